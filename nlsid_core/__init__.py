@@ -1,0 +1,1 @@
+"""From recorded data to provably stable models, proved funnels and live monitors."""

@@ -1,0 +1,95 @@
+"""`check`: rebuild the claim of a proof file from the files it is about, and decide it."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from nlsid_core import _json
+from nlsid_core._types import Json
+from nlsid_core.certificate import stability, tube
+from nlsid_core.certificate.verdict import Decision, Verdict
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+
+FORMAT = "nlsid/proof"
+VERSION = 1
+
+Decide = Callable[[Json, Json, Mapping[str, Json]], Decision]
+
+CLAIMS: Mapping[str, Decide] = MappingProxyType(
+    {
+        "incremental_stability": stability.decide,
+        "energy_tube": tube.decide,
+    }
+)
+
+
+def check(path: Path | str) -> Verdict:
+    """Decide the claim in the proof file `path` from the model, policy and funnel files beside it.
+
+    Returns a Verdict if, and only if, the claim is proved. Raises CertificateMismatch if a file
+    beside it is not the one the proof is about, CertificateRejected if the proof is damaged,
+    incomplete or does not prove its claim; the message says why. OS errors for `path` itself pass
+    through.
+    """
+    started = time.perf_counter()
+    path = Path(path)
+    try:
+        document = _json.load_document(path)
+        _json.header(document, FORMAT, VERSION, source=path.name)
+        _refuse_damage(document, path.name)
+        claim = _json.member(document, "claim", dict, source=path.name)
+        proof = _json.member(document, "proof", dict, source=path.name)
+        kind = _json.member(claim, "kind", str, source=path.name)
+        if kind not in CLAIMS:
+            raise CertificateRejected(f"claim '{kind}' is unknown; known: {', '.join(CLAIMS)}")
+        about = _files_named_in(claim, path)
+        decision = CLAIMS[kind](claim, proof, about)
+    except (DataError, ValueError, ArithmeticError) as error:
+        if isinstance(error, CertificateRejected):
+            raise
+        raise CertificateRejected(str(error)) from error
+    return Verdict(
+        statement=decision.statement,
+        margin=decision.margin,
+        assumptions=decision.assumptions,
+        mode="exact",
+        digests={role: _json.digest(content) for role, content in about.items()},
+        seconds=time.perf_counter() - started,
+    )
+
+
+def proof_document(claim: Json, proof: Json) -> Json:
+    """The proof file's content: claim, proof, and a digest over both that shows damage."""
+    document: Json = {"format": FORMAT, "version": VERSION, "claim": claim, "proof": proof}
+    return document | {"digest": _json.digest(document)}
+
+
+def _refuse_damage(document: Json, source: str) -> None:
+    stated = _json.member(document, "digest", str, source=source)
+    content = {key: value for key, value in document.items() if key != "digest"}
+    if _json.digest(content) != stated:
+        raise CertificateRejected(f"{source}: content does not match its own digest (damaged)")
+
+
+def _files_named_in(claim: Json, path: Path) -> dict[str, Json]:
+    """Load every file the claim is about from the proof's folder and compare its digest."""
+    about: dict[str, Json] = {}
+    for role, binding in _json.member(claim, "about", dict, source=path.name).items():
+        if not isinstance(binding, dict):
+            raise CertificateRejected(f"{path.name}: '{role}' should name a file and its digest")
+        name = _json.member(binding, "file", str, source=f"{path.name} {role}")
+        stated = _json.member(binding, "digest", str, source=f"{path.name} {role}")
+        if not name or Path(name).name != name or "\\" in name or "\0" in name:
+            raise CertificateRejected(f"{path.name}: {role} file '{name}' is not a plain file name")
+        try:
+            about[role] = _json.load_document(path.parent / name)
+        except OSError as error:
+            raise CertificateMismatch(f"{role} file {name} cannot be read: {error}") from error
+        found = _json.digest(about[role])
+        if found != stated:
+            raise CertificateMismatch(
+                f"{name} is not the {role} this proof is about: "
+                f"digest {found[:23]}..., proof says {stated[:23]}..."
+            )
+    return about

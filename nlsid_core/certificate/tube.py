@@ -1,0 +1,139 @@
+"""Claim: the tube of a funnel file holds for its model and policy under its energy assumption.
+
+With x̄ = x̂ - x_k and the innovation e, the observer gives x̄⁺ = (A - κBK) x̄ + L e, where κ = 0
+while the nominal inputs are played and κ = 1 while the policy drives. The proved inequality is
+V(x̄⁺) ≤ V(x̄) + e², V = x̄'Px̄, as
+    diag(P, 1) - [A - κBK, L]' P [A - κBK, L] ≻ 0   for κ = 0 and κ = 1,
+hence for every κ in between (it is convex in κ), at every sample, around every trajectory of
+the model. Summed: V(x̄_k) + e_k² ≤ V(x̄_0) + Σ e² ≤ inlet + budget ≤ level.
+The stored nominal obeys the model up to rounding; what is left is bounded and added, exactly.
+Source: thesis Section 5.1 in discrete time; energy form of a disturbance bound.
+"""
+
+from collections.abc import Mapping
+from fractions import Fraction
+
+from nlsid_core import _json
+from nlsid_core._types import Json
+from nlsid_core.certificate import exact
+from nlsid_core.certificate.stability import input_matrix, state_matrix
+from nlsid_core.certificate.verdict import Decision
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.funnel import Funnel
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.policy import Policy
+
+
+def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
+    """Decide the tube of the bound funnel; the proof states the `slack` by which V decreases."""
+    if set(about) != {"model", "policy", "funnel"} or set(claim) != {"kind", "about"}:
+        raise CertificateRejected("an energy_tube claim is about a model, a policy and a funnel")
+    model = DifferenceEquation.from_document(about["model"], source="model")
+    policy = Policy.from_document(about["policy"], source="policy")
+    funnel = Funnel.from_document(about["funnel"], source="funnel")
+    _refuse_strangers(about, policy, funnel)
+    n = len(model)
+    if len(policy.K) != n or funnel.P.shape != (n, n) or policy.period != model.period:
+        raise CertificateRejected("model, policy and funnel differ in size or sample time")
+    slack = Fraction(_json.number(proof, "slack", source="proof"))
+    if slack <= 0:
+        raise CertificateRejected(f"slack is {float(slack):g}, should be positive")
+    P = exact.rational(funnel.P.tolist())
+    if not exact.is_positive_definite(P):
+        raise CertificateRejected("P is not symmetric positive definite")
+    A, B = state_matrix(model), input_matrix(model)
+    K, L = exact.rational([policy.K.tolist()]), exact.rational([[v] for v in policy.L.tolist()])
+    for engaged in (Fraction(0), Fraction(1)):
+        closed = exact.combine(A, exact.product(B, K), -engaged)
+        if not exact.is_positive_definite(_dissipation(closed, L, P, slack)):
+            mode = "with the policy engaged" if engaged else "with the nominal inputs played"
+            raise CertificateRejected(f"V grows by more than e² {mode}")
+    _refuse_level(model, policy, funnel, P, A, B)
+    return _statement(model, policy, funnel, slack)
+
+
+def _dissipation(
+    closed: exact.Matrix, L: exact.Matrix, P: exact.Matrix, slack: Fraction
+) -> exact.Matrix:
+    """(1 - slack)·diag(P, 1) - [closed, L]'P[closed, L]."""
+    n = len(P)
+    F = [row + gain for row, gain in zip(closed, L, strict=True)]
+    supply = [row + [Fraction(0)] for row in P] + [[Fraction(0)] * n + [Fraction(1)]]
+    scaled = [[(1 - slack) * entry for entry in row] for row in supply]
+    return exact.combine(scaled, exact.congruence(F, P), Fraction(-1))
+
+
+def _refuse_strangers(about: Mapping[str, Json], policy: Policy, funnel: Funnel) -> None:
+    digests = {role: _json.digest(content) for role, content in about.items()}
+    for owner, role, stated in (
+        ("policy", "model", policy.model),
+        ("funnel", "model", funnel.model),
+        ("funnel", "policy", funnel.policy),
+    ):
+        if stated != digests[role]:
+            raise CertificateMismatch(f"the {owner} was made for another {role}: {stated[:23]}...")
+
+
+def _refuse_level(
+    model: DifferenceEquation,
+    policy: Policy,
+    funnel: Funnel,
+    P: exact.Matrix,
+    A: exact.Matrix,
+    B: exact.Matrix,
+) -> None:
+    """√level ≥ √(inlet + budget) + Σ_k |δ_k|_P, δ_k the nominal's departure from the model.
+
+    (Σ|δ_k|_P)² ≤ N Σ|δ_k|²_P =: q by Cauchy-Schwarz, and √level ≥ √s + √q is decided without
+    roots: level - s - q ≥ 0 and (level - s - q)² ≥ 4 s q.
+    """
+    assumption = funnel.assumption
+    if not 0 < assumption.samples <= len(policy):
+        raise CertificateRejected(
+            f"the assumption covers {assumption.samples} samples, the nominal {len(policy)}"
+        )
+    if assumption.budget < 0 or funnel.inlet < 0:
+        raise CertificateRejected("budget and inlet should not be negative")
+    factor, measured = Fraction(assumption.safety_factor), Fraction(assumption.measured)
+    if factor < 1 or Fraction(assumption.budget) < measured or measured < 0:
+        raise CertificateRejected("the budget is less than what was measured on the trials")
+    offset = [Fraction(float(a)) * c for a in model.a]
+    defect_energy = Fraction(0)
+    states, inputs = exact.rational(policy.x.tolist()), [Fraction(float(u)) for u in policy.u]
+    for k in range(len(policy) - 1):
+        predicted = [
+            sum((A[i][j] * states[k][j] for j in range(len(A))), Fraction(0))
+            + B[i][0] * inputs[k]
+            + offset[i]
+            for i in range(len(A))
+        ]
+        delta = [[p - x] for p, x in zip(predicted, states[k + 1], strict=True)]
+        defect_energy += exact.congruence(delta, P)[0][0]
+    q = len(policy) * defect_energy
+    s = Fraction(funnel.inlet) + Fraction(assumption.budget)
+    room = Fraction(funnel.level) - s - q
+    if room < 0 or room**2 < 4 * s * q:
+        raise CertificateRejected(
+            f"level {funnel.level:.9g} is below inlet + budget {float(s):.9g} "
+            f"plus the nominal's departure from the model {float(q) ** 0.5:.3g}"
+        )
+
+
+def _statement(
+    model: DifferenceEquation, policy: Policy, funnel: Funnel, slack: Fraction
+) -> Decision:
+    a = funnel.assumption
+    unit = model.y.unit
+    modes = "policy engaged or not" if policy.K.any() else "prediction tube, no feedback"
+    return Decision(
+        statement=(
+            f"tube: {model.y.name} stays within {funnel.output_half_width:.3f} {unit} of every "
+            f"trajectory of the model for {a.samples * model.period:g} s ({modes})"
+        ),
+        margin=float(slack),
+        assumptions=(
+            f"innovation energy sum e^2 <= {a.budget:.4g} ({unit})^2 over {a.samples} samples "
+            f"({a.safety_factor:g}^2 x {a.measured:.4g}, the largest of "
+            f"{len(a.measured_on)} recorded trials)",
+        ),
+    )

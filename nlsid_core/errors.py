@@ -1,0 +1,40 @@
+"""Every error the project raises on purpose.
+
+All inherit from `NlsidError` and from the builtin that fits, so a caller can catch either.
+"""
+
+
+class NlsidError(Exception):
+    """Base of every error raised on purpose by nlsid."""
+
+
+class ShapeError(NlsidError, ValueError):
+    """An array has the wrong shape; the message states the expected and the given one."""
+
+
+class DataError(NlsidError, ValueError):
+    """Data that cannot be used as given: NaN, unsorted time, a gap, no excitation."""
+
+
+class BagError(DataError):
+    """A bag that cannot be read as asked: damaged, or a missing topic, field or type."""
+
+
+class DocumentError(DataError):
+    """A JSON document (model, policy, funnel, proof) that is not what its format says."""
+
+
+class SolverError(NlsidError, RuntimeError):
+    """A numerical solver gave up; the message says at what and how far it got."""
+
+
+class Infeasible(SolverError):  # noqa: N818 - a result of the field, named as the field names it
+    """No certificate exists in the class that was searched; the message says what to try."""
+
+
+class CertificateRejected(NlsidError):  # noqa: N818 - a verdict, not a fault
+    """A proof does not prove its claim."""
+
+
+class CertificateMismatch(CertificateRejected):
+    """A proof is about another model, policy or funnel than the files beside it."""

@@ -1,0 +1,176 @@
+"""Identified models: frozen numbers, a document form, and simulation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core import _json
+from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core.errors import DataError, ShapeError
+
+FORMAT = "nlsid/model"
+VERSION = 1
+KIND = "difference_equation"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal's name, unit, and `topic:field.path` it is read from (empty: not from a topic)."""
+
+    name: str
+    unit: str = ""
+    path: str = ""
+
+    def document(self) -> Json:
+        """The JSON form."""
+        return {"name": self.name, "unit": self.unit, "path": self.path}
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str) -> "Signal":
+        """Raises DocumentError if a part is missing."""
+        return cls(
+            *(_json.member(document, key, str, source=source) for key in ("name", "unit", "path"))
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class DifferenceEquation:
+    """y(t) = Σ_{k=1..n} a_k y(t-k) + Σ_{j=0..n} b_j u(t-j) + c, one output, one input.
+
+    Source: (4.1) with constant G and affine p. a: (n,), b: (n+1,), c in the output's unit;
+    t counts samples of `period` s, u(t) acts from sample t on. `u_range` is the range of the
+    input the model was fitted on; `bags` names (name, digest) of the recordings.
+
+    Raises ShapeError or DataError on arrays that do not fit or are not finite.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    c: float
+    period: float
+    y: Signal
+    u: Signal
+    u_range: tuple[float, float]
+    bags: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        for key in ("a", "b"):
+            values = np.array(getattr(self, key), dtype=np.float64)
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        if self.a.ndim != 1 or not len(self.a) or self.b.shape != (len(self.a) + 1,):
+            raise ShapeError(f"a should be (n,), b (n+1,); they are {self.a.shape}, {self.b.shape}")
+        numbers = np.concatenate([self.a, self.b, [self.c, self.period, *self.u_range]])
+        if not np.isfinite(numbers).all():
+            raise DataError("a model's coefficients should be finite")
+        if self.period <= 0 or self.u_range[0] > self.u_range[1]:
+            raise DataError(f"period {self.period} s or input range {self.u_range} is not valid")
+
+    def __len__(self) -> int:
+        """The number of lags n."""
+        return len(self.a)
+
+    @property
+    def poles(self) -> FloatArray:
+        """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n (complex)."""
+        return np.roots(np.concatenate([[1.0], -self.a]))
+
+    # Observer form, the state of every later proof: x_i is the part of y(t+i-1) that is already
+    # determined before sample t. With ŷ = x₁ + b₀u + c,
+    #   x⁺ = a ŷ + shift(x) + b₁..ₙ u = A x + B u + f,   y = C x + D u + c.
+
+    @property
+    def A(self) -> FloatArray:
+        """(n, n): first column a, ones above the diagonal."""
+        A = np.diag(np.ones(len(self) - 1), 1)
+        A[:, 0] = self.a
+        return A
+
+    @property
+    def B(self) -> FloatArray:
+        """(n, 1): b_i + a_i b_0."""
+        return (self.b[1:] + self.a * self.b[0])[:, None]
+
+    @property
+    def C(self) -> FloatArray:
+        """(1, n): the first state is what the past says of the output."""
+        return np.eye(1, len(self))
+
+    @property
+    def D(self) -> float:
+        """b_0."""
+        return float(self.b[0])
+
+    @property
+    def offset(self) -> FloatArray:
+        """(n,): a_i c, the constant in the state's equation."""
+        return self.a * self.c
+
+    def state_after(self, y: ArrayLike, u: ArrayLike) -> FloatArray:
+        """The state (n,) that the last n samples y(t-n)…y(t-1), u(t-n)…u(t-1) determine."""
+        y_lags, u_lags = np.asarray(y, dtype=np.float64), np.asarray(u, dtype=np.float64)
+        n = len(self)
+        if y_lags.shape != (n,) or u_lags.shape != (n,):
+            raise ShapeError(f"y and u should have shape ({n},); {y_lags.shape}, {u_lags.shape}")
+        newest = slice(None, None, -1)
+        return np.array(
+            [
+                np.dot(self.a[i:], y_lags[newest][: n - i])
+                + np.dot(self.b[i + 1 :], u_lags[newest][: n - i])
+                for i in range(n)
+            ]
+        )
+
+    def simulate(self, u: ArrayLike, y_start: ArrayLike) -> FloatArray:
+        """Outputs (N,) for inputs u (N,), from the first n measured outputs y_start (n,).
+
+        The first n outputs are y_start itself.
+        """
+        inputs, start = np.asarray(u, dtype=np.float64), np.asarray(y_start, dtype=np.float64)
+        n = len(self)
+        if inputs.ndim != 1 or len(inputs) < n or start.shape != (n,):
+            raise ShapeError(f"u should be (N,), N >= {n}, y_start ({n},)")
+        forcing = np.convolve(inputs, self.b)[n : len(inputs)] + self.c
+        outputs = np.concatenate([start, forcing])
+        backwards = self.a[::-1]
+        for t in range(n, len(outputs)):
+            outputs[t] += backwards @ outputs[t - n : t]
+        return outputs
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": KIND,
+            "equation": "y(t) = sum a[k-1] y(t-k) + sum b[j] u(t-j) + c",
+            "period": self.period,
+            "y": self.y.document(),
+            "u": self.u.document(),
+            "a": self.a.tolist(),
+            "b": self.b.tolist(),
+            "c": self.c,
+            "u_range": list(self.u_range),
+            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "model") -> "DifferenceEquation":
+        """Raises DocumentError if the document is not a difference equation."""
+        _json.header(document, FORMAT, VERSION, source=source)
+        kind = _json.member(document, "kind", str, source=source)
+        if kind != KIND:
+            raise _json.DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        a = _json.array(document, "a", (None,), source=source)
+        lo, hi = _json.array(document, "u_range", (2,), source=source)
+        bags = _json.member(document, "bags", list, source=source)
+        return cls(
+            a=a,
+            b=_json.array(document, "b", (len(a) + 1,), source=source),
+            c=_json.number(document, "c", source=source),
+            period=_json.number(document, "period", source=source),
+            y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
+            u=Signal.from_document(_json.member(document, "u", dict, source=source), source=source),
+            u_range=(float(lo), float(hi)),
+            bags=tuple(_json.named_digests(bags, source=source)),
+        )
