@@ -6,7 +6,7 @@ import numpy as np
 
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.errors import DataError, DocumentError, ShapeError
 
 FORMAT = "nlsid/funnel"
 VERSION = 1
@@ -98,7 +98,7 @@ class Funnel:
         where = f"{source} assumption"
         kind = _json.member(nested, "kind", str, source=where)
         if kind != "energy":
-            raise _json.DocumentError(f"{where}: kind is '{kind}', expected 'energy'")
+            raise DocumentError(f"{where}: kind is '{kind}', expected 'energy'")
         trials = _json.member(nested, "measured_on", list, source=where)
         return cls(
             P=_json.array(document, "P", (None, None), source=source),

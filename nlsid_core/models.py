@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, Json
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.errors import DataError, DocumentError, ShapeError
 
 FORMAT = "nlsid/model"
 VERSION = 1
@@ -71,9 +72,9 @@ class DifferenceEquation:
         return len(self.a)
 
     @property
-    def poles(self) -> FloatArray:
-        """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n (complex)."""
-        return np.roots(np.concatenate([[1.0], -self.a]))
+    def poles(self) -> NDArray[np.complex128]:
+        """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n."""
+        return np.roots(np.concatenate([[1.0], -self.a])).astype(np.complex128)
 
     # Observer form, the state of every later proof: x_i is the part of y(t+i-1) that is already
     # determined before sample t. With ŷ = x₁ + b₀u + c,
@@ -89,7 +90,8 @@ class DifferenceEquation:
     @property
     def B(self) -> FloatArray:
         """(n, 1): b_i + a_i b_0."""
-        return (self.b[1:] + self.a * self.b[0])[:, None]
+        B: FloatArray = (self.b[1:] + self.a * self.b[0])[:, None]
+        return B
 
     @property
     def C(self) -> FloatArray:
@@ -160,7 +162,7 @@ class DifferenceEquation:
         _json.header(document, FORMAT, VERSION, source=source)
         kind = _json.member(document, "kind", str, source=source)
         if kind != KIND:
-            raise _json.DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
         a = _json.array(document, "a", (None,), source=source)
         lo, hi = _json.array(document, "u_range", (2,), source=source)
         bags = _json.member(document, "bags", list, source=source)

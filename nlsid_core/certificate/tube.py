@@ -58,7 +58,7 @@ def _dissipation(
     """(1 - slack)·diag(P, 1) - [closed, L]'P[closed, L]."""
     n = len(P)
     F = [row + gain for row, gain in zip(closed, L, strict=True)]
-    supply = [row + [Fraction(0)] for row in P] + [[Fraction(0)] * n + [Fraction(1)]]
+    supply = [[*row, Fraction(0)] for row in P] + [[Fraction(0)] * n + [Fraction(1)]]
     scaled = [[(1 - slack) * entry for entry in row] for row in supply]
     return exact.combine(scaled, exact.congruence(F, P), Fraction(-1))
 
@@ -97,6 +97,7 @@ def _refuse_level(
     factor, measured = Fraction(assumption.safety_factor), Fraction(assumption.measured)
     if factor < 1 or Fraction(assumption.budget) < measured or measured < 0:
         raise CertificateRejected("the budget is less than what was measured on the trials")
+    c = Fraction(float(model.c))
     offset = [Fraction(float(a)) * c for a in model.a]
     defect_energy = Fraction(0)
     states, inputs = exact.rational(policy.x.tolist()), [Fraction(float(u)) for u in policy.u]
