@@ -85,7 +85,8 @@ class Monitor:
             raise CertificateMismatch("the policy has another sample time than the model")
         self.model, self.policy, self.funnel, self.nominal = model, policy, funnel, nominal
         n = len(model)
-        self.axes = tuple(f"{model.y.name}, {i} ahead" for i in range(n)) + ("innovation",)
+        ahead = (f"{model.y.name}, {i} ahead" for i in range(n))
+        self.axes = (*ahead, "innovation")
         self._half_widths = funnel.half_widths
         self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset
         self.restart()
