@@ -1,4 +1,4 @@
-"""What colcon runs. The metadata is in pyproject.toml, but for two fields colcon cannot take there."""
+"""What colcon runs. All metadata but two fields is in pyproject.toml."""
 
 from setuptools import setup
 
