@@ -67,6 +67,14 @@ def header_stamp_ns(data: bytes) -> int:
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
+def decode(data: bytes, msgtype: str, types: Typestore) -> object:
+    """The message in CDR `data`, its fields as attributes; BagError if it is damaged."""
+    try:
+        return types.deserialize_cdr(data, msgtype)
+    except Exception as error:  # rosbags' generated decoders raise what the bytes make them raise
+        raise BagError(f"not a '{msgtype}': {type(error).__name__}: {str(error)[:200]}") from error
+
+
 def definition(msgtype: str) -> tuple[str, str]:
     """The text (`ros2msg`) and RIHS01 hash that define a standard type; BagError if unknown."""
     types = standard_types()
