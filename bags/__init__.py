@@ -1,0 +1,1 @@
+"""Bags (MCAP) to and from data; the command line `nlsid`."""

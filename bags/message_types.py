@@ -1,0 +1,142 @@
+"""ROS 2 message types: their fields, their definition text, and the stamp in a serialised message.
+
+Standard types come from the Jazzy release's definitions that rosbags ships, so no ROS is needed.
+A bag's own definition is used where it differs: the data were written with it.
+"""
+
+import re
+import struct
+from collections.abc import Mapping
+from functools import cache, lru_cache
+from typing import Final
+
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
+from rosbags.interfaces.typing import Fielddefs, FieldDesc, Typesdict
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+from rosbags.typesys.store import Typestore
+
+from nlsid_core.errors import BagError
+
+HEADER: Final = "std_msgs/msg/Header"
+IDL_SEPARATOR: Final = "=" * 80 + "\n"
+MAX_FIXED_ARRAY: Final = 2**16  # rosbags writes a line of code per element; none in use is near it
+
+_TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
+_FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_LITTLE_ENDIAN_STAMP: Final = struct.Struct("<iI")
+_BIG_ENDIAN_STAMP: Final = struct.Struct(">iI")
+
+
+@cache
+def standard_types() -> Typestore:
+    """The message types of ROS 2 Jazzy's common interfaces."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def fields_of(msgtype: str, types: Typestore) -> Mapping[str, FieldDesc]:
+    """Field name -> field type of `msgtype`; BagError if the type is not known."""
+    if msgtype not in types.fielddefs:
+        raise BagError(
+            f"message type '{msgtype}' is not known: it is no ROS 2 Jazzy common interface and "
+            "nothing defines it here"
+        )
+    return dict(types.fielddefs[msgtype][1])
+
+
+def is_stamped(msgtype: str, types: Typestore) -> bool:
+    """Whether messages of `msgtype` start with a std_msgs/Header."""
+    fields: Fielddefs = types.fielddefs[msgtype][1]
+    return bool(fields) and fields[0] == ("header", (Nodetype.NAME, HEADER))
+
+
+def header_stamp_ns(data: bytes) -> int:
+    """The header stamp in ns of a CDR message whose type starts with a header (see `is_stamped`).
+
+    Raises BagError if `data` is too short or not plain CDR.
+    """
+    if len(data) < 12 or data[0] != 0 or data[1] > 1:
+        raise BagError(f"not a CDR message with a header: it starts with {data[:12].hex(' ')}")
+    layout = _LITTLE_ENDIAN_STAMP if data[1] else _BIG_ENDIAN_STAMP
+    seconds, nanoseconds = layout.unpack_from(data, 4)
+    return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def decode(data: bytes, msgtype: str, types: Typestore) -> object:
+    """The message in CDR `data`, its fields as attributes; BagError if it is damaged."""
+    try:
+        return types.deserialize_cdr(data, msgtype)
+    except Exception as error:  # rosbags' generated decoders raise what the bytes make them raise
+        raise BagError(f"not a '{msgtype}': {type(error).__name__}: {str(error)[:200]}") from error
+
+
+def definition(msgtype: str) -> tuple[str, str]:
+    """The text (`ros2msg`) and RIHS01 hash that define a standard type; BagError if unknown."""
+    types = standard_types()
+    fields_of(msgtype, types)
+    return types.generate_msgdef(msgtype, ros_version=2)[0], types.hash_rihs01(msgtype)
+
+
+@lru_cache(maxsize=64)
+def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
+    """The types a bag's messages of `msgtype` were written with.
+
+    Raises BagError if the embedded definition cannot be used, or if there is none and the type is
+    not standard.
+    """
+    standard = standard_types()
+    if embedded.format == MessageDefinitionFormat.NONE:
+        fields_of(msgtype, standard)
+        return standard
+    try:
+        parsed = _parse(msgtype, embedded)
+        if msgtype in parsed and all(
+            name in standard.fielddefs and standard.fielddefs[name][1] == fields
+            for name, (_, fields) in parsed.items()
+        ):
+            return standard
+        _refuse_odd_names(parsed)
+        types = get_typestore(Stores.EMPTY)
+        types.register(parsed)
+        types.get_msgdef(msgtype)
+    except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
+        raise BagError(
+            f"the definition of '{msgtype}' in the bag cannot be used: {type(error).__name__}: "
+            f"{str(error)[:200]}"
+        ) from error
+    return types
+
+
+def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
+    if embedded.format == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(embedded.data, msgtype)
+    text = embedded.data
+    if not text.startswith(IDL_SEPARATOR + "IDL: "):
+        return get_types_from_idl(text)
+    types: Typesdict = {}
+    for part in text.split(IDL_SEPARATOR)[1:]:
+        types.update(get_types_from_idl(part.partition("\n")[2]))
+    return types
+
+
+def _refuse_odd_names(types: Typesdict) -> None:
+    """rosbags turns definitions into code, so from a bag only plain names may reach it."""
+    for name, (constants, fields) in types.items():
+        if not _TYPE_NAME.fullmatch(name):
+            raise ValueError(f"{name!r} is not a type name")
+        for field in [*(entry[0] for entry in fields), *(entry[0] for entry in constants)]:
+            if not _FIELD_NAME.fullmatch(field):
+                raise ValueError(f"{field!r} is not a field name")
+        for _, description in fields:
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                length = description[1][1]
+                if not isinstance(length, int) or not 0 <= length <= MAX_FIXED_ARRAY:
+                    raise ValueError(f"an array of {length} elements")
+                description = description[1][0]
+            if description[0] == Nodetype.NAME and not _TYPE_NAME.fullmatch(str(description[1])):
+                raise ValueError(f"{description[1]!r} is not a type name")

@@ -1,0 +1,86 @@
+"""Serialised standard messages and small bags for the tests of bags."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from bags.message_types import standard_types
+from bags.writer import BagWriter
+
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 25_000_000
+ODOM, CMD = "/odom", "/cmd_vel"
+ODOM_TYPE, CMD_TYPE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped"
+SPEED = f"{ODOM}:twist.twist.linear.x"
+COMMAND = f"{CMD}:twist.linear.x"
+JOINT_TYPE = "sensor_msgs/msg/JointState"
+
+
+def serialised(msgtype: str, message: object) -> bytes:
+    return bytes(standard_types().serialize_cdr(message, msgtype))
+
+
+def header(stamp_ns: int) -> object:
+    types = standard_types().types
+    stamp = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
+    return types["std_msgs/msg/Header"](stamp, "odom")
+
+
+def twist(speed: float) -> object:
+    types = standard_types().types
+    vector = types["geometry_msgs/msg/Vector3"]
+    return types["geometry_msgs/msg/Twist"](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+
+
+def command(stamp_ns: int, speed: float) -> bytes:
+    stamped = standard_types().types[CMD_TYPE](header(stamp_ns), twist(speed))
+    return serialised(CMD_TYPE, stamped)
+
+
+def odometry(stamp_ns: int, speed: float) -> bytes:
+    types = standard_types().types
+    pose = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](0.0, 0.0, 0.0),
+        types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
+    message = types[ODOM_TYPE](
+        header(stamp_ns),
+        "base_link",
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist(speed), np.zeros(36)),
+    )
+    return serialised(ODOM_TYPE, message)
+
+
+def joints(stamp_ns: int, position: Iterable[float]) -> bytes:
+    values = np.array(list(position), dtype=np.float64)
+    names = [f"joint_{i}" for i in range(len(values))]
+    message = standard_types().types[JOINT_TYPE](
+        header(stamp_ns),
+        names,
+        values,
+        np.zeros(0),
+        np.zeros(0),
+    )
+    return serialised(JOINT_TYPE, message)
+
+
+def speed_bag(
+    path: Path,
+    speeds: Iterable[float],
+    commands: Iterable[float],
+    *,
+    stamps_ns: Iterable[int] | None = None,
+    custom: dict[str, str] | None = None,
+) -> Path:
+    """A bag of speeds on /odom and commands on /cmd_vel, one of each every 25 ms by default."""
+    pairs = list(zip(speeds, commands, strict=True))
+    stamps = list(stamps_ns or (START_NS + k * PERIOD_NS for k in range(len(pairs))))
+    with BagWriter(path, custom=custom) as bag:
+        for k, (stamp, (speed, value)) in enumerate(zip(stamps, pairs, strict=True)):
+            log = START_NS + k * PERIOD_NS
+            times = {"log_time_ns": log, "publish_time_ns": log}
+            bag.write(CMD, CMD_TYPE, command(stamp, value), **times)
+            bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
+    return path
