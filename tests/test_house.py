@@ -125,9 +125,9 @@ def test_the_core_and_the_bags_load_no_ros() -> None:
     assert not {name for name in loaded if ROS.fullmatch(name)}
 
 
-@pytest.mark.parametrize("path", sources(*PACKAGES), ids=ids)
-def test_every_folder_of_modules_is_a_package_that_gets_installed(path: Path) -> None:
-    assert (path.parent / "__init__.py").is_file()
+def test_every_folder_of_modules_is_a_package_and_so_gets_installed() -> None:
+    folders = {path.parent for path in sources(*PACKAGES)}
+    assert all((folder / "__init__.py").is_file() for folder in folders), folders
 
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
