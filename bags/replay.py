@@ -1,15 +1,19 @@
 """Offline monitoring: a bag's messages through the same pairing and monitor as the live node."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from bags.bag import Bag
 from bags.documents import ProvedFunnel
-from bags.pairing import Pairing
-from bags.reader import read_signals
+from bags.grid import seconds
+from bags.message_types import decode, header_stamp_ns, is_stamped
+from bags.pairing import Pairing, Sample
+from bags.signals import SignalPath
 from nlsid_core.errors import BagError
-from nlsid_core.monitor import Nominal, Reading, Status
+from nlsid_core.monitor import Monitor, Nominal, Reading, Status
 
-NANOSECONDS = 1e-9
+RESPONSE, EXCITATION = "response", "excitation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,30 +63,51 @@ class Replay:
 
 
 def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Replay:
-    """Every response in `bag` held against the funnel, in stamp order.
+    """Every response in `bag` held against the funnel, message by message as it was recorded.
 
-    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals on stamped
+    messages. What is wrong with the signals themselves (NaN, gaps, time going back) shows as
+    unknown, as it does live.
     """
-    bag = Path(bag)
-    model = proved.model
-    signals = read_signals(bag, [model.y.path, model.u.path], finite=False)
-    responses, excitations = signals[model.y.path], signals[model.u.path]
-    if not len(responses.stamps):
+    bag, model = Path(bag), proved.model
+    monitor, pairing, origin = proved.monitor(nominal), Pairing(), None
+    readings: list[Reading] = []
+    for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
+        if role == RESPONSE:
+            origin = stamp_ns if origin is None else origin
+            samples = pairing.response(stamp_ns, value)
+        else:
+            samples = pairing.excitation(stamp_ns, value)
+        readings += _judge(monitor, samples, origin)
+    readings += _judge(monitor, pairing.flush(), origin)
+    if origin is None:
         raise BagError(f"{bag}: no message on {model.y.path}")
-    pairing = Pairing()
-    for stamp, value in zip(excitations.stamps, excitations.values, strict=True):
-        pairing.excitation(int(stamp), float(value))
-    for stamp, value in zip(responses.stamps, responses.values, strict=True):
-        pairing.response(int(stamp), float(value))
-    monitor = proved.monitor(nominal)
-    start = int(responses.stamps[0])
-    readings = tuple(
-        monitor.update((stamp - start) * NANOSECONDS, y, u) for stamp, y, u in pairing.flush()
-    )
     return Replay(
         name=bag.name,
-        readings=readings,
+        readings=tuple(readings),
         axis=model.y.name,
         unit=model.y.unit,
         half_width=proved.funnel.output_half_width,
     )
+
+
+def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, int, float]]:
+    """(role, header stamp in ns, value) of every message of the two signals, in log order."""
+    paths = {RESPONSE: SignalPath.parse(response), EXCITATION: SignalPath.parse(excitation)}
+    with Bag(bag) as source:
+        kinds = {role: source.types_on(path.topic) for role, path in paths.items()}
+        for role, path in paths.items():
+            path.check(*kinds[role])
+            if not is_stamped(*kinds[role]):
+                raise BagError(f"{bag}: {path.topic} ({kinds[role][0]}) has no header stamp")
+        for message in source.messages([path.topic for path in paths.values()]):
+            for role, path in paths.items():
+                if path.topic == message.topic:
+                    value = path.value(decode(message.data, *kinds[role]))
+                    yield role, header_stamp_ns(message.data), value
+
+
+def _judge(monitor: Monitor, samples: Iterable[Sample], origin: int | None) -> list[Reading]:
+    if origin is None:
+        return []
+    return [monitor.update(seconds(s.stamp_ns, origin), s.y, s.u) for s in samples]

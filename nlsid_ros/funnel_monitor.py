@@ -17,10 +17,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.grid import seconds
 from bags.message_types import is_stamped, standard_types
 from bags.pairing import Pairing, Sample
 from bags.signals import SignalPath
-from bags.times import seconds
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.errors import BagError, NlsidError
@@ -58,7 +58,9 @@ class FunnelMonitor(Node):
             declare(self, "stale_after", 0.1, "s without a response: unknown", between=(0.001, 60))  # type: ignore[arg-type]
         )
         self._command_wait = float(
-            declare(self, "command_wait", 0.02, "s a response waits for its command", between=(0, 1))  # type: ignore[arg-type]
+            declare(
+                self, "command_wait", 0.02, "s a response waits for its command", between=(0, 1)
+            )  # type: ignore[arg-type]
         )
         self._documents: dict[str, Json] = {}
         self._monitor: Monitor | None = None
@@ -148,7 +150,7 @@ class FunnelMonitor(Node):
         for sample in samples:
             if self._first_stamp is None:
                 self._first_stamp = sample.stamp_ns
-            self._last_t = seconds(sample.stamp_ns - self._first_stamp)
+            self._last_t = seconds(sample.stamp_ns, self._first_stamp)
             reading = monitor.update(self._last_t, sample.y, sample.u)
             self._say(reading)
             self._publish_margin(sample.stamp_ns, reading)

@@ -36,7 +36,7 @@ def synthetic_dataset(noise: float, *, trials: int = 6, samples: int = 80) -> Da
         y = simulate_truth(u) + noise * rng.standard_normal(samples)
         trajectories.append(
             Trajectory(
-                t=PERIOD * np.arange(samples),
+                t=np.linspace(0.0, PERIOD * (samples - 1), samples),
                 y=y,
                 u=u,
                 y_names=("speed",),

@@ -137,7 +137,9 @@ def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
 
 
 def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
-    return Dataset((Trajectory(t=PERIOD * np.arange(len(u)), y=y, u=u, name="run"),))
+    return Dataset(
+        (Trajectory(t=np.linspace(0.0, PERIOD * (len(u) - 1), len(u)), y=y, u=u, name="run"),)
+    )
 
 
 def test_a_constant_input_is_refused_with_the_reason() -> None:

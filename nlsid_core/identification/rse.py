@@ -79,7 +79,7 @@ def _minimise(regression: Regression, linearised_at: Iterate | None) -> Iterate:
         gradient, hessian = bound.derivatives(x, factor)
         step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         decrement = -float(gradient @ step)
-        if decrement <= DECREMENT * J or J <= perfect:
+        if decrement <= DECREMENT * J or perfect >= J:
             return Iterate(theta[:split], theta[split:], J)
         length = 1.0
         while True:
