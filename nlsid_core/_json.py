@@ -1,8 +1,9 @@
 """Documents on disk: strict JSON whose numbers round-trip exactly, content digests, safe writing.
 
 A float64 printed by Python's `repr` reads back as the same float64, so a document holds exact
-numbers; one whose digits are not a float64's is refused, so no changed digit goes unnoticed. A digest is the SHA-256 of a canonical form (sorted keys, no white space), so it is a
-property of the content and survives re-indentation.
+numbers; one whose digits are not a float64's is refused, so no changed digit goes unnoticed. A
+digest is the SHA-256 of a canonical form (sorted keys, no white space), so it is a property of the
+content and survives re-indentation.
 """
 
 import hashlib

@@ -82,7 +82,7 @@ class FunnelMonitor(Node):
         self._waiting: dict[str, SignalPath] = {}
 
     def _on_document(self, role: str, message: String) -> None:
-        """Take a latched document; start monitoring once all three are there and belong together."""
+        """Take a latched document; start once all three are there and belong together."""
         try:
             self._documents[role] = _json.parse_document(message.data, source=role)
             if len(self._documents) < 3:
