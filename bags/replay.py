@@ -1,17 +1,16 @@
 """Offline monitoring: a bag's messages through the same pairing and monitor as the live node."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from bags.bag import Bag
 from bags.documents import ProvedFunnel
-from bags.grid import seconds
 from bags.message_types import decode, header_stamp_ns, is_stamped
-from bags.pairing import Pairing, Sample
 from bags.signals import SignalPath
+from bags.watch import Stamped, Watch
 from nlsid_core.errors import BagError
-from nlsid_core.monitor import Monitor, Nominal, Reading, Status
+from nlsid_core.monitor import Nominal, Reading, Status
 
 RESPONSE, EXCITATION = "response", "excitation"
 
@@ -22,6 +21,7 @@ class Replay:
 
     name: str
     readings: tuple[Reading, ...]
+    stamps_ns: tuple[int, ...]
     axis: str
     unit: str
     half_width: float
@@ -70,21 +70,18 @@ def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Re
     unknown, as it does live.
     """
     bag, model = Path(bag), proved.model
-    monitor, pairing, origin = proved.monitor(nominal), Pairing(), None
-    readings: list[Reading] = []
+    watch = Watch(proved.monitor(nominal))
+    stamped: list[Stamped] = []
     for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
-        if role == RESPONSE:
-            origin = stamp_ns if origin is None else origin
-            samples = pairing.response(stamp_ns, value)
-        else:
-            samples = pairing.excitation(stamp_ns, value)
-        readings += _judge(monitor, samples, origin)
-    readings += _judge(monitor, pairing.flush(), origin)
-    if origin is None:
+        feed = watch.response if role == RESPONSE else watch.excitation
+        stamped += feed(stamp_ns, value)
+    stamped += watch.flush()
+    if watch.origin_ns is None:
         raise BagError(f"{bag}: no message on {model.y.path}")
     return Replay(
         name=bag.name,
-        readings=tuple(readings),
+        readings=tuple(reading for _, reading in stamped),
+        stamps_ns=tuple(stamp_ns for stamp_ns, _ in stamped),
         axis=model.y.name,
         unit=model.y.unit,
         half_width=proved.funnel.output_half_width,
@@ -105,9 +102,3 @@ def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, in
                 if path.topic == message.topic:
                     value = path.value(decode(message.data, *kinds[role]))
                     yield role, header_stamp_ns(message.data), value
-
-
-def _judge(monitor: Monitor, samples: Iterable[Sample], origin: int | None) -> list[Reading]:
-    if origin is None:
-        return []
-    return [monitor.update(seconds(s.stamp_ns, origin), s.y, s.u) for s in samples]

@@ -17,10 +17,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.grid import seconds
 from bags.message_types import is_stamped, standard_types
-from bags.pairing import Pairing, Sample
 from bags.signals import SignalPath
+from bags.watch import Stamped, Watch
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.errors import BagError, NlsidError
@@ -63,11 +62,8 @@ class FunnelMonitor(Node):
             )  # type: ignore[arg-type]
         )
         self._documents: dict[str, Json] = {}
-        self._monitor: Monitor | None = None
-        self._pairing = Pairing()
-        self._first_stamp: int | None = None
+        self._watch: Watch | None = None
         self._last_arrival = 0.0
-        self._last_t = 0.0
         self._reading = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel")
         self._said_at = -HEARTBEAT
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
@@ -90,7 +86,7 @@ class FunnelMonitor(Node):
             model = DifferenceEquation.from_document(self._documents["model"])
             policy = Policy.from_document(self._documents["policy"])
             funnel = Funnel.from_document(self._documents["funnel"])
-            self._monitor = Monitor(model, policy, funnel, nominal=self._nominal)
+            self._watch = Watch(Monitor(model, policy, funnel, nominal=self._nominal))
         except NlsidError as error:
             self.get_logger().error(f"funnel not used: {error}")
             self._reading = Reading(0.0, Status.UNKNOWN, reason=f"funnel not used: {error}")
@@ -123,37 +119,35 @@ class FunnelMonitor(Node):
 
     def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        if self._watch is None:
+            return
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         value = path.value(message)
         if role == "excitation":
-            self._judge(self._pairing.excitation(stamp, value))
-            return
-        self._last_arrival = time.monotonic()
-        self._judge(self._pairing.response(stamp, value))
+            self._publish(self._watch.excitation(stamp_ns, value))
+        else:
+            self._last_arrival = time.monotonic()
+            self._publish(self._watch.response(stamp_ns, value))
 
     def _on_tick(self) -> None:
         """Let go of samples whose command does not come, notice stale state, keep a heartbeat."""
         silent = time.monotonic() - self._last_arrival
-        if silent > self._command_wait:
-            self._judge(self._pairing.flush())
-        monitor = self._monitor
-        if monitor is not None and self._first_stamp is not None and silent > self._stale_after:
-            reason = f"no {monitor.model.y.name} for {self._stale_after:g} s"
-            self._say(monitor.missing(self._last_t, reason))
-        elif time.monotonic() - self._said_at >= HEARTBEAT:
+        watch = self._watch
+        if watch is not None and watch.origin_ns is not None:
+            if silent > self._command_wait:
+                self._publish(watch.flush())
+            if silent > self._stale_after:
+                name = watch.monitor.model.y.name
+                for _, reading in watch.missing(f"no {name} for {self._stale_after:g} s"):
+                    self._say(reading)
+        if time.monotonic() - self._said_at >= HEARTBEAT:
             self._say(self._reading)
 
-    def _judge(self, samples: Iterable[Sample]) -> None:
-        monitor = self._monitor
-        if monitor is None:
-            return
-        for sample in samples:
-            if self._first_stamp is None:
-                self._first_stamp = sample.stamp_ns
-            self._last_t = seconds(sample.stamp_ns, self._first_stamp)
-            reading = monitor.update(self._last_t, sample.y, sample.u)
+    def _publish(self, stamped: Iterable[Stamped]) -> None:
+        """Diagnostics first: an alarm should not wait behind a number."""
+        for stamp_ns, reading in stamped:
             self._say(reading)
-            self._publish_margin(sample.stamp_ns, reading)
+            self._publish_margin(stamp_ns, reading)
 
     def _publish_margin(self, stamp_ns: int, reading: Reading) -> None:
         message = JointState()
@@ -181,20 +175,19 @@ class FunnelMonitor(Node):
             "worst axis": reading.worst_axis,
             "budget spent": f"{reading.budget_spent:.6g}",
             "time in run [s]": f"{reading.t:.9g}",
-            "late commands": str(self._pairing.late),
+            "late commands": str(self._watch.pairing.late_excitations if self._watch else 0),
         }
         text = reading.status.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(stamp, NAME, LEVELS[reading.status], text, values))
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        """Begin a new run: forget lags, budget and stamps."""
-        self._pairing = Pairing()
-        self._first_stamp = None
-        if self._monitor is not None:
-            self._monitor.restart()
-        answer.success = self._monitor is not None
+        """Begin a new run: forget stamps, lags and budget."""
+        answer.success = self._watch is not None
         answer.message = "new run" if answer.success else "there is no funnel yet"
+        if self._watch is not None:
+            self._watch.restart()
+            self._reading = Reading(0.0, Status.UNKNOWN, reason="restarted")
         return answer
 
 

@@ -12,9 +12,7 @@ from bags.samples import convert_f1tenth, f1tenth
 from nlsid_core.errors import BagError, DataError
 
 SOURCE = Path(__file__).parents[1].parent / "shared" / "data" / "f1tenth" / "F1tenthCar"
-needs_source = pytest.mark.skipif(
-    not SOURCE.is_dir(), reason="needs ../shared/data")
-)
+needs_source = pytest.mark.skipif(not SOURCE.is_dir(), reason="needs ../shared/data")
 
 SIGNALS = {
     "/steering_command:position[0]": ("input", 0),
