@@ -16,6 +16,7 @@ from bags.config import load_config
 from bags.faults import FAULTS, write_faulty_copy
 from bags.replay import Replay, replay_bag
 from bags.report import report_available, write_margins
+from bags.shipped import config_file
 from bags.steps import design_funnel_files, identify_bags
 from nlsid_core.certificate import check
 from nlsid_core.monitor import Status
@@ -28,14 +29,14 @@ SABOTAGED_PLOT = "sabotaged.png"
 def run_demo(out: Path, console: Console) -> bool:
     """Run every step into `out`, saying what happens; True if all came out as it should."""
     started = time.perf_counter()
-    config_path = samples.f1tenth_config()
+    config_path = config_file("f1tenth.yaml")
     config = load_config(config_path)
     bags = samples.f1tenth()
     test = [bag for bag in bags if bag.name in config.split.test]
 
     console.rule("1  identify", align="left")
     console.print(
-        f"$ nlsid identify {samples.f1tenth_folder()} --config {config_path} --out {out}",
+        f"$ nlsid identify {bags[0].parent} --config {config_path} --out {out}",
         soft_wrap=True,
         highlight=False,
     )

@@ -86,7 +86,15 @@ def poles(chosen: Candidate) -> Figure:
     if chosen.proof is not None:
         rate = chosen.proof.rate
         axes.add_patch(Circle((0, 0), rate, fill=False, color=BLUE, ls="--", lw=LINE))
-        axes.text(0, -rate + 0.04, f"proved rate {rate:.3f}", color=BLUE, ha="center", fontsize=8)
+        axes.text(
+            0,
+            0.04 - rate,
+            f"proved rate {rate:.3f}",
+            color=BLUE,
+            ha="center",
+            va="bottom",
+            fontsize=8,
+        )
     z = chosen.model.poles
     axes.plot(z.real, z.imag, "x", color=RED, ms=7)
     axes.set_aspect("equal")
@@ -116,6 +124,7 @@ def margins(replays: Sequence[Replay]) -> Figure:
         lower.set_visible(True)
         _tube(upper, replay)
         _margin(lower, replay)
+        upper.sharey(panels[0, 0])
         lower.set_xlabel("time [s]", fontsize=8)
         if index % columns == 0:
             upper.set_ylabel(f"{replay.axis} [{replay.unit}]", fontsize=8)
@@ -156,7 +165,8 @@ def _margin(axes: Axes, replay: Replay) -> None:
     axes.axhline(0.0, color=RED, lw=0.8)
     axes.plot(t, [r.margin for r in judged], color=BLUE, lw=LINE, label="margin")
     axes.plot(t, [r.budget_spent for r in judged], color=ORANGE, lw=LINE, label="budget spent")
-    axes.set_ylim(-1.05, 1.6)
+    lowest = min((r.margin for r in judged), default=0.0)
+    axes.set_ylim(max(-1.0, min(0.0, lowest)) - 0.08, 1.3)
 
 
 def _one_step(candidate: Candidate, trial: Trajectory) -> np.ndarray:

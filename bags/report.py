@@ -16,7 +16,8 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; marg
        padding: 0 1rem }
 h1 { font-size: 1.5rem } h2 { font-size: 1.1rem; margin-top: 2rem }
 table { border-collapse: collapse } th, td { padding: .3rem .8rem; text-align: right }
-th:first-child, td:first-child { text-align: left } thead { border-bottom: 2px solid #222 }
+th:first-child, td:first-child, .left th, .left td { text-align: left }
+thead { border-bottom: 2px solid #222 }
 tbody tr { border-bottom: 1px solid #ddd } tr.chosen { background: #e8f1fa; font-weight: 600 }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
@@ -67,7 +68,8 @@ table and the pictures below.</p>
 model leaves something unexplained.</p>
 <h2>Poles</h2>{plots.svg(plots.poles(chosen))}
 <h2>Recordings</h2>
-<table><thead><tr><th>trial</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
+<table class="left">
+<thead><tr><th>trial</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
 <tbody>{_recordings(train, "training")}{_recordings(test, "test")}</tbody></table>
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
@@ -96,8 +98,8 @@ def _equation(candidate: Candidate) -> str:
     past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
     drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
     return (
-        f"y(t) = {past} {drive} {m.c:+.5f}, y = {m.y.name} [{m.y.unit}], u = {m.u.name} "
-        f"[{m.u.unit}], one sample = {m.period:g} s"
+        f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, "
+        f"y = {m.y.name} [{m.y.unit}], u = {m.u.name} [{m.u.unit}], one sample = {m.period:g} s"
     )
 
 

@@ -29,7 +29,7 @@ def methods_table(fit: Fit, test: Dataset) -> Table:
     for candidate in fit.candidates:
         chosen = candidate is fit.chosen
         table.add_row(
-            candidate.method + (" (written)" if chosen else ""),
+            candidate.method,
             f"{candidate.error_percent(test):.2f} %",
             f"{candidate.seconds * 1e3:.0f} ms",
             "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
@@ -59,18 +59,21 @@ def funnel_table(design: TubeDesign) -> Table:
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag: verdict, worst margin and where, budget spent, first bad sample."""
-    table = Table(title="bags held against the funnel", title_justify="left")
+    """One row per bag: verdict, worst margin, when, nearest bound, budget, first bad sample."""
+    table = Table(
+        title="worst margin (1 on the nominal, 0 on the boundary) and disturbance budget spent",
+        title_justify="left",
+    )
     for column, justify in (
         ("bag", "left"),
         ("verdict", "left"),
-        ("worst margin", "right"),
+        ("margin", "right"),
         ("at", "right"),
-        ("nearest bound", "left"),
-        ("budget spent", "right"),
-        ("not inside from", "right"),
+        ("axis", "left"),
+        ("budget", "right"),
+        ("bad from", "right"),
     ):
-        table.add_column(column, justify=justify)  # type: ignore[arg-type]
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
     for replay in replays:
         worst, bad = replay.worst, replay.first_bad
         colour = COLOURS[replay.verdict]

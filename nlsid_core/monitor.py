@@ -43,9 +43,10 @@ class Reading:
     """One sample's verdict.
 
     t: s, the sample's stamp. margin: 1 - √((V + e²)/level), 1 on the nominal, 0 on the boundary of
-    the tube, NaN if unknown. worst_axis: the axis nearest its bound. budget_spent: Σe² so far over
-    the budget, 1 is all of it. nominal, measured: the output, in its unit. reason: why
-    it is not inside, empty if it is.
+    the tube, NaN if unknown. worst_axis: the axis nearest its bound: `speed +2`, what the past says
+    of the speed two samples ahead, or `innovation`. budget_spent: Σe² so far over the budget, 1 is
+    all of it. nominal, measured: the output, in its unit. reason: why it is not inside, empty if it
+    is.
     """
 
     t: float
@@ -85,7 +86,7 @@ class Monitor:
             raise CertificateMismatch("the policy has another sample time than the model")
         self.model, self.policy, self.funnel, self.nominal = model, policy, funnel, nominal
         n = len(model)
-        ahead = (f"{model.y.name}, {i} ahead" for i in range(n))
+        ahead = (f"{model.y.name} +{i}" for i in range(n))
         self.axes = (*ahead, "innovation")
         self._half_widths = funnel.half_widths
         self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset

@@ -115,7 +115,9 @@ class FunnelMonitor(Node):
                 self.get_logger().error(str(error))
                 return
             callback = partial(self._on_signal, role, path)
-            self.create_subscription(message_class(found[0]), path.topic, callback, qos.STREAM)
+            publishers = self.get_publishers_info_by_topic(path.topic)
+            profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
+            self.create_subscription(message_class(found[0]), path.topic, callback, profile)
 
     def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""

@@ -6,6 +6,7 @@ import rclpy
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.utilities import try_shutdown
 
 Value = str | float | bool | list[str]
 
@@ -22,7 +23,7 @@ def run(make: Callable[[], Node], args: list[str] | None) -> None:
     finally:
         if node is not None:
             node.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
 
 
 def declare(

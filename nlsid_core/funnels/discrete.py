@@ -141,7 +141,7 @@ def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray)
         decrease = variable - grow * closed @ variable @ closed.T - noise / scale
         constraints.append(decrease >> 0)
     problem = cp.Problem(cp.Minimize(variable[0, 0]), constraints)
-    problem.solve(solver=cp.CLARABEL)  # type: ignore[no-untyped-call]
+    problem.solve(solver=cp.CLARABEL)
     if variable.value is None:
         raise Infeasible(
             f"no ellipsoid serves both the played inputs and the policy ({problem.status}); "

@@ -1,0 +1,1 @@
+"""Measured figures beside published ones; run with python -m benchmarks.NAME."""

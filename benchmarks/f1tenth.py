@@ -1,0 +1,116 @@
+"""The chain on the shipped F1TENTH bags: errors, proofs, monitoring, seconds.
+
+python -m benchmarks.f1tenth [--json]
+
+Published beside ours: the figures first measured on these trials (four lags): least squares
+11.7 %, simulation-error minimum about 8.5 %.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from bags import documents
+from bags.config import Config, load_config
+from bags.faults import FAULTS, write_faulty_copy
+from bags.replay import Replay, replay_bag
+from bags.samples import f1tenth
+from bags.shipped import config_file
+from bags.steps import design_funnel_files, identify_bags
+from benchmarks.machine import describe
+from nlsid_core.certificate import check
+from nlsid_core.errors import CertificateRejected
+from nlsid_core.identification import FINAL, FIRST, LEAST_SQUARES, SEM
+from nlsid_core.monitor import Status
+
+CHECKS = 11  # repetitions of the check; the median is reported
+
+
+def measure() -> dict[str, float | int | bool]:
+    """Run the chain once and return the promised keys; errors in %, times in s."""
+    config = load_config(config_file("f1tenth.yaml"))
+    bags = f1tenth()
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        started = time.perf_counter()
+        result = identify_bags(bags, config, out, progress=lambda _what, _fraction: None)
+        identify_seconds = time.perf_counter() - started
+        design_funnel_files(out / documents.MODEL, config, out)
+        proofs = [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
+        seconds = []
+        for _ in range(CHECKS):
+            started = time.perf_counter()
+            proved = all(is_proved(path) for path in proofs)
+            seconds.append(time.perf_counter() - started)
+        inside, caught = monitored(config, bags, out)
+    errors = {c.method: c.error_percent(result.test) for c in result.fit.candidates}
+    return {
+        "ls": errors[LEAST_SQUARES],
+        "first": errors[FIRST],
+        "final": errors[FINAL],
+        "sem": errors[SEM],
+        "proved": proved,
+        "test_trials_inside": sum(r.verdict == Status.INSIDE.value for r in inside),
+        "sabotaged_caught": sum(r.first_bad is not None for r in caught),
+        "identify_seconds": identify_seconds,
+        "check_seconds": statistics.median(seconds),
+    }
+
+
+def is_proved(path: Path) -> bool:
+    """What the exact checker says of a proof file."""
+    try:
+        check(path)
+    except CertificateRejected:
+        return False
+    return True
+
+
+def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay], list[Replay]]:
+    """Replays of the test trials, and of each with each sensor fault."""
+    proved = documents.load_proved_funnel(out / documents.FUNNEL)
+    nominal = config.monitor.nominal_source
+    test = [bag for bag in bags if bag.name in config.split.test]
+    clean = [replay_bag(proved, bag, nominal=nominal) for bag in test]
+    faulty = []
+    for bag in test:
+        for name, fault in FAULTS.items():
+            copy = out / f"{bag.name} {name}"
+            write_faulty_copy(bag, copy, config.signals.response.path, fault)
+            faulty.append(replay_bag(proved, copy, nominal=nominal))
+    return clean, faulty
+
+
+def main() -> None:
+    """Print the table, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
+    arguments = parser.parse_args()
+    keys = measure()
+    print(f"F1TENTH speed, 4 lags, 33 training and 8 test trials, {describe()}\n")
+    print(f"{'':42s}{'ours':>9s}{'published':>12s}")
+    for label, key, published in (
+        ("least squares, test error [%]", "ls", "11.7"),
+        ("robust simulation error, first [%]", "first", "-"),
+        ("robust simulation error, final [%]", "final", "<= 9.5"),
+        ("simulation error minimisation [%]", "sem", "8.5"),
+        ("bags to model, proof and report [s]", "identify_seconds", "-"),
+        ("both proofs checked exactly [s]", "check_seconds", "-"),
+    ):
+        print(f"{label:42s}{keys[key]:9.3f}{published:>12s}")
+    print(f"{'proved':42s}{keys['proved']!s:>9s}")
+    print(f"{'test trials inside':42s}{keys['test_trials_inside']:>9d}{'8':>12s}")
+    print(f"{'sabotaged trials caught':42s}{keys['sabotaged_caught']:>9d}{'16':>12s}")
+    if arguments.json:
+        print(json.dumps(keys))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""The quality of service of every topic, and why.
+
+DOCUMENT: a funnel, model or policy. Latched (transient local), so that a monitor that starts later
+still gets it; one is enough, the newest counts.
+STREAM: signals and margins. Reliable, because a lost sample ends a monitor's run, and deep enough
+for a second at 1 kHz, so that a busy subscriber catches up. A reliable subscription does not match
+a best-effort publisher: `subscription_to` matches what the publisher offers.
+EVENTS: diagnostics. Reliable; a few pending are enough.
+"""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+DOCUMENT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+STREAM = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+EVENTS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=50,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+
+
+def subscription_to(offered: list[ReliabilityPolicy]) -> QoSProfile:
+    """STREAM, or best effort if any publisher on the topic offers no more than that."""
+    if ReliabilityPolicy.BEST_EFFORT not in offered:
+        return STREAM
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=STREAM.depth,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
