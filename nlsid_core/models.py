@@ -40,7 +40,8 @@ class DifferenceEquation:
 
     Source: (4.1) with constant G and affine p. a: (n,), b: (n+1,), c in the output's unit;
     t counts samples of `period` s, u(t) acts from sample t on. `u_range` is the range of the
-    input the model was fitted on; `bags` names (name, digest) of the recordings.
+    input the model was fitted on; `bags` names (name, digest) the recordings and
+    `training` is the digest of the data file made of them.
 
     Raises ShapeError or DataError on arrays that do not fit or are not finite.
     """
@@ -53,6 +54,7 @@ class DifferenceEquation:
     u: Signal
     u_range: tuple[float, float]
     bags: tuple[tuple[str, str], ...] = ()
+    training: str = ""
 
     def __post_init__(self) -> None:
         for key in ("a", "b"):
@@ -153,6 +155,7 @@ class DifferenceEquation:
             "b": self.b.tolist(),
             "c": self.c,
             "u_range": list(self.u_range),
+            "training": self.training,
             "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
         }
 
@@ -174,5 +177,6 @@ class DifferenceEquation:
             y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
             u=Signal.from_document(_json.member(document, "u", dict, source=source), source=source),
             u_range=(float(lo), float(hi)),
+            training=_json.member(document, "training", str, source=source),
             bags=tuple(_json.named_digests(bags, source=source)),
         )

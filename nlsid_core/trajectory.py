@@ -17,8 +17,9 @@ class Trajectory:
 
     t: (N,) s, strictly increasing. y: (N, n_y) responses. u: (N, n_u) excitations, held constant
     until the next sample. x: (N, n_x) states where they are known, else None.
-    Names and units go with the columns. `group` is the same for repeats of one excitation
-    (empty: not a repeat). `digest` names the recording it came from (empty: none).
+    Names, units and paths (`topic:field`, empty: not from a topic) go with the columns. `group` is
+    the same for repeats of one excitation (empty: not a repeat). `digest` names the recording it
+    came from (empty: none).
 
     Raises ShapeError on mismatched lengths, DataError on NaN or on time that does not increase.
     """
@@ -31,6 +32,8 @@ class Trajectory:
     u_names: tuple[str, ...] = ()
     y_units: tuple[str, ...] = ()
     u_units: tuple[str, ...] = ()
+    y_paths: tuple[str, ...] = ()
+    u_paths: tuple[str, ...] = ()
     name: str = ""
     group: str = ""
     digest: str = ""
@@ -81,14 +84,16 @@ class Trajectory:
         return self.name or "trajectory"
 
     def _fill_names(self, letter: str, columns: int) -> None:
-        names = getattr(self, f"{letter}_names") or tuple(f"{letter}{i}" for i in range(columns))
-        units = getattr(self, f"{letter}_units") or ("",) * columns
-        if len(names) != columns or len(units) != columns:
-            raise ShapeError(
-                f"{self._label}: {letter} has {columns} columns, names {names}, units {units}"
-            )
-        object.__setattr__(self, f"{letter}_names", tuple(names))
-        object.__setattr__(self, f"{letter}_units", tuple(units))
+        defaults = {
+            "names": tuple(f"{letter}{i}" for i in range(columns)),
+            "units": ("",) * columns,
+            "paths": ("",) * columns,
+        }
+        for key, default in defaults.items():
+            given = tuple(getattr(self, f"{letter}_{key}")) or default
+            if len(given) != columns:
+                raise ShapeError(f"{self._label}: {letter} has {columns} columns, {key} {given}")
+            object.__setattr__(self, f"{letter}_{key}", given)
 
 
 @dataclass(frozen=True, eq=False)

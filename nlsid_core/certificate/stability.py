@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 
 from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import exact
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.errors import CertificateRejected
@@ -22,27 +22,33 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
         raise CertificateRejected("an incremental_stability claim is about one file, the model")
     model = DifferenceEquation.from_document(about["model"], source="model")
     n = len(model)
-    rate = Fraction(_json.number(claim, "rate", source="claim"))
-    if not 0 < rate < 1:
-        raise CertificateRejected(f"rate is {float(rate):g}; stability needs 0 < rate < 1")
-    P = exact.rational(_json.array(proof, "P", (n, n), source="proof").tolist())
-    A = state_matrix(model)
-    if not exact.is_positive_definite(P):
-        raise CertificateRejected("P is not symmetric positive definite")
-    decrease = exact.combine(
-        [[rate**2 * p for p in row] for row in P], exact.congruence(A, P), Fraction(-1)
-    )
-    if not exact.is_positive_definite(decrease):
-        raise CertificateRejected(
-            f"V does not shrink by the stated rate {float(rate):.6g} a sample"
-        )
+    rate = _json.number(claim, "rate", source="claim")
+    refusal = contracts(model, _json.array(proof, "P", (n, n), source="proof"), rate)
+    if refusal is not None:
+        raise CertificateRejected(refusal)
     return Decision(
         statement=(
             f"incremental stability: solutions with the same input approach each other at "
-            f"{float(rate):.4f} a sample of {model.period:g} s or faster, for every input,"
+            f"{rate:.4f} a sample of {model.period:g} s or faster, for every input,"
         ),
-        margin=float(1 - rate),
+        margin=1.0 - rate,
     )
+
+
+def contracts(model: DifferenceEquation, P: FloatArray, rate: float) -> str | None:
+    """None if P ≻ 0 and r²P - A'PA ≻ 0 hold exactly with 0 < r < 1, else what fails."""
+    r = Fraction(rate)
+    if not 0 < r < 1:
+        return f"rate is {rate:g}; stability needs 0 < rate < 1"
+    exact_P, A = exact.rational(P.tolist()), state_matrix(model)
+    if not exact.is_positive_definite(exact_P):
+        return "P is not symmetric positive definite"
+    supply = [[r**2 * entry for entry in row] for row in exact_P]
+    if not exact.is_positive_definite(
+        exact.combine(supply, exact.congruence(A, exact_P), Fraction(-1))
+    ):
+        return f"V = x'Px does not shrink by the stated rate {rate:.6g} a sample"
+    return None
 
 
 def state_matrix(model: DifferenceEquation) -> exact.Matrix:

@@ -10,11 +10,12 @@ The stored nominal obeys the model up to rounding; what is left is bounded and a
 Source: thesis Section 5.1 in discrete time; energy form of a disturbance bound.
 """
 
+import math
 from collections.abc import Mapping
 from fractions import Fraction
 
 from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import exact
 from nlsid_core.certificate.stability import input_matrix, state_matrix
 from nlsid_core.certificate.verdict import Decision
@@ -35,21 +36,31 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
     n = len(model)
     if len(policy.K) != n or funnel.P.shape != (n, n) or policy.period != model.period:
         raise CertificateRejected("model, policy and funnel differ in size or sample time")
-    slack = Fraction(_json.number(proof, "slack", source="proof"))
-    if slack <= 0:
-        raise CertificateRejected(f"slack is {float(slack):g}, should be positive")
-    P = exact.rational(funnel.P.tolist())
-    if not exact.is_positive_definite(P):
-        raise CertificateRejected("P is not symmetric positive definite")
-    A, B = state_matrix(model), input_matrix(model)
-    K, L = exact.rational([policy.K.tolist()]), exact.rational([[v] for v in policy.L.tolist()])
-    for engaged in (Fraction(0), Fraction(1)):
-        closed = exact.combine(A, exact.product(B, K), -engaged)
-        if not exact.is_positive_definite(_dissipation(closed, L, P, slack)):
-            mode = "with the policy engaged" if engaged else "with the nominal inputs played"
-            raise CertificateRejected(f"V grows by more than e² {mode}")
-    _refuse_level(model, policy, funnel, P, A, B)
+    slack = _json.number(proof, "slack", source="proof")
+    refusal = dissipates(model, policy.K, policy.L, funnel.P, slack)
+    if refusal is not None:
+        raise CertificateRejected(refusal)
+    _refuse_level(model, policy, funnel)
     return _statement(model, policy, funnel, slack)
+
+
+def dissipates(
+    model: DifferenceEquation, K: FloatArray, L: FloatArray, P: FloatArray, slack: float
+) -> str | None:
+    """None if P ≻ 0 and V(x̄⁺) ≤ (1 - slack)(V(x̄) + e²) hold exactly, else what fails."""
+    if not 0 < slack < 1:
+        return f"slack is {slack:g}; it should be between 0 and 1"
+    exact_P = exact.rational(P.tolist())
+    if not exact.is_positive_definite(exact_P):
+        return "P is not symmetric positive definite"
+    A, B = state_matrix(model), input_matrix(model)
+    gain, observer = exact.rational([K.tolist()]), exact.rational([[v] for v in L.tolist()])
+    for engaged in (0, 1):
+        closed = exact.combine(A, exact.product(B, gain), Fraction(-engaged))
+        if not exact.is_positive_definite(_dissipation(closed, observer, exact_P, Fraction(slack))):
+            mode = "with the policy engaged" if engaged else "with the nominal inputs played"
+            return f"V grows by more than e² {mode}"
+    return None
 
 
 def _dissipation(
@@ -74,14 +85,7 @@ def _refuse_strangers(about: Mapping[str, Json], policy: Policy, funnel: Funnel)
             raise CertificateMismatch(f"the {owner} was made for another {role}: {stated[:23]}...")
 
 
-def _refuse_level(
-    model: DifferenceEquation,
-    policy: Policy,
-    funnel: Funnel,
-    P: exact.Matrix,
-    A: exact.Matrix,
-    B: exact.Matrix,
-) -> None:
+def _refuse_level(model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
     """√level ≥ √(inlet + budget) + Σ_k |δ_k|_P, δ_k the nominal's departure from the model.
 
     (Σ|δ_k|_P)² ≤ N Σ|δ_k|²_P =: q by Cauchy-Schwarz, and √level ≥ √s + √q is decided without
@@ -94,9 +98,12 @@ def _refuse_level(
         )
     if assumption.budget < 0 or funnel.inlet < 0:
         raise CertificateRejected("budget and inlet should not be negative")
-    factor, measured = Fraction(assumption.safety_factor), Fraction(assumption.measured)
-    if factor < 1 or Fraction(assumption.budget) < measured or measured < 0:
-        raise CertificateRejected("the budget is less than what was measured on the trials")
+    stated = assumption.safety_factor**2 * assumption.measured
+    if assumption.safety_factor < 1 or assumption.measured < 0 or assumption.budget < stated:
+        raise CertificateRejected(
+            f"budget {assumption.budget:.9g} is below safety_factor² x measured = {stated:.9g}"
+        )
+    A, B, P = state_matrix(model), input_matrix(model), exact.rational(funnel.P.tolist())
     c = Fraction(float(model.c))
     offset = [Fraction(float(a)) * c for a in model.a]
     defect_energy = Fraction(0)
@@ -120,21 +127,31 @@ def _refuse_level(
         )
 
 
-def _statement(
-    model: DifferenceEquation, policy: Policy, funnel: Funnel, slack: Fraction
-) -> Decision:
+def _statement(model: DifferenceEquation, policy: Policy, funnel: Funnel, slack: float) -> Decision:
     a = funnel.assumption
     unit = model.y.unit
+    width = _output_half_width(funnel)
     modes = "policy engaged or not" if policy.K.any() else "prediction tube, no feedback"
     return Decision(
         statement=(
-            f"tube: {model.y.name} stays within {funnel.output_half_width:.3f} {unit} of every "
+            f"tube: {model.y.name} stays within {width:g} {unit} of every "
             f"trajectory of the model for {a.samples * model.period:g} s ({modes})"
         ),
-        margin=float(slack),
+        margin=slack,
         assumptions=(
             f"innovation energy sum e^2 <= {a.budget:.4g} ({unit})^2 over {a.samples} samples "
-            f"({a.safety_factor:g}^2 x {a.measured:.4g}, the largest of "
-            f"{len(a.measured_on)} recorded trials)",
+            f"(largest of {len(a.measured_on)} recorded trials {a.measured:.4g}, safety factor "
+            f"{a.safety_factor:g} in amplitude)",
         ),
     )
+
+
+def _output_half_width(funnel: Funnel) -> float:
+    """A three-digit bound on |y - y_k| = |x̄₁ + e|, decided as width² ≥ level (1 + (P⁻¹)₁₁)."""
+    inverse = exact.inverse_entry(exact.rational(funnel.P.tolist()), 0)
+    squared = Fraction(funnel.level) * (1 + inverse)
+    digits = 2 - math.floor(math.log10(funnel.output_half_width))
+    width = round(funnel.output_half_width, digits)
+    while Fraction(width) ** 2 < squared:
+        width = round(width + 10.0**-digits, digits)
+    return width

@@ -1,0 +1,63 @@
+# The README's two commands are `make demo` and `make test`. Each makes .venv, installs and runs.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+
+# python3 where it is 3.11-3.13 (for which there are ROS wheels) and can make a venv, else the
+# newest such python on PATH, else anything newer. `make PYTHON=...` overrides.
+SUITS = import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= $(1))
+PYTHON ?= $(shell \
+  for p in python3 python3.13 python3.12 python3.11; do \
+    $$p -c '$(call SUITS,(3, 13))' 2>/dev/null && { echo $$p; exit; }; \
+  done; \
+  for p in python3 python3.14 python3.15; do \
+    $$p -c '$(call SUITS,(3, 99))' 2>/dev/null && { echo $$p; exit; }; \
+  done)
+
+.PHONY: demo test check lint clean help
+.DELETE_ON_ERROR:
+
+help:
+	@echo 'make demo   run the chain on the shipped bags'
+	@echo 'make test   run the tests that need no ROS'
+	@echo 'make check  ruff, mypy and make test'
+	@echo 'make clean  remove what these made'
+
+demo: $(VENV)/.demo
+	$(BIN)/nlsid demo
+
+test: $(VENV)/.test
+	$(BIN)/python -m pytest
+
+check: lint test
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) build install log *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Editable, so that both commands run the checkout and an edit needs no second install.
+# $(call install,EXTRAS): with ROS where its wheels exist, else without, said in one line.
+define install
+$(PIP) install --editable '.[ros,$(1)]' || { \
+  echo 'nlsid: no ROS wheels for this Python or platform; installing without (nothing live runs).'; \
+  $(PIP) install --editable '.[$(1)]'; }
+touch $@
+endef
+
+$(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
+	$(call install,report)
+
+$(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
+	$(call install,report$(COMMA)test)
+
+COMMA := ,
+
+$(BIN)/python:
+	@[ -n "$(PYTHON)" ] || { echo 'nlsid: needs Python 3.11 or newer with venv (Debian, Ubuntu: apt install python3-venv)'; exit 1; }
+	$(PYTHON) -m venv $(VENV)

@@ -1,0 +1,137 @@
+"""The YAML configuration of one robot: which signals, which split, which model, which tube."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from nlsid_core.errors import DataError
+from nlsid_core.models import Signal
+from nlsid_core.monitor import Nominal
+
+MAX_CONFIG_BYTES = 2**20  # a configuration is a page of text
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Corner = Annotated[tuple[float, float], Field(strict=False)]
+
+
+class _Section(BaseModel):
+    """A part of the file: unknown keys are errors, values are not coerced across types."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class SignalConfig(_Section):
+    """A signal: its name and unit for people, and `topic:field.path[index]`."""
+
+    name: str
+    unit: str = ""
+    path: str
+
+    def signal(self) -> Signal:
+        """The same as the core's noun."""
+        return Signal(self.name, self.unit, self.path)
+
+
+class SignalsConfig(_Section):
+    """The response that is modelled and the excitation that drives it."""
+
+    response: SignalConfig
+    excitation: SignalConfig
+
+
+class GridConfig(_Section):
+    """period: s between samples. max_gap: s without a response that is still interpolated."""
+
+    period: Positive
+    max_gap: Positive
+
+
+class SplitConfig(_Section):
+    """Names of the bags that are only used to score."""
+
+    test: tuple[str, ...] = Field(default=(), strict=False)
+
+
+class IdentificationConfig(_Section):
+    """lags n of the difference equation; the most iterates of the robust simulation error."""
+
+    lags: int = Field(ge=1, le=100)
+    iterations: int = Field(default=40, ge=1, le=1000)
+
+
+class LqrConfig(_Section):
+    """Weights of the output's error and of the input's deviation."""
+
+    output_weight: Positive = 1.0
+    input_weight: Positive = 1.0
+
+
+def _none_word(value: object) -> object:
+    return None if value == "none" else value
+
+
+class FunnelConfig(_Section):
+    """The tube: see `nlsid_core.funnels.design_tube`. policy: None is K = 0."""
+
+    horizon: Positive
+    safety_factor: float = Field(default=1.5, ge=1.0, allow_inf_nan=False)
+    inlet: NonNegative = 0.0
+    policy: Annotated[LqrConfig | None, BeforeValidator(_none_word)] = LqrConfig()
+    profile: tuple[Corner, ...] = Field(min_length=2, strict=False)
+
+
+class MonitorConfig(_Section):
+    """nominal: what the tube is around; stale_after, command_wait: s, for the live monitor."""
+
+    nominal: Literal["command", "profile"] = "command"
+    stale_after: Positive = 0.1
+    command_wait: NonNegative = 0.02
+
+    @property
+    def nominal_source(self) -> Nominal:
+        """The same as the core's noun."""
+        return Nominal(self.nominal)
+
+
+class Config(_Section):
+    """One robot's configuration file."""
+
+    robot: str
+    signals: SignalsConfig
+    grid: GridConfig
+    split: SplitConfig = SplitConfig()
+    identification: IdentificationConfig
+    funnel: FunnelConfig
+    monitor: MonitorConfig = MonitorConfig()
+
+
+def load_config(path: Path | str) -> Config:
+    """Read and check a configuration; DataError lists every wrong key with where it stands.
+
+    OS errors pass through.
+    """
+    path = Path(path)
+    if path.stat().st_size > MAX_CONFIG_BYTES:
+        raise DataError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected sections (robot, signals, grid, ...), found none")
+    try:
+        return Config.model_validate(content)
+    except ValidationError as error:
+        problems = [
+            f"  {_where(problem['loc'])}: {problem['msg']} (found {problem['input']!r:.60})"
+            for problem in error.errors()
+        ]
+        raise DataError("\n".join([f"{path}: not a valid configuration:", *problems])) from error
+
+
+def _where(location: Sequence[int | str]) -> str:
+    return ".".join(str(part) for part in location)

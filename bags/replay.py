@@ -1,0 +1,113 @@
+"""Offline monitoring: a bag's messages through the same pairing and monitor as the live node."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from bags.bag import Bag
+from bags.documents import ProvedFunnel
+from bags.grid import seconds
+from bags.message_types import decode, header_stamp_ns, is_stamped
+from bags.pairing import Pairing, Sample
+from bags.signals import SignalPath
+from nlsid_core.errors import BagError
+from nlsid_core.monitor import Monitor, Nominal, Reading, Status
+
+RESPONSE, EXCITATION = "response", "excitation"
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One bag's readings, and what a summary says of them."""
+
+    name: str
+    readings: tuple[Reading, ...]
+    axis: str
+    unit: str
+    half_width: float
+
+    @property
+    def judged(self) -> tuple[Reading, ...]:
+        """The readings that are not unknown."""
+        return tuple(r for r in self.readings if r.status is not Status.UNKNOWN)
+
+    @property
+    def worst(self) -> Reading | None:
+        """The reading with the least margin."""
+        return min(self.judged, key=lambda r: r.margin, default=None)
+
+    @property
+    def first_bad(self) -> Reading | None:
+        """The first reading that is outside or whose assumption is violated."""
+        return next((r for r in self.judged if r.status is not Status.INSIDE), None)
+
+    @property
+    def budget_spent(self) -> float:
+        """The fraction of the disturbance budget spent at the last judged sample."""
+        return self.judged[-1].budget_spent if self.judged else float("nan")
+
+    @property
+    def verdict(self) -> str:
+        """The status at the first bad sample, else inside, else unknown."""
+        bad = self.first_bad
+        if bad is not None:
+            return bad.status.value
+        return Status.INSIDE.value if self.judged else Status.UNKNOWN.value
+
+    @property
+    def reason(self) -> str:
+        """Why it is not inside; empty if it is."""
+        if self.first_bad is not None:
+            return self.first_bad.reason
+        return "" if self.judged or not self.readings else self.readings[-1].reason
+
+
+def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Replay:
+    """Every response in `bag` held against the funnel, message by message as it was recorded.
+
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals on stamped
+    messages. What is wrong with the signals themselves (NaN, gaps, time going back) shows as
+    unknown, as it does live.
+    """
+    bag, model = Path(bag), proved.model
+    monitor, pairing, origin = proved.monitor(nominal), Pairing(), None
+    readings: list[Reading] = []
+    for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
+        if role == RESPONSE:
+            origin = stamp_ns if origin is None else origin
+            samples = pairing.response(stamp_ns, value)
+        else:
+            samples = pairing.excitation(stamp_ns, value)
+        readings += _judge(monitor, samples, origin)
+    readings += _judge(monitor, pairing.flush(), origin)
+    if origin is None:
+        raise BagError(f"{bag}: no message on {model.y.path}")
+    return Replay(
+        name=bag.name,
+        readings=tuple(readings),
+        axis=model.y.name,
+        unit=model.y.unit,
+        half_width=proved.funnel.output_half_width,
+    )
+
+
+def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, int, float]]:
+    """(role, header stamp in ns, value) of every message of the two signals, in log order."""
+    paths = {RESPONSE: SignalPath.parse(response), EXCITATION: SignalPath.parse(excitation)}
+    with Bag(bag) as source:
+        kinds = {role: source.types_on(path.topic) for role, path in paths.items()}
+        for role, path in paths.items():
+            path.check(*kinds[role])
+            if not is_stamped(*kinds[role]):
+                raise BagError(f"{bag}: {path.topic} ({kinds[role][0]}) has no header stamp")
+        for message in source.messages([path.topic for path in paths.values()]):
+            for role, path in paths.items():
+                if path.topic == message.topic:
+                    value = path.value(decode(message.data, *kinds[role]))
+                    yield role, header_stamp_ns(message.data), value
+
+
+def _judge(monitor: Monitor, samples: Iterable[Sample], origin: int | None) -> list[Reading]:
+    if origin is None:
+        return []
+    return [monitor.update(seconds(s.stamp_ns, origin), s.y, s.u) for s in samples]

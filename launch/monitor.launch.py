@@ -1,0 +1,34 @@
+"""Publish a proved funnel and watch the running robot against it.
+
+ros2 launch nlsid monitor.launch.py proof:=/path/to/funnel.proof.json
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+
+def generate_launch_description() -> LaunchDescription:
+    """The publisher, which refuses what is not proved, and the monitor that waits for it."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "proof",
+                description="funnel.proof.json; its funnel, policy and model lie beside it",
+            ),
+            Node(
+                package="nlsid",
+                executable="funnel_publisher",
+                name="funnel_publisher",
+                parameters=[{"proof": LaunchConfiguration("proof")}],
+                output="screen",
+            ),
+            Node(
+                package="nlsid",
+                executable="funnel_monitor",
+                name="funnel_monitor",
+                output="screen",
+            ),
+        ]
+    )

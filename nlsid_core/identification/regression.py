@@ -1,0 +1,122 @@
+"""The linear regression all identification methods share: a dataset as rows of lagged signals."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.models import DifferenceEquation, Signal
+from nlsid_core.trajectory import Dataset
+
+MIN_ROWS_PER_PARAMETER = 5  # fewer and the fit is an interpolation, not an estimate
+RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeats the others
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Rows t = n … of every trial: g_0 y(t) + … + g_n y(t-n) = b_0 u(t) + … + b_n u(t-n) + c.
+
+    Signals are scaled to zero mean and unit spread over the dataset, undone once in `model`.
+    Y: (N, n+1) with y(t-k) in column k; W: (N, n+2), the input window and a constant, as
+    W = Q R with orthonormal Q; row: (N,) index of the row within its trial.
+    """
+
+    Y: FloatArray
+    Q: FloatArray
+    R: FloatArray
+    row: FloatArray
+    y_scale: tuple[float, float]
+    u_scale: tuple[float, float]
+    dataset: Dataset
+
+    @property
+    def lags(self) -> int:
+        """The number of lags n."""
+        return int(self.Y.shape[1]) - 1
+
+    def model(self, g: FloatArray, p: FloatArray) -> DifferenceEquation:
+        """The model, in the signals' own units, of g (n+1,) and p (n+2,) with Y g = Q p."""
+        (y_mean, y_std), (u_mean, u_std) = self.y_scale, self.u_scale
+        window = np.linalg.solve(self.R, p) / g[0]
+        a = -g[1:] / g[0]
+        b = window[:-1] * y_std / u_std
+        c = window[-1] * y_std + y_mean * (1.0 - a.sum()) - u_mean * b.sum()
+        first = self.dataset.trajectories[0]
+        inputs = np.concatenate([trial.u[:, 0] for trial in self.dataset])
+        return DifferenceEquation(
+            a=a,
+            b=b,
+            c=float(c),
+            period=self.dataset.period,
+            y=Signal(first.y_names[0], first.y_units[0], first.y_paths[0]),
+            u=Signal(first.u_names[0], first.u_units[0], first.u_paths[0]),
+            u_range=(float(inputs.min()), float(inputs.max())),
+            bags=tuple((trial.name, trial.digest) for trial in self.dataset),
+        )
+
+
+def build_regression(dataset: Dataset, lags: int) -> Regression:
+    """Stack the lagged rows of every trial of a one-input one-output dataset.
+
+    Raises ShapeError if there is more than one input or output, DataError if there are too few
+    rows or the input does not excite the model (rank-deficient window).
+    """
+    first = dataset.trajectories[0]
+    if first.y.shape[1] != 1 or first.u.shape[1] != 1:
+        raise ShapeError(
+            f"one output and one input are identified; there are {first.y.shape[1]} and "
+            f"{first.u.shape[1]}"
+        )
+    if lags < 1:
+        raise DataError(f"lags is {lags}; a difference equation has at least 1")
+    short = [trial for trial in dataset if len(trial) <= lags]
+    if short:
+        raise DataError(f"{short[0].name}: {len(short[0])} samples, {lags} lags need more")
+    rows = sum(len(trial) - lags for trial in dataset)
+    parameters = 2 * lags + 2
+    if rows < MIN_ROWS_PER_PARAMETER * parameters:
+        raise DataError(
+            f"{rows} rows for {parameters} parameters; give at least "
+            f"{MIN_ROWS_PER_PARAMETER * parameters} or fewer lags than {lags}"
+        )
+    y_scale = _scale(np.concatenate([trial.y[:, 0] for trial in dataset]), "response")
+    u_scale = _scale(np.concatenate([trial.u[:, 0] for trial in dataset]), "excitation")
+    outputs, windows, row = [], [], []
+    for trial in dataset:
+        outputs.append(_lagged((trial.y[:, 0] - y_scale[0]) / y_scale[1], lags))
+        windows.append(_lagged((trial.u[:, 0] - u_scale[0]) / u_scale[1], lags))
+        row.append(np.arange(len(trial) - lags))
+    W = np.concatenate(windows)
+    Q, R = np.linalg.qr(np.column_stack([W, np.ones(len(W))]))
+    singular = np.linalg.svd(R, compute_uv=False)
+    if singular[-1] < RANK_TOLERANCE * singular[0]:
+        rank = int((singular > RANK_TOLERANCE * singular[0]).sum()) - 1
+        raise DataError(
+            f"the excitation does not excite {lags} lags: its window of {lags + 1} samples has "
+            f"rank {rank}; use richer inputs or fewer lags"
+        )
+    return Regression(
+        Y=np.concatenate(outputs),
+        Q=Q,
+        R=R,
+        row=np.concatenate(row),
+        y_scale=y_scale,
+        u_scale=u_scale,
+        dataset=dataset,
+    )
+
+
+def _scale(values: FloatArray, role: str) -> tuple[float, float]:
+    mean, spread = float(values.mean()), float(values.std())
+    if spread <= RANK_TOLERANCE * max(abs(mean), 1.0):
+        raise DataError(
+            f"the {role} is constant ({mean:g}) in all trials: nothing can be identified from it"
+        )
+    return mean, spread
+
+
+def _lagged(signal: FloatArray, lags: int) -> FloatArray:
+    """(N - lags, lags + 1): column k holds signal(t - k), t = lags …."""
+    N = len(signal)
+    return np.column_stack([signal[lags - k : N - k] for k in range(lags + 1)])
