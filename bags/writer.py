@@ -5,13 +5,12 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping
-from io import StringIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Final
 
+import yaml
 from mcap.writer import CompressionType, Writer
-from ruamel.yaml import YAML
 
 from bags.message_types import definition
 from nlsid_core._json import write_atomically
@@ -142,12 +141,9 @@ class BagWriter:
         self._stream.flush()
         os.fsync(self._stream.fileno())
         self._stream.close()
-        text = StringIO()
-        yaml = YAML(typ="safe")
-        yaml.default_flow_style = False
-        yaml.width = 4096  # a value stays on its line
-        yaml.dump({"rosbag2_bagfile_information": self._information()}, text)
-        write_atomically(self._folder / "metadata.yaml", text.getvalue().encode())
+        document = {"rosbag2_bagfile_information": self._information()}
+        text = yaml.safe_dump(document, sort_keys=False, width=4096)  # a value stays on its line
+        write_atomically(self._folder / "metadata.yaml", text.encode())
         if not self._in_place:
             if self.path.exists():  # rename would replace an empty folder
                 self.discard()
