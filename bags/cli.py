@@ -146,7 +146,7 @@ def demo(
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
 ) -> None:
-    """Run the whole chain on the shipped F1TENTH bags, then live over ROS 2 where rclpy is there."""
+    """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     if not run_demo(out_dir, out):
         raise typer.Exit(1)
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from bags.bag import Bag
-from bags.message_types import header_stamp_ns, is_stamped
+from bags.grid import seconds
+from bags.message_types import decode, header_stamp_ns, is_stamped
 from bags.signals import SignalPath
-from bags.times import seconds
 from bags.writer import BagWriter
 from nlsid_core.errors import BagError
 
@@ -48,8 +48,8 @@ def write_faulty_copy(bag: Path | str, out: Path | str, signal: str, fault: Faul
                 if message.topic == path.topic:
                     stamp = header_stamp_ns(data)
                     first = stamp if first is None else first
-                    decoded = types.deserialize_cdr(data, msgtype)
-                    path.assign(decoded, fault(seconds(stamp - first), path.value(decoded)))
+                    decoded = decode(data, msgtype, types)
+                    path.assign(decoded, fault(seconds(stamp, first), path.value(decoded)))
                     data = bytes(types.serialize_cdr(decoded, msgtype))
                 writer.write(
                     message.topic,

@@ -1,15 +1,18 @@
 """Offline monitoring: a bag's messages through the same pairing and monitor as the live node."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from bags.bag import Bag
 from bags.documents import ProvedFunnel
-from bags.pairing import Pairing
-from bags.reader import read_signals
+from bags.message_types import decode, header_stamp_ns, is_stamped
+from bags.signals import SignalPath
+from bags.watch import Stamped, Watch
 from nlsid_core.errors import BagError
 from nlsid_core.monitor import Nominal, Reading, Status
 
-NANOSECONDS = 1e-9
+RESPONSE, EXCITATION = "response", "excitation"
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +21,7 @@ class Replay:
 
     name: str
     readings: tuple[Reading, ...]
+    stamps_ns: tuple[int, ...]
     axis: str
     unit: str
     half_width: float
@@ -59,30 +63,42 @@ class Replay:
 
 
 def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Replay:
-    """Every response in `bag` held against the funnel, in stamp order.
+    """Every response in `bag` held against the funnel, message by message as it was recorded.
 
-    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals on stamped
+    messages. What is wrong with the signals themselves (NaN, gaps, time going back) shows as
+    unknown, as it does live.
     """
-    bag = Path(bag)
-    model = proved.model
-    signals = read_signals(bag, [model.y.path, model.u.path], finite=False)
-    responses, excitations = signals[model.y.path], signals[model.u.path]
-    if not len(responses.stamps):
+    bag, model = Path(bag), proved.model
+    watch = Watch(proved.monitor(nominal))
+    stamped: list[Stamped] = []
+    for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
+        feed = watch.response if role == RESPONSE else watch.excitation
+        stamped += feed(stamp_ns, value)
+    stamped += watch.flush()
+    if watch.origin_ns is None:
         raise BagError(f"{bag}: no message on {model.y.path}")
-    pairing = Pairing()
-    for stamp, value in zip(excitations.stamps, excitations.values, strict=True):
-        pairing.excitation(int(stamp), float(value))
-    for stamp, value in zip(responses.stamps, responses.values, strict=True):
-        pairing.response(int(stamp), float(value))
-    monitor = proved.monitor(nominal)
-    start = int(responses.stamps[0])
-    readings = tuple(
-        monitor.update((stamp - start) * NANOSECONDS, y, u) for stamp, y, u in pairing.flush()
-    )
     return Replay(
         name=bag.name,
-        readings=readings,
+        readings=tuple(reading for _, reading in stamped),
+        stamps_ns=tuple(stamp_ns for stamp_ns, _ in stamped),
         axis=model.y.name,
         unit=model.y.unit,
         half_width=proved.funnel.output_half_width,
     )
+
+
+def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, int, float]]:
+    """(role, header stamp in ns, value) of every message of the two signals, in log order."""
+    paths = {RESPONSE: SignalPath.parse(response), EXCITATION: SignalPath.parse(excitation)}
+    with Bag(bag) as source:
+        kinds = {role: source.types_on(path.topic) for role, path in paths.items()}
+        for role, path in paths.items():
+            path.check(*kinds[role])
+            if not is_stamped(*kinds[role]):
+                raise BagError(f"{bag}: {path.topic} ({kinds[role][0]}) has no header stamp")
+        for message in source.messages([path.topic for path in paths.values()]):
+            for role, path in paths.items():
+                if path.topic == message.topic:
+                    value = path.value(decode(message.data, *kinds[role]))
+                    yield role, header_stamp_ns(message.data), value

@@ -85,14 +85,25 @@ class SignalPath:
         Raises BagError if a dynamic array is too short.
         """
         for step in self.steps:
-            # both decoders append an underscore to a field that is a Python keyword
-            name = f"{step.field}_" if keyword.iskeyword(step.field) else step.field
-            message = getattr(message, name)
+            message = getattr(message, _attribute(step))
             if step.index is not None:
                 if step.index >= len(message):
                     raise BagError(f"{self}: '{step.field}' has {len(message)} elements")
                 message = message[step.index]
         return float(message)
+
+    def assign(self, message: Any, value: float) -> None:
+        """Put `value` in a decoded message's place of this signal; BagError as `value`."""
+        self.value(message)
+        *outer, last = self.steps
+        for step in outer:
+            message = getattr(message, _attribute(step))
+            if step.index is not None:
+                message = message[step.index]
+        if last.index is None:
+            setattr(message, _attribute(last), value)
+        else:
+            getattr(message, _attribute(last))[last.index] = value
 
     def _element(self, step: Step, found: FieldDesc, owner: str) -> FieldDesc:
         """The type of `step`, with its index applied."""
@@ -115,6 +126,11 @@ class SignalPath:
                 f"[0] to [{int(str(length)) - 1}]"
             )
         return element
+
+
+def _attribute(step: Step) -> str:
+    """The decoded message's attribute: both decoders append _ to a field that is a keyword."""
+    return f"{step.field}_" if keyword.iskeyword(step.field) else step.field
 
 
 def _describe(description: FieldDesc) -> str:

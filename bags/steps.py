@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bags import documents
-from bags.config import Config
+from bags.config import Config, SignalConfig
 from bags.grid import read_dataset
 from bags.report import report_available, write_report
 from bags.training import load_training, save_training
@@ -35,15 +35,16 @@ def identify_bags(
 
     Raises DataError (BagError for bags) before anything is written.
     """
+    response, excitation = config.signals.response, config.signals.excitation
     dataset = read_dataset(
         bags,
-        response=config.signals.response.signal(),
-        excitation=config.signals.excitation.signal(),
+        responses=[response.path],
+        excitations=[excitation.path],
         period=config.grid.period,
         max_gap=config.grid.max_gap,
         progress=lambda done, total: progress("reading bags", 0.5 * done / total),
     )
-    train, test = split(dataset, config.split.test)
+    train, test = split(_labelled(dataset, response, excitation), config.split.test)
     fit = identify(
         train,
         lags=config.identification.lags,
@@ -63,6 +64,16 @@ def identify_bags(
         write_report(files[-1], fit, train, test, robot=config.robot)
     progress("done", 1.0)
     return Identified(fit, train, test, tuple(files))
+
+
+def _labelled(dataset: Dataset, response: SignalConfig, excitation: SignalConfig) -> Dataset:
+    """The same trials with the configured names, units and paths on their signals."""
+    labels: dict[str, tuple[str, ...]] = {}
+    for letter, signal in (("y", response), ("u", excitation)):
+        labels[f"{letter}_names"] = (signal.name,)
+        labels[f"{letter}_units"] = (signal.unit,)
+        labels[f"{letter}_paths"] = (signal.path,)
+    return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
 def split(dataset: Dataset, test: Sequence[str]) -> tuple[Dataset, Dataset]:

@@ -145,6 +145,7 @@ class BagWriter:
         text = StringIO()
         yaml = YAML(typ="safe")
         yaml.default_flow_style = False
+        yaml.width = 4096  # a value stays on its line
         yaml.dump({"rosbag2_bagfile_information": self._information()}, text)
         write_atomically(self._folder / "metadata.yaml", text.getvalue().encode())
         if not self._in_place:

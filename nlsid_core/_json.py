@@ -1,8 +1,9 @@
 """Documents on disk: strict JSON whose numbers round-trip exactly, content digests, safe writing.
 
 A float64 printed by Python's `repr` reads back as the same float64, so a document holds exact
-numbers. A digest is the SHA-256 of a canonical form (sorted keys, no white space), so it is a
-property of the content and survives re-indentation.
+numbers; one whose digits are not a float64's is refused, so no changed digit goes unnoticed. A
+digest is the SHA-256 of a canonical form (sorted keys, no white space), so it is a property of the
+content and survives re-indentation.
 """
 
 import hashlib
@@ -11,6 +12,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -178,6 +180,8 @@ def _finite_float(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"{text} does not fit a float64")
+    if repr(value) != text and Decimal(repr(value)) != Decimal(text):
+        raise ValueError(f"{text} is not a float64; the nearest one is {value!r}")
     return value
 
 

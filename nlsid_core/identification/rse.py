@@ -22,6 +22,7 @@ from nlsid_core.identification.regression import Regression
 from nlsid_core.models import DifferenceEquation
 
 DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of the minimiser
+PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding
 MAX_NEWTON = 200
 ARMIJO = 1e-4  # the usual sufficient-decrease fraction
 SHORTEST_STEP = 2.0**-40
@@ -73,11 +74,12 @@ def _minimise(regression: Regression, linearised_at: Iterate | None) -> Iterate:
         theta = np.concatenate([linearised_at.g, linearised_at.p])
     bound = _Bound(band, errors, None if linearised_at is None else linearised_at.g)
     J, x, factor = bound.value(theta)
+    perfect = PERFECT_FIT * float(np.sum(regression.Y[:, 0] ** 2))
     for _ in range(MAX_NEWTON):
         gradient, hessian = bound.derivatives(x, factor)
         step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
         decrement = -float(gradient @ step)
-        if decrement <= DECREMENT * J:
+        if decrement <= DECREMENT * J or perfect >= J:
             return Iterate(theta[:split], theta[split:], J)
         length = 1.0
         while True:

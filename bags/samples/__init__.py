@@ -1,0 +1,12 @@
+"""Small real recordings that ship with the package."""
+
+from importlib.resources import files
+from pathlib import Path
+
+__all__ = ["f1tenth"]
+
+
+def f1tenth() -> list[Path]:
+    """The 41 bags of a F1TENTH car, trial_01 to trial_41; see the README beside them."""
+    folder = Path(str(files("bags.samples"))) / "f1tenth"
+    return sorted(folder.glob("trial_*"))

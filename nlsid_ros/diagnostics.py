@@ -1,0 +1,17 @@
+"""Health as `diagnostic_msgs/DiagnosticArray`, the way ROS tools expect it."""
+
+from collections.abc import Mapping
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+
+def status(
+    stamp: Time, name: str, level: bytes, message: str, values: Mapping[str, str]
+) -> DiagnosticArray:
+    """One status with its key-value pairs; `level` is a DiagnosticStatus constant."""
+    array = DiagnosticArray()
+    array.header.stamp = stamp
+    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+    array.status = [DiagnosticStatus(level=level, name=name, message=message, values=pairs)]
+    return array

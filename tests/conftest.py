@@ -1,0 +1,90 @@
+"""A synthetic robot with a known truth, small enough for every test to fit its own model."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
+from nlsid_core import _json
+from nlsid_core.funnels import TubeDesign, design_tube
+from nlsid_core.identification import Fit, identify
+from nlsid_core.trajectory import Dataset, Trajectory
+
+TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
+TRUE_B = np.array([0.0, 0.05, 0.03])
+PERIOD = 0.1
+SHARED = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+
+
+def simulate_truth(u: np.ndarray) -> np.ndarray:
+    """The synthetic robot's response from rest to u (N,)."""
+    y = np.zeros(len(u))
+    for t in range(2, len(u)):
+        y[t] = TRUE_A @ y[t - 2 : t][::-1] + TRUE_B @ u[t - 2 : t + 1][::-1]
+    return y
+
+
+def synthetic_dataset(noise: float, *, trials: int = 6, samples: int = 80) -> Dataset:
+    """Steps of random height and length, measured with white noise."""
+    rng = np.random.default_rng(7)
+    trajectories = []
+    for index in range(trials):
+        u = np.repeat(rng.uniform(0.0, 1.0, samples // 8), 8)
+        u[:8] = 0.0
+        y = simulate_truth(u) + noise * rng.standard_normal(samples)
+        trajectories.append(
+            Trajectory(
+                t=np.linspace(0.0, PERIOD * (samples - 1), samples),
+                y=y,
+                u=u,
+                y_names=("speed",),
+                u_names=("command",),
+                y_units=("m/s",),
+                u_units=("m/s",),
+                name=f"run_{index}",
+                digest=f"sha256:{index:064x}",
+            )
+        )
+    return Dataset(tuple(trajectories))
+
+
+@pytest.fixture(scope="session")
+def train() -> Dataset:
+    """Noisy recordings of the synthetic robot."""
+    return synthetic_dataset(0.01)
+
+
+@pytest.fixture(scope="session")
+def fit(train: Dataset) -> Fit:
+    """A model with two lags of the synthetic robot."""
+    return identify(train, lags=2)
+
+
+@pytest.fixture(scope="session")
+def design(fit: Fit, train: Dataset) -> TubeDesign:
+    """A tube for it, policy engaged or not."""
+    model = replace(fit.model, training="sha256:0")
+    return design_tube(
+        model,
+        train,
+        profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.5), (7.0, 0.5)],
+        horizon=7.0,
+        inlet=0.02,
+    )
+
+
+@pytest.fixture
+def design_folder(tmp_path: Path, fit: Fit, design: TubeDesign) -> Path:
+    """Model, policy, funnel and both proofs as files, as the command line writes them."""
+    model = design.model
+    for name, document in (
+        (MODEL, model.document()),
+        (MODEL_PROOF, fit.proof.document(model, MODEL)),
+        (POLICY, design.policy.document()),
+        (FUNNEL, design.funnel.document()),
+        (FUNNEL_PROOF, design.proof_document(model=MODEL, policy=POLICY, funnel=FUNNEL)),
+    ):
+        _json.write_document(tmp_path / name, document)
+    return tmp_path
