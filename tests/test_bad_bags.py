@@ -6,7 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import (
+from mcap.writer import Writer
+
+from bags.reader import bag_digest, bag_metadata, read_signals
+from bags.writer import BagWriter
+from nlsid_core.errors import BagError, DataError
+from tests.bag_messages import (
     CMD,
     CMD_TYPE,
     COMMAND,
@@ -21,11 +26,6 @@ from bag_messages import (
     odometry,
     speed_bag,
 )
-from mcap.writer import Writer
-
-from bags.reader import bag_digest, bag_metadata, read_signals
-from bags.writer import BagWriter
-from nlsid_core.errors import BagError, DataError
 
 RESOURCES = Path(__file__).parents[1].parent / "shared" / "data" / "rosbag2_resources"
 

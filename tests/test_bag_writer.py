@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bag_messages import (
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from bags.writer import BagWriter
+from nlsid_core.errors import BagError
+from tests.bag_messages import (
     CMD,
     CMD_TYPE,
     ODOM,
@@ -20,15 +29,6 @@ from bag_messages import (
     odometry,
     speed_bag,
 )
-from mcap.exceptions import EndOfFile
-from mcap.reader import make_reader
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader
-
-from bags.writer import BagWriter
-from nlsid_core.errors import BagError
 
 
 def test_rosbags_reads_back_every_byte_type_hash_and_custom_datum(tmp_path: Path) -> None:

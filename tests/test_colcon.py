@@ -107,12 +107,15 @@ def test_an_installed_executable_runs_on_the_installed_code(workspace: Workspace
     assert Path(config).read_text() == (ROOT / "config" / "f1tenth.yaml").read_text()
 
 
-def test_the_sample_bags_are_installed(workspace: Workspace) -> None:
-    script = "import bags; print(bags.__path__[0])"
-    samples = Path(workspace.run_sourced(sys.executable, "-c", script).strip()) / "samples"
-    wanted = {path.relative_to(ROOT / "bags" / "samples") for path in recordings(ROOT / "bags")}
-    assert {path.relative_to(samples) for path in recordings(samples.parent)} == wanted
+def test_the_sample_bags_are_installed_with_their_licence(workspace: Workspace) -> None:
+    script = "import bags.samples as s; print(s.__path__[0])"
+    installed = Path(workspace.run_sourced(sys.executable, "-c", script).strip())
+    shipped = files_below(ROOT / "bags" / "samples")
+    assert "f1tenth/LICENSE" in shipped
+    assert files_below(installed) == shipped
 
 
-def recordings(package: Path) -> list[Path]:
-    return [path for path in (package / "samples").rglob("*") if path.is_file()]
+def files_below(folder: Path) -> set[str]:
+    """Names of the files in `folder`, but for what Python compiled there."""
+    files = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return {str(path) for path in files if path.suffix != ".pyc"}

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 
 from bags.grid import read_dataset, require_excitation, seconds, to_trajectory
 from bags.reader import Samples, bag_digest
 from nlsid_core.errors import DataError
+from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 
 MS = 1_000_000
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import COMMAND, SPEED
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,6 +14,7 @@ from bags.message_types import decode, header_stamp_ns
 from bags.pairing import Pairing, Sample
 from bags.samples import f1tenth
 from bags.signals import SignalPath
+from tests.bag_messages import COMMAND, SPEED
 
 
 @pytest.mark.parametrize("bag", [f1tenth()[k] for k in (4, 10, 37)], ids=lambda bag: bag.name)

@@ -5,7 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_messages import (
+
+from bags.bag import Bag
+from bags.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_metadata, read_signals
+from bags.writer import BagWriter
+from tests.bag_messages import (
     COMMAND,
     JOINT_TYPE,
     PERIOD_NS,
@@ -16,10 +20,6 @@ from bag_messages import (
     speed_bag,
     twist,
 )
-
-from bags.bag import Bag
-from bags.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_metadata, read_signals
-from bags.writer import BagWriter
 
 RESOURCES = Path(__file__).parents[1].parent / "shared" / "data" / "rosbag2_resources"
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from bag_messages import JOINT_TYPE, ODOM_TYPE, START_NS, joints, odometry
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
@@ -10,6 +9,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from bags.message_types import header_stamp_ns, is_stamped, standard_types, types_in_bag
 from bags.signals import SignalPath, Step
 from nlsid_core.errors import BagError
+from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, START_NS, joints, odometry
 
 
 def test_a_path_parses_into_topic_and_steps_and_prints_back() -> None:
