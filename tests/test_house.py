@@ -115,8 +115,8 @@ def packages_loaded_by(modules: list[str]) -> set[str]:
 def test_checking_and_monitoring_load_nothing_but_numpy() -> None:
     modules = [module_name(path) for path in sources("nlsid_core") if is_base(path)]
     assert {"nlsid_core.certificate", "nlsid_core.models"} <= set(modules)
-    loaded = packages_loaded_by(modules) - set(sys.stdlib_module_names)
-    assert loaded == {"nlsid_core", "numpy"}
+    with_numpy = packages_loaded_by(["numpy"]) | set(sys.stdlib_module_names)
+    assert packages_loaded_by(modules) - with_numpy == {"nlsid_core"}
 
 
 def test_the_core_and_the_bags_load_no_ros() -> None:
@@ -127,7 +127,7 @@ def test_the_core_and_the_bags_load_no_ros() -> None:
 
 def test_every_folder_of_modules_is_a_package_and_so_gets_installed() -> None:
     folders = {path.parent for path in sources(*PACKAGES)}
-    assert all((folder / "__init__.py").is_file() for folder in folders), folders
+    assert not {folder for folder in folders if not (folder / "__init__.py").is_file()}
 
 
 Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
@@ -142,12 +142,21 @@ def public_definitions(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str,
                 yield from public_definitions(node.body, f"{prefix}.{node.name}")
 
 
+def is_overload(node: Definition) -> bool:
+    """A signature for the type checker; the docstring is on the function that follows."""
+    return any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list)
+
+
 @pytest.mark.parametrize("path", sources(*PACKAGES), ids=ids)
 def test_everything_public_has_a_docstring(path: Path) -> None:
     tree = ast.parse(path.read_text())
     name = module_name(path)
     silent = [] if ast.get_docstring(tree) else [name]
-    silent += [n for n, node in public_definitions(tree.body, name) if not ast.get_docstring(node)]
+    silent += [
+        full_name
+        for full_name, node in public_definitions(tree.body, name)
+        if not ast.get_docstring(node) and not is_overload(node)
+    ]
     assert not silent, f"no docstring: {', '.join(silent)}"
 
 
