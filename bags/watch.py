@@ -7,8 +7,6 @@ from bags.grid import seconds
 from bags.pairing import Pairing, Sample
 from nlsid_core.monitor import Monitor, Reading
 
-FOREVER = 2**63
-
 
 class Stamped(NamedTuple):
     """A reading and the stamp (ns) of the response it judges."""
@@ -40,7 +38,7 @@ class Watch:
             self.origin_ns = stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         before = self.pairing.late_responses
-        readings = self._judge(self.pairing.response(stamp_ns, (y,)))
+        readings = self._judge(self.pairing.response(stamp_ns, y))
         if self.pairing.late_responses > before:
             back = seconds(self._newest_ns, stamp_ns)
             readings += self.missing(f"time went back by {back:g} s on {self.monitor.model.y.path}")
@@ -52,7 +50,7 @@ class Watch:
 
     def flush(self) -> list[Stamped]:
         """Stop waiting for commands: readings for every response so far."""
-        return self._judge(self.pairing.flush(FOREVER))
+        return self._judge(self.pairing.flush())
 
     def missing(self, reason: str) -> list[Stamped]:
         """The state is missing or stale: unknown from here on."""
@@ -67,7 +65,7 @@ class Watch:
         return [
             Stamped(
                 s.stamp_ns,
-                self.monitor.update(seconds(s.stamp_ns, self.origin_ns), s.y[0], s.u[0]),
+                self.monitor.update(seconds(s.stamp_ns, self.origin_ns), s.y, s.u),
             )
             for s in samples
         ]

@@ -177,7 +177,7 @@ class FunnelMonitor(Node):
             "worst axis": reading.worst_axis,
             "budget spent": f"{reading.budget_spent:.6g}",
             "time in run [s]": f"{reading.t:.9g}",
-            "late commands": str(self._watch.pairing.late_excitations if self._watch else 0),
+            "late commands": str(self._watch.pairing.late if self._watch else 0),
         }
         text = reading.status.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
