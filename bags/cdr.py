@@ -10,8 +10,7 @@ four-byte encapsulation header.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -66,18 +65,27 @@ class Hop(Protocol):
 Target = Sequence[Hop]
 
 
-@dataclass(frozen=True)
-class Layout:
+class Group(NamedTuple):
+    """Wanted numbers of one kind: which targets they are, and where they are in a message."""
+
+    kind: str
+    is_bool: bool
+    targets: IntArray
+    offsets: IntArray
+
+
+class Layout(NamedTuple):
     """Where the wanted numbers are in a message, and the bytes that make it so.
 
-    leaves: (offset, NumPy kind, is bool) per target. fixed: (offset, length) of the bytes that
-    another message must share. end: bytes it must at least have; with `whole`, and 3 at most more
-    (padding), because its last field was reached.
+    words: (W,) offsets of the lengths that another message must share, expected: (W,) what they
+    are. spans: other bytes it must share, (offset, bytes). end: bytes it must at least have; with
+    `whole`, and PADDING at most more, because its last field was reached.
     """
 
-    order: str
-    leaves: tuple[tuple[int, str, bool], ...]
-    fixed: tuple[tuple[int, int], ...]
+    groups: tuple[Group, ...]
+    words: IntArray
+    expected: Any
+    spans: tuple[tuple[int, bytes], ...]
     end: int
     whole: bool
 
@@ -91,7 +99,6 @@ class Gatherer:
         self.targets = targets
         self._static: dict[str, bool] = {}
         self._layout: Layout | None = None
-        self._template = b""
 
     def gather(self, batch: Batch) -> FloatArray:
         """(targets, N) values of the batch's N messages.
@@ -99,24 +106,24 @@ class Gatherer:
         Raises UnreadableMessageError, with the message's place in the batch, if one is damaged.
         """
         values = np.empty((len(self.targets), len(batch)))
+        if self._layout is not None and _matches(self._layout, batch).all():
+            _take(self._layout, batch, values)
+            return values
         rows = np.arange(len(batch))
         layouts = 0
         while len(rows):
-            layout, template = self._layout, self._template
-            same = None if layout is None else _matches(layout, template, batch, rows)
-            if layout is None or same is None or not same.any():
-                first = int(rows[0])
-                template = batch.data(first)
-                try:
-                    layout = self.layout(template)
-                except BagError as error:
-                    raise UnreadableMessageError(first, error) from error
-                self._layout, self._template = layout, template
-                layouts += 1
-                some = rows[:1] if layouts > MAX_LAYOUTS else rows
-                same = np.zeros(len(rows), dtype=bool)
-                same[: len(some)] = _matches(layout, template, batch, some)
-            self._take(layout, batch, rows[same], values)
+            first = int(rows[0])
+            try:
+                layout = self._layout = self.layout(batch.data(first))
+            except BagError as error:
+                raise UnreadableMessageError(first, error) from error
+            layouts += 1
+            some = batch.select(rows if layouts <= MAX_LAYOUTS else rows[:1])
+            same = np.zeros(len(rows), dtype=bool)
+            same[: len(some)] = _matches(layout, some)
+            found = np.empty((len(self.targets), int(same.sum())))
+            _take(layout, batch.select(rows[same]), found)
+            values[:, rows[same]] = found
             rows = rows[~same]
         return values
 
@@ -139,13 +146,6 @@ class Gatherer:
             self._static[name] = all(self.is_static(field) for _, field in fields)
         return self._static[name]
 
-    @staticmethod
-    def _take(layout: Layout, batch: Batch, rows: IntArray, values: FloatArray) -> None:
-        start = batch.start[rows]
-        for column, (offset, kind, is_bool) in zip(values, layout.leaves, strict=True):
-            found = _view(batch.buffer, layout.order + kind)[start + offset]
-            column[rows] = found != 0 if is_bool else found
-
 
 class UnreadableMessageError(BagError):
     """A message of a batch cannot be read; `row` is its place in the batch."""
@@ -155,30 +155,37 @@ class UnreadableMessageError(BagError):
         self.row = row
 
 
+def _take(layout: Layout, batch: Batch, values: FloatArray) -> None:
+    """Put the wanted numbers of messages of this layout into `values` (targets, N)."""
+    for kind, is_bool, targets, offsets in layout.groups:
+        found = _view(batch.buffer, kind)[offsets[:, None] + batch.start]
+        values[targets] = found != 0 if is_bool else found
+
+
+def _matches(layout: Layout, batch: Batch) -> Any:
+    """Which messages of the batch have this layout."""
+    size = batch.size
+    same = size >= layout.end
+    if layout.whole:
+        same &= size <= layout.end + PADDING
+    if not same.all():
+        if same.any():
+            rows = np.flatnonzero(same)
+            same[rows] = _matches(layout, batch.select(rows))
+        return same
+    words = _view(batch.buffer, "<u4")[layout.words[:, None] + batch.start]
+    same &= (words == layout.expected[:, None]).all(axis=0)
+    for offset, wanted in layout.spans:
+        found = _view(batch.buffer, f"V{len(wanted)}")[batch.start + offset]
+        there = found.view("u1").reshape(len(batch), len(wanted))
+        same &= (there == np.frombuffer(wanted, "u1")).all(axis=1)
+    return same
+
+
 def _view(buffer: bytes, kind: str) -> Any:
     """The buffer as numbers starting at every byte."""
     dtype = np.dtype(kind)
     return np.ndarray((max(0, len(buffer) - dtype.itemsize + 1),), dtype, buffer, strides=(1,))
-
-
-def _matches(layout: Layout, template: bytes, batch: Batch, rows: IntArray) -> Any:
-    """Which of the messages `rows` have the layout found in `template`."""
-    size = batch.size[rows]
-    same = (size >= layout.end) & ((size <= layout.end + PADDING) | (not layout.whole))
-    start = batch.start[rows]
-    for offset, length in layout.fixed:
-        fits = start <= len(batch.buffer) - offset - length
-        if not fits.all():
-            same &= fits
-            start = np.where(fits, start, 0)
-        if length == 4:
-            words = _view(batch.buffer, "<u4")[start + offset]
-            same &= words == int.from_bytes(template[offset : offset + 4], "little")
-        else:
-            spans = _view(batch.buffer, f"V{length}")[start + offset]
-            wanted = np.frombuffer(template[offset : offset + length], "u1")
-            same &= (spans.view("u1").reshape(len(rows), length) == wanted).all(axis=1)
-    return same
 
 
 class _Walk:
@@ -191,7 +198,8 @@ class _Walk:
         self._data = data
         self._order = "<" if data[1] else ">"
         self._at = ENCAPSULATION
-        self._fixed = [(0, 2)]
+        self._words: list[int] = []
+        self._spans = [(0, data[:2])]
         self._leaves: list[tuple[int, str, bool] | None] = [None] * len(gatherer.targets)
         self._missing = len(gatherer.targets)
         self._steps = 0
@@ -204,9 +212,21 @@ class _Walk:
                 f"not a '{self._of.msgtype}': the message has {len(self._data)} bytes, "
                 f"one with its lengths has {self._at}"
             )
-        leaves = tuple(leaf for leaf in self._leaves if leaf is not None)
-        assert len(leaves) == len(self._of.targets)
-        return Layout(self._order, leaves, _joined(self._fixed), self._at, whole)
+        words = np.array(self._words, dtype=np.int64)
+        expected = _view(self._data, "<u4")[words]
+        return Layout(self._groups(), words, expected, tuple(self._spans), self._at, whole)
+
+    def _groups(self) -> tuple[Group, ...]:
+        """The leaves by kind, in the order of the targets."""
+        by_kind: dict[tuple[str, bool], list[tuple[int, int]]] = {}
+        for target, leaf in enumerate(self._leaves):
+            assert leaf is not None
+            offset, kind, is_bool = leaf
+            by_kind.setdefault((kind, is_bool), []).append((target, offset))
+        return tuple(
+            Group(self._order + kind, is_bool, *np.array(leaves, dtype=np.int64).T)
+            for (kind, is_bool), leaves in by_kind.items()
+        )
 
     def _struct(self, msgtype: str, wanted: list[tuple[int, int]]) -> bool:
         """Walk a message; False once the rest of it cannot matter."""
@@ -302,7 +322,7 @@ class _Walk:
         self._align(4)
         self._at += 4
         self._check_end()
-        self._fixed.append((self._at - 4, 4))
+        self._words.append(self._at - 4)
         order = "little" if self._order == "<" else "big"
         return int.from_bytes(self._data[self._at - 4 : self._at], order)  # type: ignore[arg-type]
 
@@ -320,13 +340,12 @@ class _Walk:
         assert description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE)
         length = description[1][1]
         count = int(str(length)) if description[0] == Nodetype.ARRAY else self._word()
-        start = self._at
         found = []
         for _ in range(count):
-            found.append(self._string().decode("utf-8", "replace"))
+            text = self._string()
+            self._spans.append((self._at - len(text) - 1, text + b"\0"))
+            found.append(text.decode("utf-8", "replace"))
             self._count_step()
-        if self._at > start:
-            self._fixed.append((start, self._at - start))
         return found
 
     def _align(self, size: int) -> None:
@@ -346,12 +365,3 @@ class _Walk:
         self._steps += 1
         if self._steps > MAX_STEPS:
             raise BagError(f"a '{self._of.msgtype}' of more than {MAX_STEPS} elements")
-
-
-def _joined(spans: Sequence[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """Spans without those that lie inside others."""
-    kept: list[tuple[int, int]] = []
-    for offset, length in sorted(spans, key=lambda span: (span[0], -span[1])):
-        if not kept or offset + length > kept[-1][0] + kept[-1][1]:
-            kept.append((offset, length))
-    return tuple(kept)

@@ -6,7 +6,7 @@ puts the parts together. Memory: one chunk and its index, and what is returned.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ STAMP: Final = (
     (Step("header"), Step("stamp"), Step("sec")),
     (Step("header"), Step("stamp"), Step("nanosec")),
 )
+MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
 Progress = Callable[[int, int], None]
 
 
@@ -72,13 +73,13 @@ def read_columns(
 
     As `stream_columns`; a topic without messages gives columns of length 0.
     """
-    parts: dict[str, list[Columns]] = {signal.topic: [] for signal in signals.values()}
+    names: dict[str, list[str]] = {}
+    for name, signal in signals.items():
+        names.setdefault(signal.topic, []).append(name)
+    growing = {topic: _Growing(bag, topic, columns) for topic, columns in names.items()}
     for part in stream_columns(bag, signals, progress=progress):
-        parts[part.topic].append(part)
-    names = {
-        topic: [n for n, signal in signals.items() if signal.topic == topic] for topic in parts
-    }
-    return {topic: _joined(topic, names[topic], parts.pop(topic)) for topic in list(parts)}
+        growing[part.topic].append(part)
+    return {topic: growing.pop(topic).columns() for topic in names}
 
 
 def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
@@ -144,27 +145,43 @@ def _check(bag: Bag, path: SignalPath) -> None:
         raise BagError(message if str(bag.path) in message else f"{bag.path}: {error}") from error
 
 
-def _joined(topic: str, names: Sequence[str], parts: list[Columns]) -> Columns:
-    """The parts as one, by log time; the sort is stable, so equal log times stay as recorded."""
-    log_ns = _concatenated([part.log_ns for part in parts], np.int64)
-    order = None if (np.diff(log_ns) >= 0).all() else np.argsort(log_ns, kind="stable")
-    stamps = [part.stamp_ns for part in parts if part.stamp_ns is not None]
-    stamped = len(stamps) == len(parts)
+class _Growing:
+    """One topic's columns while they are read: memory for what the bag announces, within reason."""
 
-    def ordered(column: Any) -> Any:
-        return column if order is None else column[order]
+    def __init__(self, bag: Bag, topic: str, names: Sequence[str]) -> None:
+        announced = sum(channel.count for channel in bag.channels if channel.topic == topic)
+        capacity = min(announced, MAX_ANNOUNCED)
+        self._topic = topic
+        self._names = names
+        self._stamped = is_stamped(*bag.types_on(topic))
+        self._times = np.empty((3 if self._stamped else 2, capacity), dtype=np.int64)
+        self._values = np.empty((len(names), capacity))
+        self._length = 0
 
-    return Columns(
-        topic,
-        ordered(log_ns),
-        ordered(_concatenated([part.publish_ns for part in parts], np.int64)),
-        ordered(_concatenated(stamps, np.int64)) if stamped else None,
-        {
-            name: ordered(_concatenated([part.values[name] for part in parts], np.float64))
-            for name in names
-        },
-    )
+    def append(self, part: Columns) -> None:
+        start, self._length = self._length, self._length + len(part)
+        if self._length > self._times.shape[1]:
+            more = max(self._length, 2 * self._times.shape[1]) - start
+            self._times = np.pad(self._times[:, :start], ((0, 0), (0, more)))
+            self._values = np.pad(self._values[:, :start], ((0, 0), (0, more)))
+        here = slice(start, self._length)
+        self._times[0, here] = part.log_ns
+        self._times[1, here] = part.publish_ns
+        if part.stamp_ns is not None:
+            self._times[2, here] = part.stamp_ns
+        for row, name in enumerate(self._names):
+            self._values[row, here] = part.values[name]
 
-
-def _concatenated(arrays: Sequence[Any], dtype: type) -> Any:
-    return np.concatenate(arrays) if arrays else np.zeros(0, dtype=dtype)
+    def columns(self) -> Columns:
+        """By log time; the sort is stable, so equal log times stay as recorded."""
+        times, values = self._times[:, : self._length], self._values[:, : self._length]
+        if (np.diff(times[0]) < 0).any():
+            order = np.argsort(times[0], kind="stable")
+            times, values = times[:, order], values[:, order]
+        return Columns(
+            self._topic,
+            times[0],
+            times[1],
+            times[2] if self._stamped else None,
+            dict(zip(self._names, values, strict=True)),
+        )
