@@ -242,7 +242,7 @@ class McapFile:
         """Look into the blocks for channels the rest of the file does not list; count messages."""
         found = self.contents
         for block in found.blocks:
-            if block.index is not None and block.index.keys() <= found.channels.keys():
+            if block.index is not None and all(map(self._is_known, block.index)):
                 counts = {channel: count for channel, (_, count) in block.index.items()}
             else:
                 try:
@@ -262,6 +262,13 @@ class McapFile:
         if lost := found.counts.keys() - found.channels.keys():
             raise BagError(f"messages on channel {min(lost)}, which nothing declares")
         self._check_statistics()
+
+    def _is_known(self, channel_id: int) -> bool:
+        """Whether a channel and its schema have been declared so far."""
+        channel = self.contents.channels.get(channel_id)
+        if channel is None:
+            return False
+        return channel.schema_id == 0 or channel.schema_id in self.contents.schemas
 
     def _check_statistics(self) -> None:
         """Hold the finished file's own count of its messages against what is there."""

@@ -5,8 +5,8 @@ python -m benchmarks.bag_reading [--json] [--messages 2000000] [--data DIR]
 The bag holds JointState (six joints), Odometry and Imu in equal parts, in zstd chunks; it is
 generated once and kept in DIR (default: the temporary folder). Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
-deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy machine does not
-count, and the memory is that process's.
+deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
+machine does not count; the memory is that process's.
 """
 
 import os
