@@ -52,10 +52,9 @@ class Bag:
             self.ending = "it has no metadata.yaml: the recording was not closed"
         if self._described.storage == "mcap" and not self._described.compressed:
             self._storage: Storage = McapStorage(self.files, CUSTOM_DATA)
-        elif self._described.finished:
-            self._storage = RosbagsStorage(self.path)
         else:
-            raise BagError(f"{self.path}: {self.ending}; `ros2 bag reindex` it")
+            whole = self._described.compressed
+            self._storage = RosbagsStorage([self.path] if whole else self.files)
         self.ending = self._storage.ending or self.ending
         if self.ending is not None and not unfinished:
             self.close()

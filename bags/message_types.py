@@ -111,7 +111,7 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
         fields_of(msgtype, standard)
         return standard
     with _defining(msgtype):
-        parsed = _parse(msgtype, embedded)
+        parsed = _completed(_parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
             for name, (_, fields) in parsed.items()
@@ -145,6 +145,21 @@ def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
     for part in text.split(IDL_SEPARATOR)[1:]:
         types.update(get_types_from_idl(part.partition("\n")[2]))
     return types
+
+
+def _completed(parsed: Typesdict) -> Typesdict:
+    """With the standard types that the definition uses and leaves out."""
+    standard = standard_types().fielddefs
+    todo, complete = list(parsed), dict(parsed)
+    while todo:
+        for _, description in complete[todo.pop()][1]:
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            name = str(description[1])
+            if description[0] == Nodetype.NAME and name not in complete and name in standard:
+                complete[name] = standard[name]
+                todo.append(name)
+    return complete
 
 
 def _refuse_odd_names(types: Typesdict) -> None:

@@ -171,37 +171,27 @@ class McapStorage:
 
 
 class RosbagsStorage:
-    """A bag that rosbags reads: sqlite3, files compressed whole, ROS 1."""
+    """A bag that rosbags reads: sqlite3, compressed whole, ROS 1.
+
+    Each file is opened by itself: given the folder, rosbags leaves out topics whose quality of
+    service reads otherwise in metadata.yaml than in the file.
+    """
 
     ending: str | None = None
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        ros1 = path.suffix == ".bag"
-        with reading(path):
-            reader: Any = Ros1Reader(path) if ros1 else Ros2Reader(path)
-            reader.open()
-        self._reader = reader
-        with reading(path):
-            self._connections = list(self._reader.connections)
-        self._ros1 = ros1
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.channels: list[Channel] = []
         self.custom: dict[str, str] = {}
-        if path.is_dir():
-            self.custom = dict(self._reader.storage.metadata.custom or {})
-        self.channels = [self._channel(*entry) for entry in enumerate(self._connections)]
-
-    def _channel(self, key: int, connection: Connection) -> Channel:
-        encoding, definition = "cdr", connection.msgdef
-        if isinstance(connection.ext, ConnectionExtRosbag2):
-            encoding = connection.ext.serialization_format
-        if self._ros1:
-            try:
-                definition = ros2_definition(connection.msgtype, definition)
-            except BagError:
-                encoding = "ros1"  # of a type that cannot be translated; the others can be read
-        return Channel(
-            key, connection.topic, connection.msgtype, encoding, definition, connection.msgcount
-        )
+        self._readers: list[tuple[Path, Any, list[Connection]]] = []
+        for path in paths:
+            with reading(path):
+                ros1 = path.suffix == ".bag"
+                reader: Any = Ros1Reader(path) if ros1 else Ros2Reader(path)
+                reader.open()
+                connections = list(reader.connections)
+            self._readers.append((path, reader, connections))
+            for connection in connections:
+                self.channels.append(_channel(len(self.channels), connection, ros1=ros1))
 
     def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """(channel key, messages), in the order of log time."""
@@ -216,23 +206,33 @@ class RosbagsStorage:
 
     def messages(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages by log time; equal log times as recorded."""
-        wanted = [self._connections[key] for key in keys]
-        place = {id(connection): key for key, connection in enumerate(self._connections)}
-        if not wanted:
-            return
-        with reading(self._path):
-            for connection, log_ns, data in self._reader.messages(wanted):
+        first, streams = 0, []
+        for path, reader, connections in self._readers:
+            wanted = [c for key, c in enumerate(connections, first) if key in keys]
+            if wanted:
+                place = {id(c): key for key, c in enumerate(connections, first)}
+                streams.append(self._read(path, reader, wanted, place))
+            first += len(connections)
+        return heapq.merge(*streams, key=lambda raw: raw.log_ns)
+
+    def _read(
+        self, path: Path, reader: Any, wanted: Sequence[Connection], place: Mapping[int, int]
+    ) -> Iterator[Raw]:
+        with reading(path):
+            for connection, log_ns, data in reader.messages(wanted):
                 if not 0 <= log_ns < 2**63:
                     raise BagError(f"a message on {connection.topic} has log time {log_ns} ns")
-                key = place[id(connection)]
-                if self._ros1 and self.channels[key].encoding == "cdr":
-                    types = types_in_bag(connection.msgtype, self.channels[key].definition)
-                    data = types.ros1_to_cdr(data, connection.msgtype)
-                yield Raw(key, log_ns, log_ns, bytes(data))
+                channel = self.channels[place[id(connection)]]
+                if path.suffix == ".bag" and channel.encoding == "cdr":
+                    types = types_in_bag(channel.msgtype, channel.definition)
+                    data = types.ros1_to_cdr(data, channel.msgtype)
+                yield Raw(channel.key, log_ns, log_ns, bytes(data))
 
     def close(self) -> None:
         """Close the files."""
-        self._reader.close()
+        for _, reader, _ in self._readers:
+            reader.close()
+        self._readers = []
 
 
 @contextmanager
@@ -254,6 +254,19 @@ def reading(path: Path) -> Iterator[None]:
         raise BagError(
             f"{path} is damaged or not a bag: {type(error).__name__}: {str(error)[:200]}"
         ) from error
+
+
+def _channel(key: int, connection: Connection, *, ros1: bool) -> Channel:
+    encoding, definition = "cdr", connection.msgdef
+    if isinstance(connection.ext, ConnectionExtRosbag2):
+        encoding = connection.ext.serialization_format
+    if ros1:
+        try:
+            definition = ros2_definition(connection.msgtype, definition)
+        except BagError:
+            encoding = "ros1"  # of a type that cannot be translated; the others can be read
+    msgtype = _type_name(connection.msgtype)
+    return Channel(key, connection.topic, msgtype, encoding, definition, connection.msgcount)
 
 
 def _definition(schema: Any) -> MessageDefinition:
