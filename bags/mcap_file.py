@@ -7,6 +7,7 @@ Every length is held against the bytes that are there before anything is allocat
 Source: the MCAP specification, https://mcap.dev/spec.
 """
 
+import re
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
@@ -37,6 +38,8 @@ from nlsid_core._types import IntArray
 from nlsid_core.errors import BagError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
+SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.FOOTER)
+SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
 )  # of the records read whole: schemas, metadata, loose messages
@@ -44,6 +47,7 @@ LOOSE_RUN_BYTES: Final = 4 * 2**20  # messages outside chunks are read in runs o
 
 _CHUNK: Final = struct.Struct("<QQQII")
 _INDEX: Final = struct.Struct("<HI")
+_COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
 _INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 Record = TypeVar("Record")
@@ -64,17 +68,20 @@ class Contents:
     stated: dict[int, int] | None = None  # the statistics' count of messages per channel
     ending: str | None = None
     good_bytes: int = 0
+    lost: list[str] = field(default_factory=list)
 
 
 class McapFile:
     """An MCAP file open for reading. Close it, or use as a context manager.
 
-    Raises BagError if it is not an MCAP file or if its walk ends in nonsense; a file that merely
-    stops early opens, and says so in `contents.ending`.
+    Raises BagError if it is not an MCAP file or if a record is damaged; a file that merely stops
+    early opens, and says so in `contents.ending`. With `salvage=True` what is damaged is left out
+    and listed in `contents.lost`, and indexes and summary are not used.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, salvage: bool = False) -> None:
         self.path = Path(path)
+        self._salvage = salvage
         self._size = self.path.stat().st_size
         self._stream: BinaryIO = self.path.open("rb")
         try:
@@ -141,12 +148,15 @@ class McapFile:
         while at + RECORD.size <= self._size:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             content, end = at + RECORD.size, at + RECORD.size + length
-            if end > self._size:
-                found.ending = f"the record at byte {at} runs past the end of the file"
-                break
-            if opcode == 0:
-                found.ending = f"there is no record at byte {at}"
-                break
+            if end > self._size or opcode == 0:
+                what = "runs past the end of the file" if opcode else "is no record"
+                found.ending = f"what starts at byte {at} {what}"
+                following = self._next_chunk(at + 1) if self._salvage else None
+                if following is None:
+                    break
+                found.lost.append(f"bytes {at} to {following}: no records")
+                at = following
+                continue
             if opcode == Opcode.MESSAGE:
                 if length < MESSAGE_FIXED:
                     raise BagError(f"the message at byte {at} has {length} bytes")
@@ -154,8 +164,11 @@ class McapFile:
                 loose.add(found, at, end, int(header["log"]))
             else:
                 loose.close(found)
-                self._note(found, opcode, content, length)
+                self._try_note(found, opcode, content, length)
             at = found.good_bytes = end
+            if opcode == Opcode.DATA_END and self._salvage:  # what follows repeats what was said
+                found.ending = None
+                break
             if opcode == Opcode.FOOTER:
                 if self._read(at, len(MAGIC)) == MAGIC:
                     found.ending = None
@@ -165,6 +178,28 @@ class McapFile:
             last = found.blocks[-1]
             found.blocks[-1] = replace(last, index=None)
         return found
+
+    def _try_note(self, found: Contents, opcode: int, content: int, length: int) -> None:
+        if not self._salvage:
+            self._note(found, opcode, content, length)
+        elif opcode not in SUMMARISING:
+            try:
+                self._note(found, opcode, content, length)
+            except BagError as error:
+                found.lost.append(str(error))
+
+    def _next_chunk(self, start: int) -> int | None:
+        """The first byte from `start` on where a compressed chunk's record begins."""
+        before = RECORD.size + _CHUNK.size - 4  # from there to the length of the compression's name
+        keep = before + 16
+        for at in range(start, self._size, SEARCH_BYTES):
+            window = self._read(at, SEARCH_BYTES + keep)
+            for match in _COMPRESSION.finditer(window, before):
+                place = at + match.start() - before
+                opcode, length = RECORD.unpack(self._read(place, RECORD.size))
+                if opcode == Opcode.CHUNK and place + RECORD.size + length <= self._size:
+                    return place
+        return None
 
     def _note(self, found: Contents, opcode: int, content: int, length: int) -> None:
         """Keep what a record outside chunks says."""
@@ -241,27 +276,37 @@ class McapFile:
     def _find_channels(self) -> None:
         """Look into the blocks for channels the rest of the file does not list; count messages."""
         found = self.contents
+        damaged: list[Block] = []
         for block in found.blocks:
             if block.index is not None and all(map(self._is_known, block.index)):
                 counts = {channel: count for channel, (_, count) in block.index.items()}
             else:
                 try:
-                    buffer = self.content(block)
-                    schemas, channels = walk_channels(buffer)
-                except BagError:
-                    if found.ending is None:
+                    counts = self._declared_in(block)
+                except BagError as error:
+                    if found.ending is None and not self._salvage:
                         raise
-                    continue  # the last, damaged block of an unfinished file
-                for schema in schemas:
-                    add_schema(found.schemas, schema)
-                for channel in channels:
-                    add_channel(found.channels, channel)
-                counts = {channel: len(at) for channel, at in walk_messages(buffer).items()}
+                    found.lost.append(str(error))
+                    damaged.append(block)
+                    continue
             for channel_id, count in counts.items():
                 found.counts[channel_id] = found.counts.get(channel_id, 0) + count
+        found.blocks = [block for block in found.blocks if block not in damaged]
         if lost := found.counts.keys() - found.channels.keys():
-            raise BagError(f"messages on channel {min(lost)}, which nothing declares")
+            if not self._salvage:
+                raise BagError(f"messages on channel {min(lost)}, which nothing declares")
+            found.lost += [f"{found.counts[c]} messages of unknown channel {c}" for c in lost]
         self._check_statistics()
+
+    def _declared_in(self, block: Block) -> dict[int, int]:
+        """Note the schemas and channels a block declares; how many messages each channel has."""
+        content = self.content(block)
+        schemas, channels = walk_channels(content)
+        for schema in schemas:
+            add_schema(self.contents.schemas, schema)
+        for channel in channels:
+            add_channel(self.contents.channels, channel)
+        return {channel_id: len(at) for channel_id, at in walk_messages(content).items()}
 
     def _is_known(self, channel_id: int) -> bool:
         """Whether a channel and its schema have been declared so far."""

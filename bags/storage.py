@@ -75,7 +75,7 @@ class Storage(Protocol):
 class McapStorage:
     """MCAP files, the parts of one recording. Memory: one chunk, or the chunks that overlap."""
 
-    def __init__(self, files: Sequence[Path], custom_record: str) -> None:
+    def __init__(self, files: Sequence[Path], custom_record: str, *, salvage: bool = False) -> None:
         self.channels: list[Channel] = []
         self.custom: dict[str, str] = {}
         self.files: list[McapFile] = []
@@ -84,7 +84,7 @@ class McapStorage:
         try:
             for path in files:
                 with reading(path):
-                    self._add(McapFile(path), custom_record)
+                    self._add(McapFile(path, salvage=salvage), custom_record)
         except BaseException:
             self.close()
             raise
