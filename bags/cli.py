@@ -1,4 +1,4 @@
-"""The command line `nlsid`: identify, funnel, check, monitor, demo."""
+"""The command line `nlsid`: identify, funnel, check, monitor, demo; `bag` for recordings."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from bags import documents, show
+from bags.bag_cli import bag_app
 from bags.config import load_config
 from bags.demo import run_demo
 from bags.folders import expand_bags
@@ -28,6 +29,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(bag_app)
 out = Console()
 err = Console(stderr=True)
 

@@ -179,7 +179,8 @@ class SignalPath:
         if last.field in ANGLES and not hasattr(message, last.field):
             raise BagError(f"{self} is made of four numbers; assign to those")
         if not last.picks:
-            setattr(message, _attribute(last.field), value)
+            kind = type(getattr(message, _attribute(last.field)))
+            setattr(message, _attribute(last.field), kind(value))
         else:
             array = getattr(message, _attribute(last.field))
             array[self._place(last, message, array)] = value
