@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -37,7 +37,7 @@ out = Console() if sys.stdout.isatty() else Console(width=WIDTH_IN_FILES)
 err = Console(stderr=True)
 
 
-class Format(str, Enum):
+class Format(StrEnum):
     """What a table is written as."""
 
     CSV = "csv"
@@ -45,7 +45,7 @@ class Format(str, Enum):
     PARQUET = "parquet"
 
 
-class Clock(str, Enum):
+class Clock(StrEnum):
     """Which of a message's times is its stamp."""
 
     HEADER = "header"
@@ -53,7 +53,7 @@ class Clock(str, Enum):
     PUBLISH = "publish"
 
 
-class Resampling(str, Enum):
+class Resampling(StrEnum):
     """How a signal is put on a grid."""
 
     LINEAR = "linear"
@@ -184,8 +184,10 @@ def export_command(
                 unfinished=unfinished,
                 progress=progress,
             )
-        for file, count in rows.items():
+        for file, count in rows.counts.items():
             out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+        for what in rows.left_out:
+            out.print(f"left out: {what}", soft_wrap=True, markup=False)
         return
     if not signals:
         raise BagError("a common grid needs to know which signals: --signal")

@@ -90,6 +90,9 @@ def _odd(topic: TopicInfo) -> list[str]:
     if topic.clock is not None:
         latency, spread = 1e3 * topic.clock.latency, 1e3 * topic.clock.spread
         odd.append(f"{topic.clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)")
+    if topic.unstamped:
+        odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
+        return odd
     if topic.backward:
         odd.append(f"header stamps go back in {topic.backward} places")
     if topic.duplicates:

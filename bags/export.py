@@ -7,6 +7,7 @@ One table on a common grid needs the memory of its columns.
 import io
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -23,8 +24,17 @@ from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 FORMATS: Final = ("csv", "npz", "parquet")
+MAX_COLUMNS: Final = 256  # of one array, when everything is exported; images are not tables
 TIMES: Final = ("log_time_ns", "publish_time_ns", "stamp_ns")
 Table = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Rows of each file written; left_out: what of everything is not there, and why."""
+
+    counts: Mapping[Path, int]
+    left_out: tuple[str, ...] = ()
 
 
 def export_topics(
@@ -35,26 +45,30 @@ def export_topics(
     signals: Sequence[str] | None = None,
     unfinished: bool = False,
     progress: Progress | None = None,
-) -> dict[Path, int]:
+) -> Exported:
     """One table per topic in the new folder `out`: times in ns and the signals in their own unit.
 
-    signals: which (None: every number in every message whose type can be read). Returns the rows of
-    each file. Raises BagError as `read_signals` does for damage, and if `out` exists.
+    signals: which (None: every number in every message whose type can be read, but for arrays whose
+    length changes). Raises BagError as `read_signals` does for damage, and if `out` exists.
     """
     _check_format(form)
     out = Path(out)
     if out.exists():
         raise BagError(f"{out} exists already; name another folder or move it away")
     with Bag(path, unfinished=unfinished) as bag:
-        wanted = [SignalPath.parse(text) for text in signals] if signals else every_number(bag)
-        columns = {str(signal): signal for signal in expand_paths(bag, wanted)}
+        left_out: list[str] = []
+        if signals:
+            wanted = expand_paths(bag, [SignalPath.parse(text) for text in signals])
+        else:
+            wanted = _every_number(bag, left_out)
+        columns = {str(signal): signal for signal in wanted}
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             folder_path = Path(folder) / out.name
             folder_path.mkdir()
             rows = _write_topics(bag, columns, folder_path, form, progress)
             folder_path.rename(out)
-    return {out / name: count for name, count in rows.items()}
+    return Exported({out / name: count for name, count in rows.items()}, tuple(left_out))
 
 
 def export_grid(
@@ -102,19 +116,36 @@ def export_grid(
     return errors
 
 
-def every_number(bag: Bag) -> list[SignalPath]:
+def _every_number(bag: Bag, left_out: list[str]) -> list[SignalPath]:
     """Every number of every topic that has messages and a type that can be read."""
-    found = []
+    found: list[SignalPath] = []
     for topic in bag.topics:
         if not bag.count(topic):
             continue
         try:
             kind = bag.types_on(topic)
-            paths = [SignalPath.parse(f"{topic}:{path}") for path, *_ in numeric_paths(*kind)]
-        except BagError:
+            texts = [f"{topic}:{path}" for path, *_ in numeric_paths(*kind)]
+        except BagError as error:
+            left_out.append(str(error))
             continue
-        found += [path for path in paths if sum(step.every for step in path.steps) <= 1]
+        for path in map(SignalPath.parse, texts):
+            try:
+                found += _steady(bag, path) if path.every else [path]
+            except BagError as error:
+                left_out.append(f"{path}: {error}")
     return found
+
+
+def _steady(bag: Bag, path: SignalPath) -> list[SignalPath]:
+    """The elements of an array; BagError if some message has more or fewer."""
+    if sum(step.every for step in path.steps) > 1:
+        raise BagError("arrays in arrays are not laid out in columns")
+    elements = expand_paths(bag, [path])
+    if len(elements) > MAX_COLUMNS:
+        raise BagError(f"{len(elements)} elements; name those you need")
+    for _ in stream_columns(bag, {str(element): element for element in elements}):
+        pass
+    return elements
 
 
 def _write_topics(

@@ -29,7 +29,8 @@ class TopicInfo:
     """One topic. Intervals are between log times, in s; NaN with fewer than two messages.
 
     histogram: intervals per bin of BINS, which are in median intervals. missing: sequence numbers
-    left out, where the recorder counted. clock: None without header stamps.
+    left out, where the recorder counted. clock: None without header stamps. unstamped: there are
+    header stamps and all are 0.
     """
 
     topic: str
@@ -46,6 +47,7 @@ class TopicInfo:
     duplicates: int = 0
     missing: int = 0
     clock: ClockRelation | None = None
+    unstamped: bool = False
     unreadable: str = ""
 
     @property
@@ -165,6 +167,8 @@ class _Collector:
             values["duplicates"] = int((steps == 0).sum())
             if stamp_ns.any():
                 values["clock"] = clock_relation(stamp_ns, log_ns)
+            else:
+                values["unstamped"] = True
         if count > 1:
             intervals = np.diff(log_ns) / 1e9
             median = float(np.median(intervals))

@@ -44,9 +44,12 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
         for file in files:
             for channel, batch in _messages(path, file, lost):
                 try:
-                    _copy(writer, channel, batch, sums)
+                    writer.add_topic(channel.topic, channel.msgtype, like=channel)
+                    if batch is not None:
+                        _copy(writer, channel, batch, sums)
                 except BagError as error:
-                    lost.append(f"{file.name}: {len(batch)} messages: {error}")
+                    count = 0 if batch is None else len(batch)
+                    lost.append(f"{file.name}: {count} messages: {error}")
             done += file.stat().st_size
             if progress is not None:
                 progress(done, total)
@@ -73,9 +76,11 @@ def _custom(path: Path) -> dict[str, str]:
         return {}  # damaged metadata; an MCAP file carries its own
 
 
-def _messages(path: Path, file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch]]:
+def _messages(path: Path, file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch | None]]:
+    """Every channel once without a batch, then the batches."""
     if file.suffix != ".mcap":
         with Bag(path, unfinished=True) as bag:
+            yield from ((channel, None) for channel in bag.channels)
             yield from bag.batches()
         return
     try:
@@ -90,6 +95,7 @@ def _messages(path: Path, file: Path, lost: list[str]) -> Iterator[tuple[Channel
         rest = file.stat().st_size - contents.good_bytes
         lost.append(f"{file.name}: {contents.ending}; the last {rest} bytes hold no whole chunk")
     try:
+        yield from ((channel, None) for channel in storage.channels)
         for key, batch in storage.batches(range(len(storage.channels))):
             yield storage.channels[key], batch
     finally:
@@ -99,7 +105,6 @@ def _messages(path: Path, file: Path, lost: list[str]) -> Iterator[tuple[Channel
 def _copy(
     writer: BagWriter, channel: Channel, batch: Batch, sums: dict[str, tuple[int, int]]
 ) -> None:
-    writer.add_topic(channel.topic, channel.msgtype, like=channel)
     for k in range(len(batch)):
         data = batch.data(k)
         writer.write(

@@ -37,7 +37,9 @@ class ClockRelation:
 
     def __str__(self) -> str:
         if self.same_clock:
-            return f"one clock, stamp {-1e3 * self.offset:+.3g} ms before log"
+            return (
+                f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
+            )
         drift = f", drifting {1e6 * self.drift:+.3g} ppm" if self.drift else ", constant"
         return f"stamps {self.offset:+.3f} s from log time{drift}"
 
