@@ -102,7 +102,7 @@ class Monitor:
         self._ended = ""
         self._violated = ""
         self._x: FloatArray | None = None
-        self._x_nominal = np.zeros(len(self.model))
+        self._x_nominal: FloatArray = np.zeros(len(self.model))
 
     def missing(self, t: float, reason: str) -> Reading:
         """End the run because the state is missing or stale at time t (s): unknown from here on."""

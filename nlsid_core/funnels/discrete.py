@@ -80,7 +80,7 @@ def design_tube(
         )
     if safety_factor < 1.0 or inlet < 0.0:
         raise DataError(f"safety factor {safety_factor} should be >= 1, inlet {inlet} >= 0")
-    K = np.zeros(len(model))
+    K: FloatArray = np.zeros(len(model))
     if lqr_weights is not None:
         K = lqr_gain(model, output_weight=lqr_weights[0], input_weight=lqr_weights[1])
     gains = np.array([kalman_gain(model, ratio) for ratio in NOISE_RATIOS])
