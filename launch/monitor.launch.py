@@ -17,6 +17,12 @@ def generate_launch_description() -> LaunchDescription:
                 "proof",
                 description="funnel.proof.json; its funnel, policy and model lie beside it",
             ),
+            DeclareLaunchArgument(
+                "nominal",
+                default_value="command",
+                choices=["command", "profile"],
+                description="what the tube is around",
+            ),
             Node(
                 package="nlsid",
                 executable="funnel_publisher",
@@ -28,6 +34,9 @@ def generate_launch_description() -> LaunchDescription:
                 package="nlsid",
                 executable="funnel_monitor",
                 name="funnel_monitor",
+                parameters=[
+                    {"source": "/funnel_publisher", "nominal": LaunchConfiguration("nominal")}
+                ],
                 output="screen",
             ),
         ]

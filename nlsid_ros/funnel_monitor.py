@@ -164,12 +164,12 @@ class FunnelMonitor(Node):
         message.position = list(values.values())
         self._margin.publish(message)
 
-    def _say(self, reading: Reading) -> None:
+    def _say(self, reading: Reading, *, at_once: bool = False) -> None:
         """Publish diagnostics if the status changed or the heartbeat is due."""
         now = time.monotonic()
         changed = reading.status is not self._reading.status
         self._reading = reading
-        if not changed and now - self._said_at < HEARTBEAT:
+        if not (changed or at_once) and now - self._said_at < HEARTBEAT:
             return
         self._said_at = now
         values = {
@@ -189,7 +189,7 @@ class FunnelMonitor(Node):
         answer.message = "new run" if answer.success else "there is no funnel yet"
         if self._watch is not None:
             self._watch.restart()
-            self._reading = Reading(0.0, Status.UNKNOWN, reason="restarted")
+            self._say(Reading(0.0, Status.UNKNOWN, reason="restarted"), at_once=True)
         return answer
 
 
