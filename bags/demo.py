@@ -69,7 +69,6 @@ def run_demo(out: Path, console: Console) -> bool:
     nominal = config.monitor.nominal_source
     replays = [replay_bag(proved, bag, nominal=nominal) for bag in test]
     console.print(show.replay_table(replays))
-    console.print("The same trials with a broken speed sensor:")
     signal = config.signals.response.path
     sabotaged: list[Replay] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -78,7 +77,7 @@ def run_demo(out: Path, console: Console) -> bool:
             copy = Path(folder) / f"{bag.name}, {fault}"
             write_faulty_copy(bag, copy, signal, FAULTS[fault])
             sabotaged.append(replay_bag(proved, copy, nominal=nominal))
-    console.print(show.replay_table(sabotaged))
+    console.print(show.caught_table(sabotaged))
     if report_available():
         write_margins(out / documents.MARGIN_PLOT, replays)
         write_margins(out / SABOTAGED_PLOT, sabotaged)
