@@ -1,6 +1,5 @@
 """Tables for the terminal."""
 
-import math
 from collections.abc import Sequence
 
 from rich.table import Table
@@ -50,7 +49,7 @@ def funnel_table(design: TubeDesign) -> Table:
     table.add_row("policy", tracking)
     table.add_row(
         "half-width",
-        f"{math.ceil(1e3 * funnel.output_half_width) / 1e3:.3f} {unit} of {model.y.name}",
+        f"{funnel.half_width:g} {unit} of {model.y.name}",
     )
     table.add_row("horizon", f"{assumption.samples * model.period:g} s")
     table.add_row(
