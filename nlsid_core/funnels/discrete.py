@@ -143,9 +143,7 @@ def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray)
     scale = float(np.trace(open_loop_covariance(model, L)))
     variable = cp.Variable((n, n), symmetric=True)
     reach = cp.Variable()
-    constraints: list[cp.Constraint] = [
-        cp.trace(np.outer(c, c) @ variable) <= reach for c in _output_rows(model, K)
-    ]
+    constraints: list[cp.Constraint] = [(variable @ c) @ c <= reach for c in _output_rows(model, K)]
     for closed in (model.A, model.A - model.B @ K[None, :]):
         decrease = variable - grow * closed @ variable @ closed.T - noise / scale
         constraints.append(decrease >> 0)
