@@ -155,9 +155,11 @@ def _tube(axes: Axes, replay: Replay) -> None:
     axes.plot([r.t for r in everything], [r.measured for r in everything], color=INK, lw=LINE,
               label="measured")  # fmt: skip
     bad = [r for r in judged if r.status is not Status.INSIDE]
-    axes.plot([r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3,
-              label="not inside" if not bad else f"not inside from {bad[0].t:.3f} s")  # fmt: skip
-    axes.set_title(f"{replay.name}: {replay.verdict}", fontsize=8, loc="left")
+    axes.plot(
+        [r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3, label="not inside"
+    )
+    since = f" from {bad[0].t:.3f} s" if bad else ""
+    axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
 
 
 def _margin(axes: Axes, replay: Replay) -> None:
