@@ -1,0 +1,15 @@
+"""Multivariate polynomials: exponents and coefficients, float64 or exactly rational."""
+
+from nlsid_core.polynomial.algebra import Polynomial, constant, variables
+from nlsid_core.polynomial.maps import compose_affine, evaluate, jacobian, monomials, trace
+
+__all__ = [
+    "Polynomial",
+    "compose_affine",
+    "constant",
+    "evaluate",
+    "jacobian",
+    "monomials",
+    "trace",
+    "variables",
+]
