@@ -256,7 +256,7 @@ class Polynomial:
                 for name, power in zip(self.names, exponent, strict=True)
                 if power
             ]
-            size = f"{abs(coefficient)}" if self.is_exact else f"{abs(coefficient):.6g}"
+            size = str(abs(coefficient)).removesuffix(".0")  # exact: floats print shortest
             if factors and size == "1":
                 size = ""
             sign = "-" if coefficient < 0 else "+"
