@@ -150,8 +150,23 @@ class Polynomial:
         missing = [name for name in values if name not in self.names]
         if missing:
             raise DataError(f"no variable {', '.join(missing)}; it has {', '.join(self.names)}")
-        chosen = [name for name in self.names if name in values]
-        return self._horner([(name, as_polynomial(values[name])) for name in chosen])
+        given = {name: as_polynomial(values[name]) for name in self.names if name in values}
+        constants = {name: value for name, value in given.items() if not value.degree}
+        rest = [(name, value) for name, value in given.items() if value.degree]
+        return self._at(constants)._horner(rest)
+
+    def _at(self, constants: Mapping[str, "Polynomial"]) -> "Polynomial":
+        """Constants in the place of variables, all at once."""
+        if not constants:
+            return self
+        exact = self.is_exact or any(value.is_exact for value in constants.values())
+        p = self.exact() if exact else self
+        coefficients = p.coefficients
+        for name, value in constants.items():
+            c = (value.exact() if exact else value).coefficients.sum()
+            coefficients = coefficients * c ** p.exponents[:, p.names.index(name)]
+        kept = [j for j, name in enumerate(p.names) if name not in constants]
+        return Polynomial(p.exponents[:, kept], coefficients, tuple(p.names[j] for j in kept))
 
     def _horner(self, substitutions: list[tuple[str, "Polynomial"]]) -> "Polynomial":
         if not substitutions:
@@ -360,9 +375,11 @@ def _sum(a: Polynomial, b: Polynomial) -> Polynomial:
 
 def _product(a: Polynomial, b: Polynomial) -> Polynomial:
     a, b = _aligned(a, b)
-    exponents = (a.exponents[:, None, :] + b.exponents[None, :, :]).reshape(-1, len(a.names))
+    exponents = a.exponents[:, None, :] + b.exponents[None, :, :]
     return Polynomial(
-        exponents, np.multiply.outer(a.coefficients, b.coefficients).ravel(), a.names
+        exponents.reshape(len(a) * len(b), len(a.names)),
+        np.multiply.outer(a.coefficients, b.coefficients).ravel(),
+        a.names,
     )
 
 

@@ -52,7 +52,7 @@ def sign_blocks(basis: IntArray, support: IntArray) -> list[IntArray]:
     A sign change z_j -> -z_j that leaves every monomial of the support unchanged splits the basis
     into the monomials it keeps and those it negates; products across the two cannot be needed.
     """
-    signs = _parity_kernel(support % 2)
+    signs = parity_kernel(support % 2)
     signature = (basis @ signs.T) % 2
     keys = [tuple(row) for row in signature.tolist()]
     return [
@@ -61,7 +61,7 @@ def sign_blocks(basis: IntArray, support: IntArray) -> list[IntArray]:
     ]
 
 
-def _parity_kernel(parity: IntArray) -> IntArray:
+def parity_kernel(parity: IntArray) -> IntArray:
     """Rows s in {0,1}^n with s·α even for every row α: the kernel over GF(2)."""
     n = parity.shape[1]
     rows = [row.copy() for row in np.unique(parity, axis=0)]
