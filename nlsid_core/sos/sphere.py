@@ -27,7 +27,7 @@ CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the be
 RANK_TOLERANCE = 1e-10  # of the QR diagonal: degree-4 monomials on a sphere keep 12 digits
 MAX_ITERATIONS = 60  # 8 to 12 are usual
 STEP_TO_BOUNDARY = 0.97  # of the way to where X or Z would stop being positive definite
-REGULARISATIONS = (1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
+REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
 REFINEMENTS = 1  # a second one was never seen to change the number of iterations
 CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
 CERTIFY_FROM = 1e-6  # of the spread; from here rounding may undo what an iteration gains
@@ -159,6 +159,7 @@ def _interior_point(
     k = V.shape[1]
     X, y, m = _first_iterate(program, g, start)
     best: SphereSolution | None = None
+    M, work = (np.zeros((len(g), len(g)), order="F") for _ in range(2))  # lower triangles, reused
     for iteration in range(MAX_ITERATIONS + 1):
         Z = (V.T * y) @ V
         upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
@@ -176,8 +177,10 @@ def _interior_point(
             break
         inverse, _ = lapack.dtrtri(Lz, lower=1)
         across, dual = V @ Lx, V @ inverse.T
-        M = blas.dsyrk(1.0, across, lower=1) * blas.dsyrk(1.0, dual, lower=1)
-        factor = _factor_or_regularise(M)
+        M = blas.dsyrk(1.0, across, beta=0.0, c=M, overwrite_c=1, lower=1)
+        work = blas.dsyrk(1.0, dual, beta=0.0, c=work, overwrite_c=1, lower=1)
+        np.multiply(M, work, out=M)
+        factor = _factor_or_regularise(M, work)
         if factor is None:
             break
         # M y = diag(VXV'), so dy = shift - y + dm·unit: only small right-hand sides are solved for.
@@ -254,17 +257,17 @@ def _factor(A: FloatArray) -> FloatArray | None:
     return None if info else np.asarray(L)
 
 
-def _factor_or_regularise(M: FloatArray) -> FloatArray | None:
-    """Cholesky factor of M, with the least regularisation that lets it complete."""
-    diagonal = np.diag(M)
-    factor, info = lapack.dpotrf(M, lower=1)
+def _factor_or_regularise(M: FloatArray, work: FloatArray) -> FloatArray | None:
+    """Cholesky factor of M, in `work`, with the least regularisation that lets it complete."""
+    diagonal = np.diag_indices(len(M))
     for regularisation in REGULARISATIONS:
+        np.copyto(work, M)
+        if regularisation:
+            work[diagonal] *= 1 + regularisation
+        factor, info = lapack.dpotrf(work, lower=1, clean=0, overwrite_a=1)
         if not info:
             return np.asarray(factor)
-        shifted = M.copy(order="F")
-        shifted[np.diag_indices(len(M))] += regularisation * diagonal
-        factor, info = lapack.dpotrf(shifted, lower=1, overwrite_a=1)
-    return None if info else np.asarray(factor)
+    return None
 
 
 def _solve(M: FloatArray, factor: FloatArray, rhs: FloatArray) -> FloatArray:
