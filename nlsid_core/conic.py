@@ -186,7 +186,7 @@ class _Outcome:
 
 def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
     if rung == "clarabel":
-        return _clarabel(program, tolerance, refine=False)
+        return _clarabel_dual(program, tolerance)
     if rung == "clarabel refined":
         return _clarabel(program, tolerance, refine=True)
     if rung == "clarabel rescaled":
@@ -217,6 +217,69 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
     if status.startswith("Almost") and "Infeasible" in status:
         return _Outcome("stalled")  # no proof of infeasibility: a later rung decides
     return _Outcome(status, *(np.array(part) for part in (solution.x, solution.s, solution.z)))
+
+
+def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
+    """Solve the dual instead where it is smaller: sums of squares have few equalities, many unknowns.
+
+    Columns V that only mirror a cone block (rows -x_V + s = 0) become slack; with the other rows G
+    and columns F it reads: minimise b_G'z, A_GF'z = -q_F, q_V + A_GV'z ∈ K, z ∈ K where G has a cone.
+    """
+    split = _mirrored(program) if not program.P.nnz else None
+    if split is None:
+        return _clarabel(program, tolerance, refine=False)
+    mirrored, columns, order, affine, cones = split
+    others = np.setdiff1d(np.arange(len(program.b)), mirrored)
+    free = np.setdiff1d(np.arange(len(program.q)), columns)
+    G = program.A.tocsr()[others].tocsc()
+    pick = np.searchsorted(others, affine)
+    keep = sp.csc_matrix((-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others)))
+    dual = ConeProgram(
+        P=sp.csc_matrix((len(others), len(others))),
+        q=program.b[others],
+        A=sp.vstack([G[:, free].T, -G[:, order].T, keep], format="csc"),
+        b=np.concatenate([-program.q[free], program.q[order], np.zeros(len(pick))]),
+        cones=(Cone("zero", len(free)), *cones),
+    )
+    outcome = _clarabel(dual, tolerance, refine=False)
+    if outcome.x is None or "Infeasible" in outcome.status:
+        swapped = {"PrimalInfeasible": "DualInfeasible", "DualInfeasible": "PrimalInfeasible"}
+        return _Outcome(swapped.get(outcome.status, outcome.status))
+    x, s, z = np.zeros(len(program.q)), np.zeros(len(program.b)), np.zeros(len(program.b))
+    mirror = slice(len(free), len(free) + len(order))
+    x[free], x[order] = -outcome.z[: len(free)], outcome.z[mirror]
+    s[mirrored], s[affine] = x[order], outcome.z[mirror.stop :]
+    z[others], z[mirrored] = outcome.x, outcome.s[mirror]
+    return _Outcome(outcome.status, x, s, z)
+
+
+def _mirrored(program: ConeProgram) -> tuple[Any, Any, Any, Any, list[Cone]] | None:
+    """Rows and columns of cone blocks that are unknowns themselves; None if there are none.
+
+    Returns the rows, the set of columns, the columns in row order, the rows of the other cones, and
+    the cones: mirrored ones first, then the others.
+    """
+    A = program.A.tocsr()
+    single = (np.diff(A.indptr) == 1) & (program.b == 0)
+    single[single] = A.data[A.indptr[:-1][single]] == -1.0
+    rows, affine, first, second, start = [], [], [], [], 0
+    for cone in program.cones:
+        block = np.arange(start, start + cone.rows)
+        start += cone.rows
+        if cone.kind == "zero":
+            continue
+        mirrors = bool(single[block].all())
+        (rows if mirrors else affine).append(block)
+        (first if mirrors else second).append(cone)
+    if not rows:
+        return None
+    mirrored = np.concatenate(rows)
+    order = A.indices[A.indptr[:-1][mirrored]]
+    columns = np.unique(order)
+    if len(columns) < len(order):  # one unknown in two cones: leave the program as it is
+        return None
+    other = np.concatenate([np.zeros(0, dtype=np.int64), *affine])
+    return mirrored, columns, order, other, first + second
 
 
 def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:

@@ -150,21 +150,33 @@ class Polynomial:
         missing = [name for name in values if name not in self.names]
         if missing:
             raise DataError(f"no variable {', '.join(missing)}; it has {', '.join(self.names)}")
-        given = {name: as_polynomial(values[name]) for name in self.names if name in values}
-        constants = {name: value for name, value in given.items() if not value.degree}
-        rest = [(name, value) for name, value in given.items() if value.degree]
+        constants: dict[str, Any] = {}
+        rest: list[tuple[str, Polynomial]] = []
+        for name in (name for name in self.names if name in values):
+            value = values[name]
+            if isinstance(value, (float, Fraction)):
+                constants[name] = value
+                continue
+            inner = as_polynomial(value)
+            if inner.degree:
+                rest.append((name, inner))
+            else:
+                constants[name] = inner.coefficient([0] * len(inner.names))
         return self._at(constants)._horner(rest)
 
-    def _at(self, constants: Mapping[str, "Polynomial"]) -> "Polynomial":
-        """Constants in the place of variables, all at once."""
+    def _at(self, constants: Mapping[str, Any]) -> "Polynomial":
+        """Numbers in the place of variables, all at once."""
         if not constants:
             return self
-        exact = self.is_exact or any(value.is_exact for value in constants.values())
+        exact = self.is_exact or any(isinstance(value, Fraction) for value in constants.values())
         p = self.exact() if exact else self
-        coefficients = p.coefficients
-        for name, value in constants.items():
-            c = (value.exact() if exact else value).coefficients.sum()
-            coefficients = coefficients * c ** p.exponents[:, p.names.index(name)]
+        numbers = [Fraction(c) if exact else float(c) for c in constants.values()]
+        values = np.array(numbers, dtype=object if exact else np.float64)
+        column = {name: j for j, name in enumerate(p.names)}
+        powers = p.exponents[:, [column[name] for name in constants]]
+        term, which = np.nonzero(powers)
+        coefficients = p.coefficients.copy()
+        np.multiply.at(coefficients, term, values[which] ** powers[term, which])
         kept = [j for j, name in enumerate(p.names) if name not in constants]
         return Polynomial(p.exponents[:, kept], coefficients, tuple(p.names[j] for j in kept))
 

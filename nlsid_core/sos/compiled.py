@@ -18,7 +18,6 @@ from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram, ConeSolution
 from nlsid_core.errors import DataError
 from nlsid_core.polynomial import Polynomial
-from nlsid_core.polynomial.algebra import monomial_values
 from nlsid_core.sos.basis import drop_inconsistent, gram_basis, sign_blocks
 from nlsid_core.sos.program import (
     Constraint,
@@ -74,6 +73,7 @@ class Compiled:
 
     program: Program
     builder: "_Builder"
+    features: IntArray
     pattern: sp.csc_matrix
     A_map: sp.csr_matrix
     b_map: sp.csr_matrix
@@ -112,11 +112,14 @@ class Compiled:
 
     def _features(self, parameters: Values) -> FloatArray:
         names = self.program.parameters
-        missing = sorted(set(names) - set(parameters))
+        missing = [name for name in names if name not in parameters]
         if missing:
             raise DataError(f"no value for the parameter {', '.join(missing)}")
-        point = np.array([[parameters[name] for name in names]], dtype=np.float64)
-        return monomial_values(self.builder.features(), point)[0]
+        point = np.array([parameters[name] for name in names], dtype=np.float64)
+        monomial, which = np.nonzero(self.features)
+        phi = np.ones(len(self.features))
+        np.multiply.at(phi, monomial, point[which] ** self.features[monomial, which])
+        return phi
 
 
 def compile_program(program: Program) -> Compiled:
@@ -383,7 +386,7 @@ class _Builder:
                 raise DataError(f"the objective {objective} should be affine in the decisions")
             np.add.at(q, decision[decision >= 0], weight[decision >= 0])
         cones = tuple([Cone("zero", self.equality_rows), *self.cones])
-        return Compiled(self.program, self, pattern, A_map, b_map, q, cones)
+        return Compiled(self.program, self, self.features(), pattern, A_map, b_map, q, cones)
 
     def _column_sizes(self) -> FloatArray:
         """Physical value of each unknown when the solver's is 1; the last is the right-hand side."""
