@@ -110,7 +110,7 @@ def monomials(n: int, degrees: Sequence[int]) -> IntArray:
     for degree in sorted(set(degrees)):
         for chosen in combinations_with_replacement(range(n), degree):
             rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=n))
-    return np.array(rows, dtype=np.int64).reshape(-1, n)
+    return np.array(rows, dtype=np.int64).reshape(len(rows), n)
 
 
 def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, FloatArray]:
