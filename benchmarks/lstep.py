@@ -4,7 +4,7 @@
 
 Every solver gets the same g (n = 6, degree 4, Gram 27 or 28) and maximises m with g - m ≥ 0 on
 |z| = 1; a time is build + solve from the values or coefficients of g. What depends on n alone
-(points, cone pattern) is built once and stated apart. One core: OMP_NUM_THREADS=1 is set here.
+(points, cone pattern) is built once and stated apart. One core: thread counts are set to 1 here.
 """
 
 import argparse
@@ -21,12 +21,12 @@ from typing import Any
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"):
     os.environ.setdefault(_variable, "1")
 
-import numpy as np
+import numpy as np  # noqa: E402 - the thread counts have to be set first
 
-from examples import satellite
-from nlsid_core.certificate import Mode, prove_lower_bound
-from nlsid_core.polynomial import Polynomial, monomials, variables
-from nlsid_core.sos import (
+from examples import satellite  # noqa: E402
+from nlsid_core.certificate import Mode, prove_lower_bound  # noqa: E402
+from nlsid_core.polynomial import Polynomial, monomials, variables  # noqa: E402
+from nlsid_core.sos import (  # noqa: E402
     Compiled,
     Program,
     SphereProgram,
@@ -73,7 +73,7 @@ def satellite_comparison() -> dict[str, Any]:
     }
     if (drake := drake_solver()) is not None:
         others["drake"] = drake
-    times = {name: [] for name in others}  # type: dict[str, list[float]]
+    times: dict[str, list[float]] = {name: [] for name in others}
     worst = 0.0
     for k in chosen:
         g = polynomials[k]
@@ -88,7 +88,9 @@ def satellite_comparison() -> dict[str, Any]:
         sphere_proof(sphere, solution, g)
         for solution, g in zip(warm[1e-5][1], polynomials, strict=True)
     ]
-    checks = [check_time(g, proof, "rigorous") for g, proof in zip(polynomials, proofs, strict=True)]
+    checks = [
+        check_time(g, proof, "rigorous") for g, proof in zip(polynomials, proofs, strict=True)
+    ]
     exact = [check_time(polynomials[k], proofs[k], "exact") for k in chosen]
     result: dict[str, Any] = {
         "ours_ms": ours,

@@ -191,7 +191,7 @@ def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
         return _clarabel(program, tolerance, refine=True)
     if rung == "clarabel rescaled":
         return _rescaled(program, tolerance)
-    return _through_cvxpy(program, rung, tolerance)
+    return _through_cvxpy(program, rung)
 
 
 def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outcome:
@@ -220,7 +220,7 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
 
 
 def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
-    """Solve the dual instead where it is smaller: sums of squares have few equalities, many unknowns.
+    """Solve the dual instead where it is smaller: few equalities, many unknowns.
 
     Columns V that only mirror a cone block (rows -x_V + s = 0) become slack; with the other rows G
     and columns F it reads: minimise b_G'z, A_GF'z = -q_F, q_V + A_GV'z ∈ K, z ∈ K where G has a cone.
@@ -233,7 +233,9 @@ def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
     free = np.setdiff1d(np.arange(len(program.q)), columns)
     G = program.A.tocsr()[others].tocsc()
     pick = np.searchsorted(others, affine)
-    keep = sp.csc_matrix((-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others)))
+    keep = sp.csc_matrix(
+        (-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others))
+    )
     dual = ConeProgram(
         P=sp.csc_matrix((len(others), len(others))),
         q=program.b[others],
@@ -301,7 +303,7 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, outcome.z / dual)
 
 
-def _through_cvxpy(program: ConeProgram, name: str, tolerance: float) -> _Outcome:
+def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     """Any solver cvxpy has, by its name."""
     import cvxpy as cp
 

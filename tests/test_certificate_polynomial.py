@@ -45,7 +45,7 @@ def test_the_checker_imports_no_solver() -> None:
     shown = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=root
     )
-    loaded = set(eval(shown.stdout)) - set(sys.stdlib_module_names)  # noqa: S307 - our own print
+    loaded = set(eval(shown.stdout)) - set(sys.stdlib_module_names)
     outside = {name for name in loaded if not name.startswith(("_", "numpy", "nlsid_core"))}
     assert not outside & {"scipy", "clarabel", "cvxpy", "scs", "sympy"}
     for source in (root / "nlsid_core" / "certificate").glob("*.py"):
@@ -77,7 +77,8 @@ def test_definiteness_is_decided_where_floats_cannot_tell() -> None:
     assert is_positive_semidefinite([[big, big], [big, big]])
     assert not is_positive_semidefinite([[big, big + 1], [big + 1, big]])
     assert not is_positive_semidefinite([[0, 1], [1, 10]])
-    assert is_positive_definite([]) and is_positive_semidefinite([[0]])
+    assert is_positive_definite([])
+    assert is_positive_semidefinite([[0]])
 
 
 @settings(max_examples=100, deadline=None)
@@ -167,7 +168,9 @@ def test_attraction_needs_an_equilibrium_a_level_and_a_definite_basis() -> None:
 
 def test_the_statement_is_made_from_the_numbers_that_were_verified(tmp_path: Path) -> None:
     path = tmp_path / "p.json"
-    _json.write_document(path, bound_document(x**2 + 1, 0.5, gram([[0.5, 0], [0, 1.0]], LINEAR[:2])))
+    _json.write_document(
+        path, bound_document(x**2 + 1, 0.5, gram([[0.5, 0], [0, 1.0]], LINEAR[:2]))
+    )
     verdict = check(path, mode="rigorous")
     assert verdict.statement.startswith("polynomial bound: x**2 + 1 >= 0.5 for all real x, y")
     assert verdict.mode == "rigorous"

@@ -82,7 +82,12 @@ def test_no_bound_of_the_motzkin_polynomial_is_a_sum_of_squares() -> None:
 def test_a_camel_bound_above_the_minimum_is_rejected() -> None:
     document = six_hump_camel.document()
     claim = document["claim"] | {"bound": -1.0316}
-    forged = {"format": document["format"], "version": 1, "claim": claim, "proof": document["proof"]}
+    forged = {
+        "format": document["format"],
+        "version": 1,
+        "claim": claim,
+        "proof": document["proof"],
+    }
     with pytest.raises(CertificateRejected):
         _check(forged)
 
@@ -121,7 +126,12 @@ def test_levels_below_one_twentieth_are_proved_and_above_refused() -> None:
 def test_a_proof_for_one_level_is_rejected_for_a_larger_one() -> None:
     document = too_large_a_level.document(0.0499)
     claim = document["claim"] | {"level": 0.0501}
-    forged = {"format": document["format"], "version": 1, "claim": claim, "proof": document["proof"]}
+    forged = {
+        "format": document["format"],
+        "version": 1,
+        "claim": claim,
+        "proof": document["proof"],
+    }
     with pytest.raises(CertificateRejected):
         _check(forged)
 

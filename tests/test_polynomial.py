@@ -125,7 +125,7 @@ def test_cross_products_and_matrices_can_be_traced() -> None:
         (lambda x: x[0] // 2, "floor division of x0"),
         (lambda x: float(x[0]), "float"),
         (lambda x: 1j * x[0], "complex"),
-        (lambda x: "x0", "'x0'"),
+        (lambda x: repr(x[0]), "'x0'"),
     ],
 )
 def test_a_function_that_is_not_polynomial_says_which_operation_was_not(

@@ -114,9 +114,7 @@ def test_division_by_one_polynomial_leaves_the_normal_form() -> None:
 
 def test_parameters_change_and_the_pattern_is_compiled_once() -> None:
     (r,) = variables("r")
-    program = Program(
-        ("x", "y"), (SumOfSquares(CAMEL + r * x - t),), maximise=t, parameters=("r",)
-    )
+    program = Program(("x", "y"), (SumOfSquares(CAMEL + r * x - t),), maximise=t, parameters=("r",))
     compiled = compile_program(program)
     for value in (0.0, 1.0, -2.0):
         fresh = Program(("x", "y"), (SumOfSquares(CAMEL + value * x - t),), maximise=t)

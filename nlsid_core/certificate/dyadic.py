@@ -47,7 +47,10 @@ def as_floats(M: Integers) -> tuple[FloatArray, list[int]]:
 
 
 def is_dominated(M: Integers) -> bool:
-    """True proves M ≻ 0 (False proves nothing): 2^(2t) S M S - LL' strictly diagonally dominant, S a diagonal of 2^-s_i."""
+    """True proves M ≻ 0, False proves nothing.
+
+    Shown: 2^(2t) S M S - LL' is strictly diagonally dominant, S the diagonal of 2^-s_i.
+    """
     n = len(M)
     scaled, shifts = as_floats(M)
     if not np.isfinite(scaled).all():
@@ -58,7 +61,10 @@ def is_dominated(M: Integers) -> bool:
         return False
     low = 2 * max(shifts, default=0)
     # Integers throughout: multiply by 2^(low + 2t), which makes every scaled entry whole.
-    L = [[round(entry * 2**FACTOR_BITS) for entry in row[: i + 1]] for i, row in enumerate(factor.tolist())]
+    L = [
+        [round(entry * 2**FACTOR_BITS) for entry in row[: i + 1]]
+        for i, row in enumerate(factor.tolist())
+    ]
     rest = [[0] * n for _ in range(n)]
     for i in range(n):
         for j in range(i + 1):
@@ -83,11 +89,7 @@ def _eliminate(M: Integers) -> int | None:
             return rank if not any(map(any, rows)) else None
         head, top = rows[pivot], rows[pivot][pivot]
         rows = [
-            [
-                (top * row[j] - row[pivot] * head[j]) // previous
-                for j in range(size)
-                if j != pivot
-            ]
+            [(top * row[j] - row[pivot] * head[j]) // previous for j in range(size) if j != pivot]
             for i, row in enumerate(rows)
             if i != pivot
         ]

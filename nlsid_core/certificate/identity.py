@@ -22,7 +22,9 @@ from nlsid_core.polynomial import Gram, Polynomial
 Mode: TypeAlias = Literal["exact", "rigorous"]
 Factor: TypeAlias = Polynomial | Gram
 
-MAX_ORDER = 500  # of a Gram matrix: beyond it deciding takes minutes, and so would a denial of service
+MAX_ORDER = (
+    500  # of a Gram matrix: beyond it deciding takes minutes, and so would a denial of service
+)
 MAX_TERMS = 4_000_000  # products of coefficients to expand; a large real proof has 1e5
 MAX_DEGREE = 2**15  # keeps sums of exponents and their weights within 64-bit integers
 

@@ -111,7 +111,9 @@ def _exponents(document: Json, key: str, n: int, source: str) -> IntArray:
     rows = _json.member(document, key, list, source=source)
     for row in rows:
         if not isinstance(row, list) or len(row) != n or not all(type(e) is int for e in row):
-            raise DocumentError(f"{source}: a row of '{key}' should be {n} integers, is {row!r:.80}")
+            raise DocumentError(
+                f"{source}: a row of '{key}' should be {n} integers, is {row!r:.80}"
+            )
         if min(row) < 0:
             raise DocumentError(f"{source}: '{key}' holds a negative exponent: {row}")
     return np.array(rows, dtype=np.int64).reshape(-1, n)

@@ -139,7 +139,10 @@ def _refuse_unless_zero(
         (
             Fraction(a) * Fraction(b) * w
             for a, b, w in zip(
-                left[which].tolist(), right[which].tolist(), terms.weight[which].tolist(), strict=True
+                left[which].tolist(),
+                right[which].tolist(),
+                terms.weight[which].tolist(),
+                strict=True,
             )
         ),
         Fraction(0),

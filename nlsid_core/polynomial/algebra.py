@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
+from nlsid_core.polynomial.operations import OPERATORS, REFUSED
 
 Coefficients: TypeAlias = NDArray[Any]
 Number: TypeAlias = int | float | Fraction
@@ -256,7 +257,7 @@ class Polynomial:
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
         """NumPy's protocol: `array * polynomial` and `np.sqrt(polynomial)` arrive here."""
-        names = _OPERATORS.get(ufunc.__name__)
+        names = OPERATORS.get(ufunc.__name__)
         if method != "__call__" or names is None or len(inputs) > 2:
             raise NotPolynomial(f"{ufunc.__name__} of {_short(self)} is not a polynomial")
         if isinstance(inputs[0], Polynomial):
@@ -290,17 +291,6 @@ class Polynomial:
             text += f" {sign} " if text else "-" if sign == "-" else ""
             text += "*".join(([size] if size else []) + factors)
         return text or "0"
-
-
-_OPERATORS = {
-    "add": ("__add__", "__radd__"),
-    "subtract": ("__sub__", "__rsub__"),
-    "multiply": ("__mul__", "__rmul__"),
-    "divide": ("__truediv__", "__rtruediv__"),
-    "power": ("__pow__", "__rpow__"),
-    "negative": ("__neg__", "__neg__"),
-    "positive": ("__pos__", "__pos__"),
-}
 
 
 def variables(names: str | Sequence[str]) -> tuple[Polynomial, ...]:
@@ -416,24 +406,5 @@ def _refusal(operation: str) -> Callable[..., Polynomial]:
     return refuse
 
 
-# NumPy calls these by name on the entries of an object array (np.sin -> .sin()); Python calls the
-# others. Without them the message would not say which operation was to blame.
-for _name in (
-    *"sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh".split(),
-    *"exp exp2 expm1 log log2 log10 log1p sqrt cbrt floor ceil trunc rint hypot arctan2".split(),
-):
-    setattr(Polynomial, _name, _refusal(_name))
-for _name, _operation in {
-    "abs": "abs",
-    "mod": "remainder",
-    "rmod": "remainder",
-    "floordiv": "floor division",
-    "rfloordiv": "floor division",
-    "rpow": "exponentiation with an exponent",
-    "lt": "comparison <",
-    "le": "comparison <=",
-    "gt": "comparison >",
-    "ge": "comparison >=",
-    "bool": "the truth value",
-}.items():
-    setattr(Polynomial, f"__{_name}__", _refusal(_operation))
+for _name, _operation in REFUSED.items():
+    setattr(Polynomial, _name, _refusal(_operation))

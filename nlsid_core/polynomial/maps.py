@@ -87,7 +87,9 @@ def compose_affine(
     A, b = np.asarray(A), np.asarray(b)
     n = len(array.flat[0].names) if array.size else 0
     if A.shape != (n, len(names)) or b.shape != (n,):
-        raise ShapeError(f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}")
+        raise ShapeError(
+            f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}"
+        )
     z = _object_array(variables(names))
     rational = A.dtype == object or b.dtype == object
     inner = [
@@ -109,7 +111,10 @@ def monomials(n: int, degrees: Sequence[int]) -> IntArray:
     rows = []
     for degree in sorted(set(degrees)):
         for chosen in combinations_with_replacement(range(n), degree):
-            rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=n))
+            row = [0] * n
+            for j in chosen:
+                row[j] += 1
+            rows.append(row)
     return np.array(rows, dtype=np.int64).reshape(len(rows), n)
 
 

@@ -14,8 +14,8 @@ def gram_basis(support: IntArray) -> IntArray:
 
     Starts from the monomials within half the degree bounds, then repeatedly drops b while b² is
     neither in the support nor a product of two other candidates. What is left lies in half the
-    Newton polytope: a vertex b of the hull of the candidates is only b·b, so it stays only if b² is in
-    the support.
+    Newton polytope: for a vertex b of the hull of the candidates b² is b·b only, so b stays only if
+    b² is in the support.
     """
     if not len(support):
         return np.zeros((0, support.shape[1]), dtype=np.int64)

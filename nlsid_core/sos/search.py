@@ -89,7 +89,7 @@ def lower_bound(
         )
         return Bound(value, optimum, document)
     raise Infeasible(
-        f"the bound {optimum:.9g} was found but none within {BACK_OFF[-1]:g} of it could be proved; "
+        f"the bound {optimum:.9g} was found but none within {BACK_OFF[-1]:g} of it was proved; "
         "raise the degree, or give the zeros to `exact_gram`"
     )
 
@@ -158,7 +158,7 @@ def largest_level(
 
 
 def positive_semidefinite(gram: Gram) -> Gram:
-    """The Gram matrix with its eigenvalues lifted just above zero; the identity takes the change."""
+    """With its eigenvalues lifted just above zero; the identity takes the change."""
     if not len(gram):
         return gram
     lowest = float(np.linalg.eigvalsh(gram.Q)[0])

@@ -214,7 +214,7 @@ def _interior_point(
 def _first_iterate(
     program: SphereProgram, g: FloatArray, start: SphereSolution | None
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Strictly feasible X, y, m: least-norm X for the equalities, shifted until positive definite."""
+    """Strictly feasible X, y, m: the least-norm X that meets the equalities, shifted."""
     if start is None:
         X, y, m = 0 * program._unit, program._centre, float(g.min())
         clearance = 1.0
@@ -227,9 +227,7 @@ def _first_iterate(
     return X + shift * program._unit, y, m - shift
 
 
-def _certified(
-    program: SphereProgram, g: FloatArray, found: SphereSolution
-) -> SphereSolution:
+def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> SphereSolution:
     """Meet the equalities to rounding, and give up as much of m as keeps X positive definite."""
     X = _corrected(program, found.X, g - found.m)
     shift = max(0.0, -_lowest(program, X)) * (1 + 1e-6)

@@ -52,9 +52,7 @@ def _attraction(claim: dict[str, Any], proof: dict[str, Any]) -> bool:
         return False
     rate: Poly = {}
     for j, f in enumerate(field):
-        gradient = {
-            (*e[:j], e[j] - 1, *e[j + 1 :]): c * e[j] for e, c in V.items() if e[j]
-        }
+        gradient = {(*e[:j], e[j] - 1, *e[j + 1 :]): c * e[j] for e, c in V.items() if e[j]}
         rate = _plus(rate, _times(gradient, f), -1)
     if claim.get("level") is not None:
         level, sigma = _number(claim["level"]), proof["multiplier"]

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.forgeries.genuine import genuine
-from tests.forgeries.mutate import mutant
-from tests.forgeries.oracle import agrees
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.certificate import Verdict, check
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, Undecided
+from tests.forgeries.genuine import genuine
+from tests.forgeries.mutate import mutant
+from tests.forgeries.oracle import agrees
 
 KINDS = ("bound", "factor", "domain", "sphere", "matrix", "attraction")
 MUTATIONS = 12_000
@@ -67,7 +67,8 @@ def main_gram(forged: Json) -> Json:
 def flip_an_entry(forged: Json) -> None:
     Q = main_gram(forged)["Q"]
     i, j = max(
-        ((i, j) for i in range(len(Q)) for j in range(i)), key=lambda at: abs(float(Q[at[0]][at[1]]))
+        ((i, j) for i in range(len(Q)) for j in range(i)),
+        key=lambda at: abs(float(Q[at[0]][at[1]])),
     )
     Q[i][j] = Q[j][i] = -Q[i][j]
 
@@ -186,9 +187,7 @@ def test_a_forgery_by_hand_is_refused(
         ("factor", "factor"),
     ],
 )
-def test_a_dropped_multiplier_is_refused(
-    kind: str, key: str, mode: Mode, tmp_path: Path
-) -> None:
+def test_a_dropped_multiplier_is_refused(kind: str, key: str, mode: Mode, tmp_path: Path) -> None:
     def drop(forged: Json) -> None:
         del forged["proof"][key]
 
@@ -240,7 +239,19 @@ def test_the_bound_cannot_be_raised_by_a_thousandth(tmp_path: Path) -> None:
         b"null",
         b'{"format": "nlsid/proof", "version": true}',
     ],
-    ids=["twice", "nan", "infinity", "1e999", "arrays", "objects", "bytes", "empty", "list", "null", "bool"],
+    ids=[
+        "twice",
+        "nan",
+        "infinity",
+        "1e999",
+        "arrays",
+        "objects",
+        "bytes",
+        "empty",
+        "list",
+        "null",
+        "bool",
+    ],
 )
 def test_what_is_no_document_is_refused(text: bytes, tmp_path: Path) -> None:
     with pytest.raises(CertificateRejected):
