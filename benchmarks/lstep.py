@@ -8,6 +8,7 @@ Every solver gets the same g (n = 6, degree 4, Gram 27 or 28) and maximises m wi
 """
 
 import argparse
+import importlib
 import json
 import multiprocessing
 import os
@@ -25,7 +26,7 @@ import numpy as np  # noqa: E402 - the thread counts have to be set first
 
 from examples import satellite  # noqa: E402
 from nlsid_core.certificate import Mode, prove_lower_bound  # noqa: E402
-from nlsid_core.polynomial import Polynomial, monomials, variables  # noqa: E402
+from nlsid_core.polynomial import Polynomial, constant, monomials, variables  # noqa: E402
 from nlsid_core.sos import (  # noqa: E402
     Compiled,
     Program,
@@ -146,7 +147,7 @@ def parametric(n: int) -> Compiled:
     names = tuple(f"z{i}" for i in range(n))
     g = template("g", monomials(n, range(5)), names)
     (m,) = variables("m")
-    sphere = 1 - sum(z**2 for z in variables(names))
+    sphere: Polynomial = 1 - sum((z**2 for z in variables(names)), constant(0.0))
     squares = SumOfSquares(g - m, modulo=sphere)
     return compile_program(Program(names, (squares,), maximise=m, parameters=g.names[n:]))
 
@@ -162,8 +163,9 @@ def solve_compiled(compiled: Compiled, g: Polynomial) -> float:
 
 def solve_cvxpy(g: Polynomial) -> float:
     """The full form g - m + μ(1 - |z|²) = v'Qv in cvxpy with Clarabel."""
-    import cvxpy as cp
     import scipy.sparse as sp
+
+    cp: Any = importlib.import_module("cvxpy")
 
     n = len(g.names)
     rows = monomials(n, range(5))

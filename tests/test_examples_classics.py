@@ -18,6 +18,7 @@ from examples import (
     van_der_pol,
 )
 from nlsid_core import _json
+from nlsid_core._types import Json
 from nlsid_core.certificate import check
 from nlsid_core.errors import CertificateRejected, Infeasible, Undecided
 from nlsid_core.sos.exact import exact_gram
@@ -136,7 +137,7 @@ def test_a_proof_for_one_level_is_rejected_for_a_larger_one() -> None:
         _check(forged)
 
 
-def _check(document: _json.Json) -> None:
+def _check(document: Json) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:

@@ -223,6 +223,6 @@ def test_univariate_minima_are_exact() -> None:
     for _ in range(5):
         p: Polynomial = z**6 + sum(float(c) * z**k for k, c in enumerate(rng.normal(size=6)))
         roots = np.roots([float(p.derivative("z").coefficient([k])) for k in range(5, -1, -1)])
-        least = p(roots[np.abs(roots.imag) < 1e-9].real[:, None]).min()
+        least = np.min(p(roots[np.abs(roots.imag) < 1e-9].real[:, None]))
         found = solve(Program(("z",), (SumOfSquares(p - t),), maximise=t))
         assert found.objective == pytest.approx(least, abs=1e-6)

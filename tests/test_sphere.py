@@ -6,7 +6,7 @@ import pytest
 from examples import satellite
 from nlsid_core.certificate import Mode, prove_lower_bound
 from nlsid_core.errors import CertificateRejected, DataError, ShapeError
-from nlsid_core.polynomial import Gram, Polynomial, monomials, variables
+from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.sos import Program, SphereProgram, SumOfSquares, solve, sphere_proof
 
 TWICE_SOLVER = 1e-6  # of the spread: Clarabel stops at 1e-8 of quantities of size 1, not of g
@@ -20,7 +20,7 @@ def random_quartic(n: int, seed: int) -> Polynomial:
 
 def oracle(g: Polynomial) -> float:
     (m,) = variables("m")
-    sphere = 1 - sum(z**2 for z in variables(g.names))
+    sphere: Polynomial = 1 - sum((z**2 for z in variables(g.names)), constant(0.0))
     return solve(Program(g.names, (SumOfSquares(g - m, modulo=sphere),), maximise=m)).objective
 
 
@@ -102,7 +102,7 @@ def test_fewer_monomials_suffice_where_few_states_enter_nonlinearly() -> None:
     proof = sphere_proof(program, found, g)
     assert prove(g, proof.bound, proof, "exact") > 0
     points = rng.normal(size=(20_000, 5))
-    assert proof.bound <= g(points / np.linalg.norm(points, axis=1)[:, None]).min()
+    assert proof.bound <= np.min(g(points / np.linalg.norm(points, axis=1)[:, None]))
 
 
 def test_a_constant_needs_no_iteration() -> None:

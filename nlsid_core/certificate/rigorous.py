@@ -106,7 +106,7 @@ def is_positive_definite(A: FloatArray, shift: float = 0.0) -> bool:
 def _decide_shifted(Q: FloatArray, rho: float) -> float:
     if len(Q) and np.isfinite(Q).all():
         half = (float(np.linalg.eigvalsh(Q)[0]) - rho) / 2
-        largest = float(np.diag(Q).max())
+        largest = float(np.max(np.diag(Q)))
         if half > 0 and is_positive_definite(Q, (rho + half) * SLACK):
             return half / largest / SLACK
     if is_positive_definite(Q, rho):

@@ -72,7 +72,7 @@ class Polynomial:
     @property
     def degree(self) -> int:
         """Total degree; 0 for constants and for the zero polynomial."""
-        return int(self.exponents.sum(axis=1).max(initial=0))
+        return int(np.max(self.exponents.sum(axis=1), initial=0))
 
     @property
     def is_exact(self) -> bool:
@@ -190,7 +190,7 @@ class Polynomial:
         kept = self.names[:j] + self.names[j + 1 :]
         reduced = np.delete(self.exponents, j, axis=1)
         result = constant(0, names=kept)
-        for power in range(int(powers.max(initial=0)), -1, -1):
+        for power in range(int(np.max(powers, initial=0)), -1, -1):
             part = Polynomial(
                 reduced[powers == power], self.coefficients[powers == power], kept
             )._horner(rest)
@@ -316,7 +316,7 @@ def as_polynomial(value: Any) -> Polynomial:
         return as_polynomial(value.item())
     if isinstance(value, (Rational, float, np.floating)):
         if isinstance(value, Integral):
-            return constant(int(value) if abs(value) <= 2**53 else Fraction(int(value)))
+            return constant(int(value) if abs(int(value)) <= 2**53 else Fraction(int(value)))
         return constant(Fraction(value) if isinstance(value, Rational) else float(value))
     raise NotPolynomial(f"{value!r} ({type(value).__name__}) is not a real number or a polynomial")
 
@@ -325,7 +325,7 @@ def monomial_values(exponents: IntArray, points: FloatArray) -> FloatArray:
     """(N, m) values of m monomials (m, n) at N points (N, n)."""
     values = np.ones((len(points), len(exponents)))
     for j in range(exponents.shape[1]):
-        top = int(exponents[:, j].max(initial=0))
+        top = int(np.max(exponents[:, j], initial=0))
         if top:
             powers = np.ones((top + 1, len(points)))
             for k in range(1, top + 1):

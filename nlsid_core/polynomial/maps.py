@@ -56,7 +56,7 @@ def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
 
     All are in the same variables; monomials they share are evaluated once.
     """
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     points = np.asarray(points, dtype=np.float64)
     exponents, table = coefficient_table(array.ravel().tolist())
     if points.shape[-1:] != (exponents.shape[1],):
@@ -67,7 +67,7 @@ def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
 
 def jacobian(polynomials: ArrayLike, names: Sequence[str]) -> NDArray[Any]:
     """∂p_i/∂names_j as an object array (..., len(names))."""
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     result = np.empty((*array.shape, len(names)), dtype=object)
     for index in np.ndindex(array.shape):
         for j, name in enumerate(names):
@@ -83,7 +83,7 @@ def compose_affine(
     A: (n, k) and b: (n,) of floats or Fractions, n the variables of the p_i in their order.
     Returns an object array of the shape of `polynomials`. Exact if A and b are Fractions.
     """
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     A, b = np.asarray(A), np.asarray(b)
     n = len(array.flat[0].names) if array.size else 0
     if A.shape != (n, len(names)) or b.shape != (n,):

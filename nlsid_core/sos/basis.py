@@ -20,7 +20,7 @@ def gram_basis(support: IntArray) -> IntArray:
     if not len(support):
         return np.zeros((0, support.shape[1]), dtype=np.int64)
     degrees = support.sum(axis=1)
-    low, high = int(degrees.min() + 1) // 2, int(degrees.max()) // 2
+    low, high = int(np.min(degrees) + 1) // 2, int(np.max(degrees)) // 2
     candidates = monomials(support.shape[1], range(low, high + 1))
     within = (candidates >= (support.min(axis=0) + 1) // 2) & (
         candidates <= support.max(axis=0) // 2

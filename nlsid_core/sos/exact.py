@@ -71,7 +71,7 @@ def _vanishing(
 ) -> Rational:
     """Rows n with n'v(z) = 0 at every zero: a rational basis of the null space."""
     values = [[_monomial(row, zero) for row in basis.tolist()] for zero in zeros]
-    top = int(basis.sum(axis=1).max(initial=0))
+    top = int(np.max(basis.sum(axis=1), initial=0))
     values += [
         [_monomial(row, zero) if sum(row) == top else Fraction(0) for row in basis.tolist()]
         for zero in directions
@@ -131,7 +131,7 @@ def _interior_gram(rows: Rational, rhs: Sequence[Fraction], size: int) -> FloatA
             f"no positive definite Gram matrix on the reduced basis (smallest eigenvalue "
             f"{x[0]:.1e}): p is not a sum of squares, or has zeros that were not given"
         )
-    return size_of_p * (conic.smat(x[1:]) + x[0] * np.eye(size))
+    return np.asarray(size_of_p * (conic.smat(x[1:]) + x[0] * np.eye(size)))
 
 
 def _corrected(G: Rational, rows: Rational, rhs: Sequence[Fraction]) -> Rational | None:

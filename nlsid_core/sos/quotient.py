@@ -46,7 +46,7 @@ class Quotient:
 
     def standard(self, basis: IntArray) -> IntArray:
         """The rows of `basis` that are their own remainder; with the others they are dependent."""
-        return basis[(basis < self.lead).any(axis=1)]
+        return np.asarray(basis[(basis < self.lead).any(axis=1)])
 
 
 def divide(p: Polynomial, g: Polynomial) -> tuple[Polynomial, Polynomial]:

@@ -121,7 +121,7 @@ def attraction(
     """
     names = V.names
     rate: Polynomial = -sum(V.derivative(x) * f for x, f in zip(names, field, strict=True))
-    lowest = int(rate.exponents.sum(axis=1).min()) if len(rate) else 0
+    lowest = int(np.min(rate.exponents.sum(axis=1))) if len(rate) else 0
     even = rate.degree + rate.degree % 2
     room = SumOfSquares(
         rate,

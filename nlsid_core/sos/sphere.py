@@ -168,9 +168,10 @@ def _interior_point(
         if upper - m <= max(tolerance, CERTIFY_FROM):
             found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
             found = _certified(program, g, found)
-            worse = best is not None and found.gap >= best.gap
-            best = best if worse else found
-            if worse or upper - m <= tolerance:
+            if best is not None and found.gap >= best.gap:
+                return best
+            best = found
+            if upper - m <= tolerance:
                 return best
         Lx, Lz = _factor(X), _factor(Z)
         if Lx is None or Lz is None:
@@ -216,7 +217,7 @@ def _first_iterate(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Strictly feasible X, y, m: the least-norm X that meets the equalities, shifted."""
     if start is None:
-        X, y, m = 0 * program._unit, program._centre, float(g.min())
+        X, y, m = 0 * program._unit, program._centre, float(np.min(g))
         clearance = 1.0
     else:
         # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.

@@ -301,7 +301,7 @@ def refute_or_confirm(document: Json, folder: Path) -> str:
     answers = {}
     for mode in ("exact", "rigorous"):
         try:
-            verdict_of(document, folder, mode)  # type: ignore[arg-type]
+            verdict_of(document, folder, mode)
             answers[mode] = "proved"
         except Undecided:
             answers[mode] = "undecided"
