@@ -17,7 +17,7 @@ Integers: TypeAlias = list[list[int]]
 
 FACTOR_BITS = 60  # of the rounded factor; past the 53 of a float there is nothing left to keep
 SHIFT = 2.0**-46  # taken off a unit diagonal first, so that rounding the factor cannot matter
-ELIMINATION_ORDER = 150  # beyond it fraction-free elimination takes minutes
+ELIMINATION_WORK = 2_000_000  # order² times bits: beyond it elimination takes longer than seconds
 
 
 def is_positive_definite(M: Integers) -> bool:
@@ -77,8 +77,12 @@ def is_dominated(M: Integers) -> bool:
 def _eliminate(M: Integers) -> int | None:
     """The rank of M if M ⪰ 0, else None, by fraction-free symmetric elimination (Bareiss)."""
     n = len(M)
-    if n > ELIMINATION_ORDER:
-        raise Undecided(f"a {n}x{n} matrix too close to singular for the fast exact test")
+    bits = max((abs(entry).bit_length() for row in M for entry in row), default=0)
+    if n * n * bits > ELIMINATION_WORK:
+        raise Undecided(
+            f"a {n}x{n} matrix with {bits} bits is too close to singular for the fast exact test, "
+            "and too large to eliminate"
+        )
     rows, previous = [row[:] for row in M], 1
     for rank in range(n):
         size = len(rows)

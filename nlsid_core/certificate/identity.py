@@ -25,7 +25,7 @@ Factor: TypeAlias = Polynomial | Gram
 MAX_ORDER = (
     500  # of a Gram matrix: beyond it deciding takes minutes, and so would a denial of service
 )
-MAX_TERMS = 4_000_000  # products of coefficients to expand; a large real proof has 1e5
+MAX_ENTRIES = 40_000_000  # exponents of the products to expand (320 MB); real proofs have 1e6
 MAX_DEGREE = 2**15  # keeps sums of exponents and their weights within 64-bit integers
 
 
@@ -103,8 +103,10 @@ def group(exponents: IntArray) -> tuple[IntArray, IntArray]:
 
 def one(names: Sequence[str], value: int | float | Fraction = 1) -> Polynomial:
     """The constant `value`, exactly, as a factor in these variables."""
-    coefficients = np.array([value], dtype=object if isinstance(value, Fraction) else np.float64)
-    return Polynomial(np.zeros((1, len(names)), dtype=np.int64), coefficients, tuple(names))
+    exactly = Fraction(value)
+    is_float = isinstance(value, float) or (exactly.denominator == 1 and abs(exactly) <= 2**53)
+    coefficient = np.array([float(value)]) if is_float else np.array([exactly], dtype=object)
+    return Polynomial(np.zeros((1, len(names)), dtype=np.int64), coefficient, tuple(names))
 
 
 def _expand(target: Sequence[Product], gram: Gram) -> Terms:
@@ -119,8 +121,8 @@ def _expand(target: Sequence[Product], gram: Gram) -> Terms:
                 _refuse_order(factor)
         (e, a, w), (f, b, v) = _raw(product.left, product.derivative), _raw(product.right, None)
         size += len(a) * len(b)
-        if size > MAX_TERMS:
-            raise CertificateRejected(f"more than {MAX_TERMS} products to expand: not decided")
+        if size * n > MAX_ENTRIES:
+            raise Undecided(f"{size} products in {n} variables are too many to expand")
         parts.append(
             Terms(
                 (e[:, None] + f[None]).reshape(-1, n),

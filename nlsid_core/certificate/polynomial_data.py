@@ -67,6 +67,9 @@ def read_polynomial(document: Any, names: Sequence[str], *, source: str) -> Poly
     values = _json.member(document, "coefficients", list, source=source)
     if len(values) != len(exponents):
         raise DocumentError(f"{source}: {len(exponents)} exponents, {len(values)} coefficients")
+    if len({tuple(row) for row in exponents.tolist()}) < len(exponents):
+        # Adding its coefficients would round, and the claim be about another polynomial.
+        raise DocumentError(f"{source}: a monomial occurs twice")
     return Polynomial(exponents, _numbers(values, source), tuple(names))
 
 

@@ -30,4 +30,4 @@ class Verdict:
     seconds: float
 
     def __str__(self) -> str:
-        return f"PROVED {self.statement} margin {self.margin:.3g} in {self.seconds:.3f} s"
+        return f"PROVED {self.statement} margin {self.margin:.3g} in {self.seconds:.3f} s ({self.mode})"

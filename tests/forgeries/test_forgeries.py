@@ -2,6 +2,7 @@
 
 import copy
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.certificate import Verdict, check
+from nlsid_core.certificate.dyadic import is_positive_semidefinite
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, Undecided
 from tests.forgeries.genuine import genuine
@@ -286,6 +288,38 @@ def test_a_digest_of_another_file_is_a_mismatch(tmp_path: Path) -> None:
 
     with pytest.raises(CertificateMismatch):
         verdict_of(resealed(genuine()["bound"], bind), tmp_path)
+
+
+def test_a_monomial_stated_twice_is_refused(tmp_path: Path) -> None:
+    def split(forged: Json) -> None:
+        polynomial = forged["claim"]["polynomial"]
+        polynomial["exponents"].append(polynomial["exponents"][0])
+        polynomial["coefficients"].append(1e-30)
+
+    with pytest.raises(CertificateRejected, match="twice"):
+        verdict_of(resealed(genuine()["factor"], split), tmp_path)
+
+
+def test_a_proof_built_to_take_hours_is_left_undecided_in_seconds(tmp_path: Path) -> None:
+    """Singular, so only elimination could decide, with entries of thousands of bits."""
+    size = 120
+
+    def burden(forged: Json) -> None:
+        main_gram(forged).update(
+            basis=[[k + 1, 0] for k in range(size)],
+            Q=[[f"{i * j + 1}/{3**900}" for j in range(size)] for i in range(size)],
+        )
+        polynomial = forged["claim"]["polynomial"]
+        polynomial.update(exponents=[], coefficients=[])
+        forged["claim"]["bound"] = 0.0
+        forged["proof"]["multipliers"] = []
+
+    started = time.perf_counter()
+    with pytest.raises(CertificateRejected):
+        verdict_of(resealed(genuine()["bound"], burden), tmp_path)
+    with pytest.raises(Undecided, match="eliminate"):
+        is_positive_semidefinite([[(i * j + 1) * 3**900 for j in range(size)] for i in range(size)])
+    assert time.perf_counter() - started < 20
 
 
 def test_the_verdict_quotes_the_claim_and_not_the_file(tmp_path: Path) -> None:
