@@ -5,9 +5,10 @@ import pytest
 
 from examples import satellite
 from nlsid_core.certificate import Mode, prove_lower_bound
-from nlsid_core.errors import CertificateRejected, DataError, ShapeError
+from nlsid_core.errors import CertificateRejected, DataError, ShapeError, SolverError
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.sos import Program, SphereProgram, SumOfSquares, solve, sphere_proof
+from nlsid_core.sos import sphere as sphere_module
 
 TWICE_SOLVER = 1e-6  # of the spread: Clarabel stops at 1e-8 of quantities of size 1, not of g
 
@@ -81,6 +82,39 @@ def test_a_warm_start_reaches_the_same_margin_in_fewer_iterations() -> None:
     cold = program.solve(nearby, tolerance=1e-5)
     assert warm.iterations < cold.iterations
     assert warm.m == pytest.approx(cold.m, abs=2e-5 * np.ptp(nearby))
+
+
+@pytest.mark.parametrize("degrees", [(1,), (2,), (4,), (0, 2, 4), (1, 2, 3, 4)])
+def test_special_shapes_of_g_are_solved(degrees: tuple[int, ...]) -> None:
+    program, rng = SphereProgram(4), np.random.default_rng(len(degrees))
+    last = None
+    for size in (1e-9, 1.0, 1e6):
+        rows = monomials(4, degrees)
+        g = Polynomial(rows, size * rng.normal(size=len(rows)), tuple("abcd"))
+        last = program.solve(g(program.points), start=last)
+        assert last.iterations > 0
+        assert last.gap < 1e-6
+        sphere_points = rng.normal(size=(5000, 4))
+        sphere_points /= np.linalg.norm(sphere_points, axis=1)[:, None]
+        assert last.m <= np.min(g(sphere_points)) + 1e-6 * size
+
+
+def test_clarabel_steps_in_when_the_interior_point_gives_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    program, g = SphereProgram(4), random_quartic(4, 7)
+    values = g(program.points)
+    expected = program.solve(values)
+
+    def gives_up(*_: object) -> None:
+        raise SolverError("on purpose")
+
+    monkeypatch.setattr(sphere_module, "_interior_point", gives_up)
+    found = program.solve(values, start=expected)
+    assert found.iterations == 0
+    assert found.m == pytest.approx(expected.m, abs=1e-6 * np.ptp(values))
+    proof = sphere_proof(program, found, g)
+    assert prove(g, proof.bound, proof, "exact") > 0
 
 
 def test_a_useless_warm_start_still_solves() -> None:
