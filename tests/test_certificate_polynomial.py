@@ -105,6 +105,31 @@ def test_rigorous_definiteness_proves_well_conditioned_and_badly_scaled_matrices
     assert not rigorously_definite(np.array([[np.nan]]))
 
 
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-17, -2), st.booleans())
+def test_rigorous_mode_proves_nothing_that_exact_mode_does_not(
+    seed: int, room: float, above: bool
+) -> None:
+    """Identities whose truth hangs on a margin down to rounding size, on either side of it."""
+    rng = np.random.default_rng(seed)
+    L = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-3, 3, size=(3, 1))
+    Q = L @ L.T
+    Q = (Q + Q.T) / 2
+    p = gram(Q).polynomial()
+    lowest = float(np.linalg.eigvalsh(Q)[0])
+    shift = lowest * (1 - 10.0**room if above else 1 + 10.0**room)
+    shifted = gram(Q - shift * np.eye(3))
+    target = p - shift * (x**2 + y**2 + 1)
+    answers = []
+    for mode in ("exact", "rigorous"):
+        try:
+            prove_lower_bound(target, 0.0, shifted, mode=mode)
+            answers.append(True)
+        except CertificateRejected:
+            answers.append(False)
+    assert answers[0] or not answers[1]
+
+
 @pytest.mark.parametrize("mode", ["exact", "rigorous"])
 def test_a_small_residual_is_absorbed_and_a_large_one_refused(mode: Any) -> None:
     p = x**2 + y**2 + 1
