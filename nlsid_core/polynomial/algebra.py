@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
 from nlsid_core.polynomial.operations import OPERATORS, REFUSED
+from nlsid_core.polynomial.values import monomial_values
 
 Coefficients: TypeAlias = NDArray[Any]
 Number: TypeAlias = int | float | Fraction
@@ -319,19 +320,6 @@ def as_polynomial(value: Any) -> Polynomial:
             return constant(int(value) if abs(int(value)) <= 2**53 else Fraction(int(value)))
         return constant(Fraction(value) if isinstance(value, Rational) else float(value))
     raise NotPolynomial(f"{value!r} ({type(value).__name__}) is not a real number or a polynomial")
-
-
-def monomial_values(exponents: IntArray, points: FloatArray) -> FloatArray:
-    """(N, m) values of m monomials (m, n) at N points (N, n)."""
-    values = np.ones((len(points), len(exponents)))
-    for j in range(exponents.shape[1]):
-        top = int(np.max(exponents[:, j], initial=0))
-        if top:
-            powers = np.ones((top + 1, len(points)))
-            for k in range(1, top + 1):
-                powers[k] = powers[k - 1] * points[:, j]
-            values *= powers[exponents[:, j]].T
-    return values
 
 
 def _merge(exponents: IntArray, coefficients: Coefficients) -> tuple[IntArray, Coefficients]:

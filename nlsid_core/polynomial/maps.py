@@ -13,9 +13,9 @@ from nlsid_core.errors import NotPolynomial, ShapeError
 from nlsid_core.polynomial.algebra import (
     Polynomial,
     as_polynomial,
-    monomial_values,
     variables,
 )
+from nlsid_core.polynomial.values import monomial_values
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray[Any]:

@@ -24,7 +24,7 @@ from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials
-from nlsid_core.polynomial.algebra import monomial_values
+from nlsid_core.polynomial.values import monomial_values
 
 CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
 RANK_TOLERANCE = 1e-10  # of the QR diagonal: degree-4 monomials on a sphere keep 12 digits
