@@ -174,6 +174,7 @@ class _Bound:
             return band.shift(k, x) + band.shift_back(k, x)
         H_transposed = sum(h[j] * band.shift_back(j, x) for j in range(len(h)))
         back = band.shift_back(k, x)
-        return band.shift(k, np.asarray(H_transposed)) + np.asarray(
+        slope: FloatArray = band.shift(k, np.asarray(H_transposed)) + np.asarray(
             sum(h[j] * band.shift(j, back) for j in range(len(h)))
         )
+        return slope
