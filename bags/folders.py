@@ -1,5 +1,6 @@
 """Which bags a person means by a path, and which files a bag is made of."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,8 +133,8 @@ def _inside(folder: Path, name: str, version: int) -> Path:
     file = folder / name
     if version < 4:  # these named the file from the folder above
         file = folder / Path(name).name
-    file_there, home = file.resolve(), folder.resolve()
-    if not file_there.is_relative_to(home):
+    there, home = Path(os.path.realpath(file)), folder.resolve()  # realpath bears loops of links
+    if not there.is_relative_to(home):
         raise _bad(folder / METADATA, f"it names {name}, which is outside the bag")
     if not file.is_file():
         raise _bad(folder / METADATA, f"it names {name}, which is not there")
