@@ -12,6 +12,7 @@ from nlsid_core.errors import DataError
 SEGMENTS: Final = 50  # of the recording, each giving its least latency to the line of the drift
 SAME_CLOCK: Final = 1.0  # s; latencies stay below, an offset between clocks rarely does
 DRIFT_SIGNIFICANT: Final = 5.0  # times the scatter of the segments about the line
+OWN_PACE: Final = 1e-3  # s per s; two real clocks differ by less
 DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency says nothing
 
 
@@ -39,6 +40,8 @@ class ClockRelation:
             return (
                 f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
             )
+        if abs(self.drift) > OWN_PACE:
+            return f"stamps run at {1 + self.drift:.3g} times the pace of log time: simulated time?"
         drift = f", drifting {1e6 * self.drift:+.3g} ppm" if self.drift else ", constant"
         return f"stamps {self.offset:+.3f} s from log time{drift}"
 

@@ -108,14 +108,18 @@ def test_topics_with_no_name_or_odd_names_are_listed(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"odd.mcap", "out"}
 
 
+@pytest.fixture(scope="module")
+def zeros() -> bytes:
+    """300 MB in a few kB."""
+    return zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
+
+
 @pytest.mark.parametrize("stated", [2**20, 2**31, 2**62])
-def test_a_decompression_bomb_is_refused_without_being_unpacked(
-    tmp_path: Path, stated: int
+def test_a_decompression_bomb_is_refused_before_it_unpacks(
+    tmp_path: Path, zeros: bytes, stated: int
 ) -> None:
-    bomb = zstandard.ZstdCompressor(level=19).compress(bytes(300 * 2**20))
-    chunk = (
-        struct.pack("<QQQII", 0, 0, stated, 0, 4) + b"zstd" + struct.pack("<Q", len(bomb)) + bomb
-    )
+    chunk = struct.pack("<QQQII", 0, 0, stated, 0, 4) + b"zstd"
+    chunk += struct.pack("<Q", len(zeros)) + zeros
     header = struct.pack("<BQII", 1, 8, 0, 0)
     file = tmp_path / "bomb.mcap"
     file.write_bytes(b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 6, len(chunk)) + chunk)

@@ -37,6 +37,13 @@ def test_offset_and_drift_between_clocks_are_found_under_latency(offset: float, 
     assert found.latency == pytest.approx(0.004 * np.log(2), abs=2e-3)
 
 
+def test_simulated_time_is_told_by_its_pace() -> None:
+    t = np.arange(0, 60, 0.02)
+    found = clock_relation(np.rint(0.4e9 * t).astype(np.int64), stamps(t))
+    assert found.drift == pytest.approx(-0.6)
+    assert str(found) == "stamps run at 0.4 times the pace of log time: simulated time?"
+
+
 def test_segments_end_where_messages_are_missing() -> None:
     t = np.array([0.0, 0.1, 0.2, 1.0, 1.1, 3.0])
     assert segments(stamps(t), 0.5) == [(0, 3), (3, 5), (5, 6)]
