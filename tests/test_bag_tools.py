@@ -2,6 +2,8 @@
 
 import csv
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from bags.bag import Bag
 from bags.bag_cli import bag_app
 from bags.cli import app
 from bags.fitness import Level, check_fitness
+from bags.folders import expand_bags
 from bags.importing import import_tables, read_tables
 from bags.info import bag_info
 from bags.reader import bag_metadata, read_signals
@@ -66,6 +69,27 @@ def test_every_command_has_help() -> None:
     ):
         assert command in output
         assert "--help" in run(command, "--help")
+
+
+def test_an_error_shows_a_path_with_brackets_whole(bag: Path) -> None:
+    command = [sys.executable, "-m", "bags.cli", "bag", "plot", str(bag), "--out", "x.png"]
+    signal = f"{ODOM}:twist.twist.linear[name=elbow].x"
+    run = subprocess.run([*command, "-s", signal], capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert signal in run.stderr
+    assert "is a 'geometry_msgs/msg/Vector3', not an array" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_a_folder_holds_bags_of_one_file_or_one_bag_of_several(bag: Path, tmp_path: Path) -> None:
+    content = (bag / "trial.mcap").read_bytes()
+    for folder, names in (("runs", ("trial_01", "trial_02")), ("one", ("trial_0", "trial_1"))):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / f"{name}.mcap").write_bytes(content)
+    runs = tmp_path / "runs"
+    assert expand_bags([runs]) == [runs / "trial_01.mcap", runs / "trial_02.mcap"]
+    assert expand_bags([tmp_path / "one"]) == [tmp_path / "one"]
 
 
 def test_info_states_counts_rates_clocks_and_losses(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from bags.expressions import Expression, derivative
 from bags.message_types import standard_types
 from bags.reader import LOG_TIME, PUBLISH_TIME, read_signals
 from bags.signals import SignalPath, numeric_paths, quaternion_angle
+from bags.training import load_training, save_training
 from bags.units import UNITS, conversion, implied_unit
 from bags.writer import BagWriter
 from nlsid_core.errors import BagError
@@ -194,3 +195,6 @@ def test_a_dataset_knows_where_it_comes_from(tmp_path: Path) -> None:
     assert trial.y_paths == ("/odom:twist.twist.linear.x",)
     for part in (trial.digest, '"a.mcap"', '"/odom:twist.twist.linear.x"', '"tolerance":0.05'):
         assert part in trial.provenance
+    digest = save_training(tmp_path / "training.npz", dataset)
+    again = load_training(tmp_path / "training.npz", digest=digest)
+    assert again.trajectories[1].provenance == dataset.trajectories[1].provenance

@@ -118,11 +118,8 @@ def zeros() -> bytes:
 def test_a_decompression_bomb_is_refused_before_it_unpacks(
     tmp_path: Path, zeros: bytes, stated: int
 ) -> None:
-    chunk = struct.pack("<QQQII", 0, 0, stated, 0, 4) + b"zstd"
-    chunk += struct.pack("<Q", len(zeros)) + zeros
-    header = struct.pack("<BQII", 1, 8, 0, 0)
     file = tmp_path / "bomb.mcap"
-    file.write_bytes(b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    file.write_bytes(bomb_file(zeros, stated))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with McapFile(file, salvage=True) as opened:
         assert opened.contents.lost
@@ -147,6 +144,16 @@ def test_a_type_of_arrays_of_arrays_that_hold_nothing_ends_soon(tmp_path: Path) 
     with pytest.raises(NlsidError):
         read_signals(file, ["/x:a[999].b[999].c[0]"])
     assert time.monotonic() - started < SECONDS
+
+
+def bomb_file(packed: bytes, *stated: int) -> bytes:
+    """An MCAP file with chunks of those zeros, each stating its size."""
+    content = b"\x89MCAP0\r\n" + struct.pack("<BQII", 1, 8, 0, 0)
+    for size in stated:
+        chunk = struct.pack("<QQQII", 0, 0, size, 0, 4) + b"zstd"
+        chunk += struct.pack("<Q", len(packed)) + packed
+        content += struct.pack("<BQ", 6, len(chunk)) + chunk
+    return content
 
 
 def write_mcap(file: Path, topics: dict[str, tuple[str, str]]) -> None:
@@ -176,7 +183,7 @@ def run_all(file: Path, out: Path) -> None:
 
 
 def seeds(folder: Path) -> list[bytes]:
-    """Small bags of every layout: zstd, lz4, uncompressed, unchunked, custom types."""
+    """Small bags of every layout: zstd, lz4, uncompressed, unchunked, custom types, a bomb."""
     found = []
     options: list[dict[str, object]] = [
         {"compression": kind, "chunk_size": 600} for kind in CompressionType
@@ -206,7 +213,8 @@ def seeds(folder: Path) -> list[bytes]:
             writer.add_metadata("custom_data", {"a": "b"})
             writer.finish()  # type: ignore[no-untyped-call]
         found.append(file.read_bytes())
-    return found
+    zeros = zstandard.ZstdCompressor(level=1).compress(bytes(300 * 2**20))
+    return [*found, bomb_file(zeros, 300 * 2**20, 2**20)]
 
 
 def mutated(content: bytes, rng: random.Random) -> bytes:
