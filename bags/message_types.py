@@ -126,6 +126,11 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     return types
 
 
+def are_same(first: Typestore, second: Typestore) -> bool:
+    """Whether two results of `types_in_bag` define the same, however their texts differ."""
+    return first is second or first.fielddefs == second.fielddefs
+
+
 @contextmanager
 def _defining(msgtype: str) -> Iterator[None]:
     try:

@@ -35,6 +35,7 @@ from tests.bag_messages import (
     speed_bag,
 )
 from tests.conftest import SHARED
+from tests.test_hostile_bags import write_mcap
 
 ROBOT = SHARED / "schunk_arm" / "Robot"
 
@@ -159,6 +160,16 @@ def test_parts_of_a_bag_merge_to_the_whole(bag: Path, tmp_path: Path) -> None:
     run("merge", *reversed(parts), "--out", tmp_path / "again")
     with Bag(tmp_path / "again") as again, Bag(bag) as whole:
         assert list(again.messages()) == list(whole.messages())
+
+
+def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
+    for name, text in (("a", "float64 x"), ("b", "float64 x"), ("c", "float32 x")):
+        write_mcap(tmp_path / f"{name}.mcap", {"/x": ("pkg/msg/X", text)})
+    a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
+    run("merge", a, b, "--out", tmp_path / "ab")
+    with pytest.raises(BagError, match="two definitions of 'pkg/msg/X'; keep them in two bags"):
+        run("merge", a, c, "--out", tmp_path / "ac")
+    assert not (tmp_path / "ac").exists()
 
 
 def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from bags.bag import Bag
+from bags.columns import read_columns
 from bags.info import bag_info
 from bags.mcap_file import McapFile
+from bags.message_types import decode
 from bags.reader import read_signals
 from bags.recover import recover
+from bags.signals import SignalPath, numeric_paths
 from nlsid_core.errors import BagError
 from tests.conftest import SHARED
 
@@ -202,3 +205,24 @@ def test_the_replayed_bag_of_a_real_vehicle() -> None:
     assert len(depth) == 1566
     assert np.min(depth) == pytest.approx(-1.10, abs=0.01)
     assert np.max(depth) == pytest.approx(-0.26, abs=0.01)
+
+
+@pytest.mark.skipif(not COUGARS.is_dir(), reason="needs cougars_auv in ../shared/data")
+def test_every_number_of_a_real_bag_is_what_the_decoder_gives_bit_for_bit() -> None:
+    compared = 0
+    with Bag(COUGARS) as bag:
+        for topic in bag.topics:
+            if not bag.count(topic):
+                continue
+            kind, types = bag.types_on(topic)
+            texts = [path for path, *_ in numeric_paths(kind, types) if "[*]" not in path]
+            paths = {text: SignalPath.parse(f"{topic}:{text}") for text in texts}
+            columns = read_columns(bag, paths)[topic] if paths else None
+            for row, message in enumerate(bag.messages([topic])):
+                decoded = decode(message.data, kind, types)
+                for text, path in paths.items():
+                    assert columns is not None
+                    found, wanted = columns.values[text][row], path.value(decoded)
+                    assert found == wanted or (np.isnan(found) and np.isnan(wanted))
+                    compared += 1
+    assert compared > 150_000
