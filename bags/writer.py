@@ -116,11 +116,11 @@ class BagWriter:
 
     def _refuse_another(self, first: Channel, second: Channel) -> None:
         """BagError if two channels copied to one topic were written with different definitions."""
-        if first.encoding == second.encoding and first.definition == second.definition:
+        if first.encoding == second.encoding and (
+            first.definition == second.definition
+            or are_same(*(types_in_bag(c.msgtype, c.definition) for c in (first, second)))
+        ):
             return
-        if first.encoding == second.encoding == "cdr":
-            if are_same(*(types_in_bag(c.msgtype, c.definition) for c in (first, second))):
-                return
         raise BagError(
             f"{self.path}: {first.topic} comes with two definitions of '{first.msgtype}'; keep "
             "them in two bags"
