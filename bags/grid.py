@@ -15,6 +15,7 @@ from typing import Final, overload
 import numpy as np
 
 from bags.reader import Samples, bag_origin, read_signals, stamp_text
+from bags.timing import segments
 from nlsid_core._json import canonical
 from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.errors import DataError
@@ -127,6 +128,7 @@ def read_dataset(
     tolerance: float = JITTER_TOLERANCE,
     clock: str | None = None,
     sort: bool = False,
+    drop_duplicates: bool = False,
     split_gaps: bool = False,
     unfinished: bool = False,
     executor: Executor | None = None,
@@ -136,7 +138,7 @@ def read_dataset(
 
     A trajectory has the bag's name and digest, and as group its custom datum `repeat_group`. Its
     provenance is the bag's digest, files and custom data, the signals and the options. For the grid
-    see `to_trajectory`, for clock, sort and unfinished `read_signals`.
+    see `to_trajectory`, for clock, sort, drop_duplicates and unfinished `read_signals`.
 
     split_gaps: a bag in which a response is missing for more than `max_gap` gives one trajectory
     per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error. executor: reads
@@ -154,6 +156,7 @@ def read_dataset(
         "tolerance": tolerance,
         "clock": clock,
         "sort": sort,
+        "drop_duplicates": drop_duplicates,
         "split_gaps": split_gaps,
         "unfinished": unfinished,
     }
@@ -177,6 +180,7 @@ def _read_trials(
         [*signals["responses"], *signals["excitations"]],
         clock=options["clock"],
         sort=options["sort"],
+        drop_duplicates=options["drop_duplicates"],
         unfinished=options["unfinished"],
     )
     origin = bag_origin(path, unfinished=options["unfinished"])
@@ -205,13 +209,14 @@ def _stretches(
     responses: Sequence[Samples], excitations: Sequence[Samples], max_gap: float | None
 ) -> Iterator[tuple[list[Samples], list[Samples]]]:
     """The signals cut where a response is missing; stretches of a few samples are left out."""
-    starts, stops = [], []
+    starts: list[int] = []
+    stops: list[int] = []
     for samples in responses:
         steps = np.diff(samples.stamp_ns)
         gap = DEFAULT_MAX_GAP * np.median(steps) / 1e9 if max_gap is None else max_gap
-        at = np.flatnonzero(steps > gap * 1e9)
-        stops += samples.stamp_ns[at].tolist()
-        starts += samples.stamp_ns[at + 1].tolist()
+        runs = segments(samples.stamp_ns, gap)
+        starts += [int(samples.stamp_ns[first]) for first, _ in runs[1:]]
+        stops += [int(samples.stamp_ns[end - 1]) for _, end in runs[:-1]]
     starts = [min(int(s.stamp_ns[0]) for s in responses), *sorted(starts)]
     stops = [*sorted(stops), max(int(s.stamp_ns[-1]) for s in responses)]
     for start, stop in zip(starts, stops, strict=True):

@@ -12,6 +12,7 @@ from rosbags.typesys.store import Typestore
 from bags.bag import Bag
 from bags.columns import Columns, Progress, expand_paths, read_columns
 from bags.expressions import Expression
+from bags.timing import without_duplicates
 from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
 
@@ -49,6 +50,7 @@ def read_signals(
     *,
     clock: str | None = None,
     sort: bool = False,
+    drop_duplicates: bool = False,
     unfinished: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Samples]:
@@ -56,6 +58,7 @@ def read_signals(
 
     clock: which times are the stamps (None: header stamps, log time for types without a header).
     sort: put messages in the order of their stamps instead of refusing stamps that go back.
+    drop_duplicates: of messages with one stamp keep the first.
     unfinished: read what there is of a recording that was not closed.
     `[*]` gives one entry per element. Every path is checked against the types in the bag before a
     message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
@@ -81,6 +84,8 @@ def read_signals(
         for topic, found in columns.items():
             topics[topic] = _Topic(source, found, clock, sort=sort)
             topics[topic].check_stamps(source.count(topic))
+            if drop_duplicates:
+                topics[topic].drop_duplicates()
         samples = {}
         for name, expression in wanted.items():
             recorded = topics[expression.path.topic].samples(name)
@@ -189,6 +194,12 @@ class _Topic:
                 f"{stamp_text(int(stamps[i + 1]))} "
                 f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
             )
+
+    def drop_duplicates(self) -> None:
+        kept = without_duplicates(self._stamps)
+        if len(kept) < len(self._stamps):
+            self._stamps = self._stamps[kept]
+            self._values = {name: values[kept] for name, values in self._values.items()}
 
     def samples(self, name: str) -> Samples:
         values = self._values[name]

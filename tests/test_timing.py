@@ -122,6 +122,15 @@ def test_stamps_that_go_back_are_sorted_on_request(tmp_path: Path) -> None:
     assert read_signals(bag, [SPEED], sort=True)[SPEED].values.tolist() == [0, 1, 2, 3]
 
 
+def test_of_messages_with_one_stamp_the_first_is_kept_on_request(tmp_path: Path) -> None:
+    times = [START_NS + k * PERIOD_NS for k in (0, 1, 1, 2)]
+    bag = speed_bag(tmp_path / "x", [0.0, 1.0, 9.0, 2.0], [0.0] * 4, stamps_ns=times)
+    with pytest.raises(DataError, match="have the same stamp"):
+        bags.read([bag], responses=[SPEED], excitations=[COMMAND])
+    found = bags.read([bag], responses=[SPEED], excitations=[COMMAND], drop_duplicates=True)
+    assert found.trajectories[0].y[:, 0].tolist() == [0.0, 1.0, 2.0]
+
+
 def test_a_bag_with_a_gap_gives_a_trajectory_per_stretch(tmp_path: Path) -> None:
     ticks = [*range(30), *range(50, 90)]
     times = [START_NS + k * PERIOD_NS for k in ticks]
