@@ -1,0 +1,6 @@
+"""Identified models: frozen numbers, a document form, and simulation."""
+
+from nlsid_core.models.difference_equation import DifferenceEquation
+from nlsid_core.models.signal import Signal
+
+__all__ = ["DifferenceEquation", "Signal"]
