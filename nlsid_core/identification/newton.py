@@ -20,9 +20,10 @@ from nlsid_core.identification.rows import Rows
 
 DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of the minimiser
 PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding
+STALLED = 1e-7  # decrement relative to J at which rounding of J may end the line search
 MAX_NEWTON = 200
 ARMIJO = 1e-4  # the usual sufficient-decrease fraction
-SHORTEST_STEP = 2.0**-40
+SHORTEST_STEP = 2.0**-30
 BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken to the barrier
 GAP = 1e-8  # μ·(barrier parameter) relative to J at which the barrier path of K ends
 INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
@@ -137,6 +138,8 @@ class _Search:
                 if new_point is not None and new_value <= value - ARMIJO * length * decrement:
                     break
                 length /= 2
+                if length < SHORTEST_STEP and decrement <= max(STALLED * point.J, mu):
+                    return Minimum(point, z[self.parameters :], self.steps, barrier_on_K)
                 if length < SHORTEST_STEP:
                     return None
             z, value, point = candidate, new_value, new_point

@@ -16,7 +16,8 @@ from nlsid_core.models.monomials import monomial_values, monomials_up_to
 from nlsid_core.models.state_affine import Polynomials
 from nlsid_core.trajectory import Dataset, Trajectory
 
-RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeats the others
+CONSTANT = 1e-10  # relative spread below which a signal is constant
+RANK_TOLERANCE = 1e-13  # relative singular value of unit columns at which a basis repeats itself
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def _block(
 
 def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
     mean, spread = values.mean(axis=0), values.std(axis=0)
-    for i in np.flatnonzero(spread <= RANK_TOLERANCE * np.maximum(np.abs(mean), 1.0)):
+    for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
         raise DataError(
             f"the {role} {i} is constant ({mean[i]:g}) in all trials: nothing can be identified "
             "from it"
@@ -179,7 +180,7 @@ def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
 
 
 def _refuse_rank(R: FloatArray, lags: int) -> None:
-    singular = np.linalg.svd(R, compute_uv=False)
+    singular = np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
     rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
     if rank < len(R):
         raise DataError(
