@@ -12,7 +12,8 @@ from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.certificate import check, proof_document
 from nlsid_core.errors import CertificateRejected, DataError, ShapeError
-from nlsid_core.identification.certified import certified_simulation_error, prove_state_affine
+from nlsid_core.identification.certified import certified_simulation_error
+from nlsid_core.identification.contraction import prove_state_affine
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
@@ -52,7 +53,8 @@ def documents(stacked: StateAffineRows) -> tuple[Json, Json]:
     """Model and proof of the last certified iterate."""
     *_, last = certified_simulation_error(stacked, iterations=4)
     model = stacked.model(last.point.theta, last.point.p)
-    proof = prove_state_affine(model, stacked, last)
+    proof = prove_state_affine(model)
+    assert proof is not None
     return model.document(), proof.document(model, "model.json")
 
 

@@ -13,47 +13,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import FloatArray, Json
-from nlsid_core.certificate import proof_document
-from nlsid_core.certificate.state_affine import contracts
-from nlsid_core.errors import Infeasible, ShapeError
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import ShapeError
 from nlsid_core.identification.bound import Bound, Point
+from nlsid_core.identification.contraction import box_inequalities, companion, traceless
 from nlsid_core.identification.inequalities import MatrixInequality, centre, minimise_linear
 from nlsid_core.identification.newton import minimise
 from nlsid_core.identification.state_affine import StateAffineRows
-from nlsid_core.models import StateAffineModel
 
-RATE_ROOM = 0.02  # the certified rate gives up this fraction of 1 - |slowest rate of P|
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
 START_BOUNDS = (0.9, 1.1)  # of G_0 around the first iterate's start G = I
 START_SLACK = 0.05  # of those bounds, spent on the multipliers of the box
 TIGHT = 1e-4  # of h - ℓ, how tightly the bounds of G_0 are stated
-STOP = 1e-6  # relative decrease of J that ends the iteration
-BOUND_ROOM = 1e-7  # the stated bounds of q are this much wider than found, for a strict proof
-
-
-@dataclass(frozen=True, eq=False)
-class StateAffineProof:
-    """The numbers of a `state_affine_stability` proof, decided exactly by the checker's code."""
-
-    P: FloatArray
-    rate: float
-    bounds: tuple[float, float]
-    multipliers: tuple[FloatArray, FloatArray]
-
-    def document(self, model: StateAffineModel, file: str) -> Json:
-        """The proof file's content for the model stored in `file` beside it."""
-        about = {"model": {"file": file, "digest": _json.digest(model.document())}}
-        claim = {"kind": "state_affine_stability", "rate": self.rate, "about": about}
-        proof = {
-            "P": self.P.tolist(),
-            "lower": self.bounds[0],
-            "upper": self.bounds[1],
-            "lower_box": self.multipliers[0].tolist(),
-            "upper_box": self.multipliers[1].tolist(),
-        }
-        return proof_document(claim, proof)
+STOP = 1e-4  # relative decrease of J that ends the iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,36 +68,11 @@ def certified_simulation_error(
         theta = linearised = found.point.theta
         extra = _tightened(inequalities[2:], theta, found.extra)
         linearised_at = extra[:2]
-        P = _centred(P, [_state_matrix(problem, theta, q) for q in linearised_at])
+        P = _centred(P, [companion(theta[-n:], q) for q in linearised_at])
         yield CertifiedIterate(found.point, extra, P)
         if previous * (1.0 - STOP) <= found.point.J:
             return
         previous = found.point.J
-
-
-def prove_state_affine(
-    model: StateAffineModel, problem: StateAffineRows, iterate: CertifiedIterate
-) -> StateAffineProof:
-    """The exact proof of an iterate's model; Infeasible says what fails."""
-    P = iterate.P / np.abs(iterate.P).max()
-    L = np.linalg.cholesky(P)
-    low = float(iterate.extra[0] * (1.0 - BOUND_ROOM))
-    high = float(iterate.extra[1] * (1.0 + BOUND_ROOM))
-    matrices = [_state_matrix(problem, iterate.point.theta, q) for q in (low, high)]
-    norms = [np.linalg.norm(np.linalg.solve(L, A.T @ L), 2) for A in matrices]
-    slowest = float(max(norms))
-    rate = slowest + RATE_ROOM * (1.0 - slowest)
-    n_w = len(model.window)
-    proof = StateAffineProof(
-        P=P,
-        rate=rate,
-        bounds=(low, high),
-        multipliers=(iterate.extra[2 : 2 + n_w], iterate.extra[2 + n_w :]),
-    )
-    refusal = contracts(model, rate, P=P, bounds=proof.bounds, multipliers=proof.multipliers)
-    if refusal is not None:
-        raise Infeasible(f"no exact proof of this iterate: {refusal}")
-    return proof
 
 
 def _inequalities(
@@ -152,18 +99,9 @@ def _inequalities(
             entry = F[1 + n_q + k]
             entry[n:, k] = entry[k, n:] = -P[:, 0]
         result.append(MatrixInequality(F))
-    for end, sign in ((0, 1.0), (1, -1.0)):
+    for part in box_inequalities(problem.left[0], box):
         F = np.zeros((size, n_w + 1, n_w + 1))
-        for index, powers in enumerate(problem.left[0]):
-            used = [i + 1 for i, power in enumerate(powers) for _ in range(int(power))]
-            i, j = [0] * (2 - len(used)) + used
-            F[1 + index, i, j] += 0.5 * sign
-            F[1 + index, j, i] += 0.5 * sign
-        F[1 + n_g + end, 0, 0] = -sign
-        for i, (low, high) in enumerate(box, 1):
-            entry = F[1 + n_g + 2 + end * n_w + i - 1]
-            entry[0, 0], entry[i, i] = low * high, 1.0
-            entry[0, i] = entry[i, 0] = -0.5 * (low + high)
+        F[1 : 1 + n_q], F[1 + n_g :] = part[:n_q], part[n_q:]
         result.append(MatrixInequality(F))
     F = np.zeros((size, 2 * n_w, 2 * n_w))
     for i in range(2 * n_w):
@@ -192,18 +130,10 @@ def _tightened(
     return tight
 
 
-def _state_matrix(problem: StateAffineRows, theta: FloatArray, q: float) -> FloatArray:
-    """A(1/q) of x = [ȳ(t-1); …; ȳ(t-n)]."""
-    n = len(problem.left) - 1
-    A = np.diag(np.ones(n - 1), -1)
-    A[0] -= theta[-n:] / q
-    return A
-
-
 def _centred(P: FloatArray, matrices: list[FloatArray]) -> FloatArray:
     """The analytic centre of {P : r²P - A'PA ≻ 0 for every A, tr P = n}, from P in it."""
     n = len(P)
-    basis = _traceless(n)
+    basis = traceless(n)
     start = P * n / np.trace(P)
     images = [
         np.stack([SLOWEST_RATE**2 * X - A.T @ X @ A for X in (start, *basis)]) for A in matrices
@@ -211,18 +141,3 @@ def _centred(P: FloatArray, matrices: list[FloatArray]) -> FloatArray:
     inequalities = [MatrixInequality(F) for F in images]
     z = centre(inequalities, np.zeros(len(basis)))
     return np.asarray(start + np.tensordot(z, basis, axes=1))
-
-
-def _traceless(n: int) -> FloatArray:
-    """A basis of the symmetric n×n matrices with trace zero."""
-    basis = []
-    for i in range(n):
-        for j in range(i, n):
-            X = np.zeros((n, n))
-            X[i, j] = X[j, i] = 1.0
-            if i == j:
-                if i == 0:
-                    continue
-                X[0, 0] = -1.0
-            basis.append(X)
-    return np.array(basis).reshape(-1, n, n)
