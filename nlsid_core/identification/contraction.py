@@ -155,7 +155,7 @@ def traceless(n: int) -> FloatArray:
 
 def _fastest_rate(matrices: list[FloatArray]) -> float | None:
     """About the smallest rate with a common storage function: 1 - rate to some per cent."""
-    room = 1.0 - float(max(abs(np.linalg.eigvals(A)).max() for A in matrices))
+    room = 1.0 - float(max(np.max(abs(np.linalg.eigvals(A))) for A in matrices))
     while room > SLOWEST and _common_storage(matrices, 1.0 - room) is None:
         room /= 4.0
     if room <= SLOWEST:
