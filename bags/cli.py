@@ -1,19 +1,17 @@
 """The command line `nlsid`: identify, funnel, check, monitor, demo."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from bags import documents, show
 from bags.config import load_config
 from bags.demo import run_demo
 from bags.folders import expand_bags
+from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
 from bags.steps import design_funnel_files, identify_bags
@@ -35,17 +33,17 @@ BagsArgument = Annotated[
     list[Path], typer.Argument(help="Bags: rosbag2 folders, .mcap files, or folders of bags.")
 ]
 ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
-OutOption = Annotated[Path, typer.Option(help="Folder for the results; made if it is not there.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
+]
 
 
 @app.command()
-def identify(bags: BagsArgument, config: ConfigOption, out_dir: Annotated[
-    Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
-]) -> None:  # fmt: skip
+def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
     settings = load_config(config)
     folders = expand_bags(bags)
-    with _progress("identifying") as progress:
+    with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)
     out.print(show.methods_table(result.fit, result.test))
     for file in result.files:
@@ -58,13 +56,11 @@ def identify(bags: BagsArgument, config: ConfigOption, out_dir: Annotated[
 def funnel(
     model: Annotated[Path, typer.Option(help="The model.json that `nlsid identify` wrote.")],
     config: ConfigOption,
-    out_dir: Annotated[
-        Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
-    ],
+    out_dir: OutOption,
 ) -> None:
     """Design a tracking policy and a proved tube: policy.json, funnel.json, funnel.proof.json."""
     settings = load_config(config)
-    with _progress("designing") as progress:
+    with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, out_dir)
         progress("done", 1.0)
@@ -121,7 +117,7 @@ def monitor(
     if settings is not None:
         folders = [f for f in folders if f.name in settings.split.test] or folders
     nominal = show.nominal_of(settings)
-    with _progress("replaying") as progress:
+    with progress_bar("replaying") as progress:
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
@@ -149,14 +145,6 @@ def demo(
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     if not run_demo(out_dir, out):
         raise typer.Exit(1)
-
-
-@contextmanager
-def _progress(task: str) -> Iterator[Callable[[str, float], None]]:
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True) as bar:
-        identifier = bar.add_task(task, total=1.0)
-        yield lambda what, fraction: bar.update(identifier, description=what, completed=fraction)
 
 
 def main() -> None:

@@ -124,11 +124,12 @@ def margins(replays: Sequence[Replay]) -> Figure:
         lower.set_visible(True)
         _tube(upper, replay)
         _margin(lower, replay)
-        upper.sharey(panels[0, 0])
         lower.set_xlabel("time [s]", fontsize=8)
         if index % columns == 0:
             upper.set_ylabel(f"{replay.axis} [{replay.unit}]", fontsize=8)
             lower.set_ylabel("margin, budget spent", fontsize=8)
+    for kind in (0, 1):
+        _same_limits([axes for axes in panels[kind::2].flat if axes.get_visible()])
     _tidy([axes for axes in panels.flat if axes.get_visible()])
     handles, labels = [], []
     for axes in (panels[0, 0], panels[1, 0]):
@@ -154,9 +155,11 @@ def _tube(axes: Axes, replay: Replay) -> None:
     axes.plot([r.t for r in everything], [r.measured for r in everything], color=INK, lw=LINE,
               label="measured")  # fmt: skip
     bad = [r for r in judged if r.status is not Status.INSIDE]
-    axes.plot([r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3,
-              label="not inside" if not bad else f"not inside from {bad[0].t:.3f} s")  # fmt: skip
-    axes.set_title(f"{replay.name}: {replay.verdict}", fontsize=8, loc="left")
+    axes.plot(
+        [r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3, label="not inside"
+    )
+    since = f" from {bad[0].t:.3f} s" if bad else ""
+    axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
 
 
 def _margin(axes: Axes, replay: Replay) -> None:
@@ -167,6 +170,12 @@ def _margin(axes: Axes, replay: Replay) -> None:
     axes.plot(t, [r.budget_spent for r in judged], color=ORANGE, lw=LINE, label="budget spent")
     lowest = min((r.margin for r in judged), default=0.0)
     axes.set_ylim(max(-1.0, min(0.0, lowest)) - 0.08, 1.3)
+
+
+def _same_limits(panels: list[Axes]) -> None:
+    limits = [axes.get_ylim() for axes in panels]
+    for axes in panels:
+        axes.set_ylim(min(lo for lo, _ in limits), max(hi for _, hi in limits))
 
 
 def _one_step(candidate: Candidate, trial: Trajectory) -> np.ndarray:

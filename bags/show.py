@@ -47,7 +47,10 @@ def funnel_table(design: TubeDesign) -> Table:
     table.add_column()
     tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
     table.add_row("policy", tracking)
-    table.add_row("half-width", f"{funnel.output_half_width:.3f} {unit} of {model.y.name}")
+    table.add_row(
+        "half-width",
+        f"{funnel.half_width:g} {unit} of {model.y.name}",
+    )
     table.add_row("horizon", f"{assumption.samples * model.period:g} s")
     table.add_row(
         "assuming",
@@ -61,8 +64,10 @@ def funnel_table(design: TubeDesign) -> Table:
 def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, budget, first bad sample."""
     table = Table(
-        title="worst margin (1 on the nominal, 0 on the boundary) and disturbance budget spent",
+        title="held against the funnel",
+        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube",
         title_justify="left",
+        caption_justify="left",
     )
     for column, justify in (
         ("bag", "left"),
@@ -85,6 +90,25 @@ def replay_table(replays: Sequence[Replay]) -> Table:
             "-" if worst is None else worst.worst_axis,
             "-" if worst is None else f"{100 * replay.budget_spent:.0f} %",
             "-" if bad is None else f"{bad.t:.3f} s",
+        )
+    return table
+
+
+def caught_table(replays: Sequence[Replay]) -> Table:
+    """One row per bag that should be caught: verdict, first bad sample, budget spent in the end."""
+    table = Table(title="the same trials with a broken sensor", title_justify="left")
+    table.add_column("bag", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("bad from", justify="right", no_wrap=True)
+    table.add_column("budget", justify="right", no_wrap=True)
+    for replay in replays:
+        bad = replay.first_bad
+        colour = COLOURS[replay.verdict]
+        table.add_row(
+            replay.name,
+            f"[{colour}]{replay.verdict}[/{colour}]",
+            "-" if bad is None else f"{bad.t:.3f} s",
+            f"{100 * replay.budget_spent:.0f} %",
         )
     return table
 

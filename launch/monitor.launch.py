@@ -1,6 +1,6 @@
 """Publish a proved funnel and watch the running robot against it.
 
-ros2 launch nlsid monitor.launch.py proof:=/path/to/funnel.proof.json
+ros2 launch nlsid monitor.launch.py funnel:=/path/to/funnel.json
 """
 
 from launch import LaunchDescription
@@ -14,20 +14,29 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument(
-                "proof",
-                description="funnel.proof.json; its funnel, policy and model lie beside it",
+                "funnel",
+                description="funnel.json; its proof, policy and model lie beside it",
+            ),
+            DeclareLaunchArgument(
+                "nominal",
+                default_value="command",
+                choices=["command", "profile"],
+                description="what the tube is around",
             ),
             Node(
                 package="nlsid",
                 executable="funnel_publisher",
                 name="funnel_publisher",
-                parameters=[{"proof": LaunchConfiguration("proof")}],
+                parameters=[{"funnel": LaunchConfiguration("funnel")}],
                 output="screen",
             ),
             Node(
                 package="nlsid",
                 executable="funnel_monitor",
                 name="funnel_monitor",
+                parameters=[
+                    {"source": "/funnel_publisher", "nominal": LaunchConfiguration("nominal")}
+                ],
                 output="screen",
             ),
         ]

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray: TypeAlias = NDArray[np.float64]
+FloatArray: TypeAlias = NDArray[np.floating[Any]]  # float64 in fact; NumPy's stubs say less
 IntArray: TypeAlias = NDArray[np.int64]
 Json: TypeAlias = dict[str, Any]
 

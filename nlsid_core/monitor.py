@@ -88,7 +88,7 @@ class Monitor:
         n = len(model)
         ahead = (f"{model.y.name} +{i}" for i in range(n))
         self.axes = (*ahead, "innovation")
-        self._half_widths = funnel.half_widths
+        self._half_widths = funnel.axis_half_widths
         self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset
         self.restart()
 
@@ -102,7 +102,7 @@ class Monitor:
         self._ended = ""
         self._violated = ""
         self._x: FloatArray | None = None
-        self._x_nominal = np.zeros(len(self.model))
+        self._x_nominal: FloatArray = np.zeros(len(self.model))
 
     def missing(self, t: float, reason: str) -> Reading:
         """End the run because the state is missing or stale at time t (s): unknown from here on."""

@@ -70,12 +70,12 @@ class Trajectory:
         if len(self.t) < 2:
             raise DataError(f"{self._label}: {len(self.t)} sample; a sample time needs two")
         steps = np.diff(self.t)
-        period = float(np.median(steps))
+        period = float(self.t[-1] - self.t[0]) / len(steps)
         worst = int(np.argmax(np.abs(steps - period)))
         if abs(steps[worst] - period) > GRID_TOLERANCE * period:
             raise DataError(
                 f"{self._label}: not on a uniform grid: step {steps[worst]:.6g} s after "
-                f"t = {self.t[worst]:g} s, elsewhere {period:.6g} s"
+                f"t = {self.t[worst]:g} s, on average {period:.6g} s"
             )
         return period
 

@@ -6,6 +6,7 @@ every sample, and /diagnostics at once when the status changes, otherwise once a
 Missing, stale or NaN state is unknown (STALE), never inside. `~/restart` begins a new run.
 """
 
+import sys
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -164,12 +165,12 @@ class FunnelMonitor(Node):
         message.position = list(values.values())
         self._margin.publish(message)
 
-    def _say(self, reading: Reading) -> None:
+    def _say(self, reading: Reading, *, at_once: bool = False) -> None:
         """Publish diagnostics if the status changed or the heartbeat is due."""
         now = time.monotonic()
         changed = reading.status is not self._reading.status
         self._reading = reading
-        if not changed and now - self._said_at < HEARTBEAT:
+        if not (changed or at_once) and now - self._said_at < HEARTBEAT:
             return
         self._said_at = now
         values = {
@@ -189,13 +190,16 @@ class FunnelMonitor(Node):
         answer.message = "new run" if answer.success else "there is no funnel yet"
         if self._watch is not None:
             self._watch.restart()
-            self._reading = Reading(0.0, Status.UNKNOWN, reason="restarted")
+            self._say(Reading(0.0, Status.UNKNOWN, reason="restarted"), at_once=True)
         return answer
 
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid funnel_monitor`."""
-    run(FunnelMonitor, args)
+    try:
+        run(FunnelMonitor, args)
+    except NlsidError as error:
+        sys.exit(f"{NAME}: {error}")
 
 
 if __name__ == "__main__":

@@ -40,3 +40,17 @@ def subscription_to(offered: list[ReliabilityPolicy]) -> QoSProfile:
         reliability=ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.VOLATILE,
     )
+
+
+def recording_of(offered: list[QoSProfile]) -> QoSProfile:
+    """As `subscription_to`, and latched if every publisher is, so that a document published before
+    the recording began is in it.
+    """
+    profile = subscription_to([publisher.reliability for publisher in offered])
+    latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offered)
+    return QoSProfile(
+        history=profile.history,
+        depth=profile.depth,
+        reliability=profile.reliability,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else profile.durability,
+    )

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,13 +22,13 @@ def serialised(msgtype: str, message: object) -> bytes:
     return bytes(standard_types().serialize_cdr(message, msgtype))
 
 
-def header(stamp_ns: int) -> object:
+def header(stamp_ns: int) -> Any:
     types = standard_types().types
     stamp = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
     return types["std_msgs/msg/Header"](stamp, "odom")
 
 
-def twist(speed: float) -> object:
+def twist(speed: float) -> Any:
     types = standard_types().types
     vector = types["geometry_msgs/msg/Vector3"]
     return types["geometry_msgs/msg/Twist"](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0))

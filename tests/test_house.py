@@ -28,7 +28,9 @@ SEARCH = {"identification", "funnels", "sos", "conic"}
 SOLVERS = {"clarabel", "cvxpy"}
 WRITTEN_IN_CVXPY = {"nlsid_core/funnels/discrete.py"}  # one small problem, solved once a funnel
 BAG_FORMATS = {"rosbags", "mcap"}
-ROS = re.compile(r"rcl\w*|ros\w*_runtime_py|\w+_msgs|\w+_interfaces|ament_\w+|launch(_ros)?|tf2\w*")
+ROS = re.compile(
+    r"rcl\w*|ros\w*_runtime_py|\w+_(msgs|srvs|interfaces)|ament_\w+|launch(_ros)?|tf2\w*"
+)
 
 
 def sources(*folders: str) -> list[Path]:
@@ -193,6 +195,13 @@ def test_launch_files_compile_and_start_executables_that_exist(path: Path) -> No
     }
     assert started
     assert started <= project()["scripts"].keys()
+
+
+def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
+    imported = set().union(*map(imported_packages, sources("nlsid_ros", "launch")))
+    manifest = ElementTree.parse(ROOT / "package.xml").getroot()
+    named = {element.text for element in manifest.iter("exec_depend")}
+    assert {name for name in imported if ROS.fullmatch(name)} <= named
 
 
 def test_the_version_is_the_same_everywhere() -> None:

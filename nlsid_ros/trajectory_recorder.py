@@ -1,0 +1,145 @@
+"""Node `trajectory_recorder`: topics into a bag, serialised as they arrive, safe against kill -9.
+
+Subscribes to each topic once a publisher shows its type and quality of service, and writes the
+messages undecoded: log time is the arrival, publish time the header stamp. What a killed recorder
+loses is what came after the last chunk, at most `chunk_period`. Counts of received and lost
+messages go to /diagnostics every second.
+"""
+
+import sys
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+
+from bags.message_types import definition, header_stamp_ns, is_stamped, standard_types
+from bags.writer import BagWriter
+from nlsid_core.errors import DataError, NlsidError
+from nlsid_ros import qos
+from nlsid_ros.diagnostics import status
+from nlsid_ros.message_classes import message_class
+from nlsid_ros.running import declare, run
+
+NAME = "trajectory_recorder"
+DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
+REPORT = 1.0  # s between diagnostics
+
+
+class TrajectoryRecorder(Node):
+    """Records topics from its start to its end into one new bag."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        topics: Any = declare(self, "topics", [""], "/topic or /topic:=package/msg/Type, each")
+        bag = str(declare(self, "bag", "", "folder of the new bag; empty: trajectory_DATE_TIME"))
+        period: Any = declare(
+            self, "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 1.0)
+        )
+        self._waiting = dict(_topic_and_type(entry) for entry in topics if entry)
+        if not self._waiting:
+            raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
+        for msgtype in filter(None, self._waiting.values()):
+            message_class(msgtype)
+            definition(msgtype)
+        self._lost = dict.fromkeys(self._waiting, 0)
+        self._refused: dict[str, str] = {}
+        path = Path(bag or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
+        self._bag = BagWriter(path, in_place=True, max_chunk_age=period)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._discovery = self.create_timer(DISCOVERY, self._connect)
+        self.create_timer(period, self._bag.close_chunk)
+        self.create_timer(REPORT, self._report)
+        self.get_logger().info(f"recording {', '.join(self._waiting)} to {path}")
+        self._connect()
+
+    def destroy_node(self) -> None:
+        """Close the bag, then the node."""
+        self._bag.close()
+        super().destroy_node()
+
+    def _connect(self) -> None:
+        """Subscribe to topics that have publishers now."""
+        for topic, asked in list(self._waiting.items()):
+            publishers = self.get_publishers_info_by_topic(topic)
+            if not publishers:
+                continue
+            del self._waiting[topic]
+            msgtype = asked or publishers[0].topic_type
+            try:
+                kind = message_class(msgtype)
+                self._bag.add_topic(topic, msgtype)
+            except NlsidError as error:
+                self._refused[topic] = str(error)
+                self.get_logger().error(f"{topic} is not recorded: {error}")
+                continue
+            self.create_subscription(
+                kind,
+                topic,
+                partial(self._record, topic, msgtype, is_stamped(msgtype, standard_types())),
+                qos.recording_of([publisher.qos_profile for publisher in publishers]),
+                event_callbacks=SubscriptionEventCallbacks(message_lost=partial(self._lose, topic)),
+                raw=True,
+            )
+        if not self._waiting:
+            self._discovery.cancel()
+
+    def _record(
+        self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
+    ) -> None:
+        arrival_ns = info["received_timestamp"]
+        stamp_ns = arrival_ns
+        if stamped and len(data) >= 12:
+            stamp_ns = header_stamp_ns(data)
+        self._bag.write(
+            topic,
+            msgtype,
+            data,
+            log_time_ns=arrival_ns,
+            publish_time_ns=stamp_ns if stamp_ns >= 0 else arrival_ns,
+        )
+
+    def _lose(self, topic: str, event: QoSMessageLostInfo) -> None:
+        self._lost[topic] = event.total_count
+        self.get_logger().warning(f"{topic}: {event.total_count} messages lost so far")
+
+    def _report(self) -> None:
+        """Counts per topic; a warning while a topic is missing, silent or losing messages."""
+        values = {"bag": str(self._bag.path)}
+        for topic, lost in self._lost.items():
+            values[f"{topic} received"] = str(self._bag.counts.get(topic, 0))
+            values[f"{topic} lost"] = str(lost)
+        level, text = DiagnosticStatus.OK, "recording"
+        silent = [topic for topic in self._lost if not self._bag.counts.get(topic)]
+        losing = [topic for topic, lost in self._lost.items() if lost]
+        if silent or losing:
+            level = DiagnosticStatus.WARN
+            text = "; ".join(
+                [f"nothing on {topic} yet" for topic in silent]
+                + [f"messages lost on {topic}" for topic in losing]
+            )
+        if self._refused:
+            level = DiagnosticStatus.ERROR
+            text = "; ".join(f"{topic}: {why}" for topic, why in self._refused.items())
+        now = self.get_clock().now().to_msg()
+        self._diagnostics.publish(status(now, NAME, level, text, values))
+
+
+def _topic_and_type(entry: str) -> tuple[str, str]:
+    topic, _, msgtype = entry.partition(":=")
+    return topic if topic.startswith("/") else f"/{topic}", msgtype
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of `ros2 run nlsid trajectory_recorder`."""
+    try:
+        run(TrajectoryRecorder, args)
+    except (NlsidError, OSError) as error:
+        sys.exit(f"{NAME}: {error}")
+
+
+if __name__ == "__main__":
+    main()
