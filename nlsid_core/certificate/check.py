@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from nlsid_core import _json
 from nlsid_core._types import Json
-from nlsid_core.certificate import cascade, stability, state_affine, tube
+from nlsid_core.certificate import stability, state_affine, tube
 from nlsid_core.certificate.verdict import Decision, Verdict
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
 
@@ -21,7 +21,6 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "incremental_stability": stability.decide,
         "energy_tube": tube.decide,
         "state_affine_stability": state_affine.decide,
-        "cascade_stability": cascade.decide,
     }
 )
 
