@@ -70,9 +70,8 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
         problem.rows, iterations=ITERATES, tolerance=IMPROVEMENT
     ):
         model = problem.model(iterate.theta, iterate.p)
-        iterates.append(
-            (percent(y[THESIS_VALIDATION], simulate(model, u, THESIS_VALIDATION)), model)
-        )
+        validation = simulate(model, u, THESIS_VALIDATION)
+        iterates.append((percent(y[THESIS_VALIDATION], validation), model))
     model = min(iterates, key=lambda entry: entry[0])[1]
     seconds = time.perf_counter() - started
     proof = prove_state_affine(model)
