@@ -7,7 +7,7 @@ from rich.table import Table
 from bags.config import Config
 from bags.replay import Replay
 from nlsid_core.funnels import TubeDesign
-from nlsid_core.identification import Fit
+from nlsid_core.identification import AnyFit
 from nlsid_core.monitor import Nominal, Status
 from nlsid_core.trajectory import Dataset
 
@@ -19,7 +19,7 @@ COLOURS = {
 }
 
 
-def methods_table(fit: Fit, test: Dataset) -> Table:
+def methods_table(fit: AnyFit, test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{len(fit.model)} lags, {len(test)} test trials", title_justify="left")
     table.add_column("method")

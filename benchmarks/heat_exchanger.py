@@ -43,8 +43,8 @@ def measure(data: Path, n: int) -> dict[str, float | bool]:
     """Errors in % at n lags, and whether the exact checker proves the certified model."""
     flow, temperature = heat_exchanger(data)
     train = single("exchanger", flow[:TRAINING], temperature[:TRAINING], 1.0)
-    model_class = StateAffineClass(n, leading_degree=2, right_degree=3)
-    problem = build_state_affine_rows(train, model_class, u_range=[FLOW_RANGE])
+    model_class = StateAffineClass(n, leading_degree=2, right_degree=3, u_range=(FLOW_RANGE,))
+    problem = build_state_affine_rows(train, model_class)
 
     def score(model: StateAffineModel) -> float:
         return percent(temperature, model.simulate(flow[:, None])[:, 0])

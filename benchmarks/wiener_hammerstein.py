@@ -61,8 +61,7 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
     """First and chosen iterate at n lags: errors in % and V on the thesis's test samples."""
     problem = build_state_affine_rows(
         single("estimation", u[train], y[train], PERIOD),
-        StateAffineClass(n, right_degree=3),
-        u_range=[[np.min(u), np.max(u)]],
+        StateAffineClass(n, right_degree=3, u_range=((float(np.min(u)), float(np.max(u))),)),
     )
     started = time.perf_counter()
     iterates: list[tuple[float, StateAffineModel]] = []

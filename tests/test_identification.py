@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import FINAL, FIRST, SEM, Fit, identify, prove_stability
+from nlsid_core.identification import (
+    FINAL,
+    FIRST,
+    SEM,
+    Fit,
+    LinearClass,
+    identify,
+    prove_stability,
+    simulation_percent,
+)
 from nlsid_core.identification.least_squares import least_squares
 from nlsid_core.identification.regression import build_regression
 from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import simulation_error_percent
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.trajectory import Dataset, Trajectory
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
@@ -26,12 +34,14 @@ def test_the_bound_never_goes_up_over_the_iterates(train: Dataset) -> None:
 
 
 def test_noise_free_data_give_the_true_coefficients_back() -> None:
-    model = identify(synthetic_dataset(0.0), lags=2).model
+    model = identify(synthetic_dataset(0.0), LinearClass(2)).model
     np.testing.assert_allclose(model.a, TRUE_A, atol=1e-6)
     np.testing.assert_allclose(model.b, TRUE_B, atol=1e-6)
 
 
-def test_final_iterate_simulates_as_well_as_direct_minimisation(fit: Fit, train: Dataset) -> None:
+def test_final_iterate_simulates_as_well_as_direct_minimisation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
     assert fit[FINAL].error_percent(train) <= 1.001 * fit[SEM].error_percent(train)
     assert fit[FINAL].error_percent(train) < fit[FIRST].error_percent(train)
 
@@ -50,7 +60,9 @@ def test_every_recorded_sample_scale_is_undone_once(train: Dataset) -> None:
     np.testing.assert_allclose([*model.a, *model.b, model.c], expected, atol=1e-9)
 
 
-def test_observer_form_simulates_the_difference_equation(fit: Fit, train: Dataset) -> None:
+def test_observer_form_simulates_the_difference_equation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
     model = fit.model
     trial = train.trajectories[0]
     y, u, n = trial.y[:, 0], trial.u[:, 0], len(model)
@@ -88,31 +100,31 @@ def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
 def test_a_constant_input_is_refused_with_the_reason() -> None:
     y = np.random.default_rng(0).standard_normal(100)
     with pytest.raises(DataError, match=r"excitation is constant \(0.4\)"):
-        identify(_dataset(np.full(100, 0.4), y), lags=2)
+        identify(_dataset(np.full(100, 0.4), y), LinearClass(2))
 
 
 def test_an_input_that_excites_too_few_lags_is_refused() -> None:
     u = np.tile([0.0, 1.0], 50)
     with pytest.raises(DataError, match="does not excite 4 lags"):
-        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), lags=4)
+        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), LinearClass(4))
 
 
 def test_too_few_rows_are_refused_with_how_many_are_needed() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(DataError, match="28 rows for 6 parameters; give at least 30"):
-        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), lags=2)
+        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), LinearClass(2))
 
 
 def test_several_outputs_are_refused() -> None:
     rng = np.random.default_rng(0)
     trial = Trajectory(t=np.arange(50.0), y=rng.standard_normal((50, 2)), u=rng.random(50))
     with pytest.raises(ShapeError, match="there are 2 and 1"):
-        identify(Dataset((trial,)), lags=2)
+        identify(Dataset((trial,)), LinearClass(2))
 
 
-def test_error_percent_is_zero_for_the_truth(fit: Fit) -> None:
+def test_error_percent_is_zero_for_the_truth(fit: Fit[DifferenceEquation]) -> None:
     clean = synthetic_dataset(0.0, trials=2)
     truth = DifferenceEquation(
         a=TRUE_A, b=TRUE_B, c=0.0, period=PERIOD, y=fit.model.y, u=fit.model.u, u_range=(0.0, 1.0)
     )
-    assert simulation_error_percent(truth, clean) < 1e-9
+    assert simulation_percent(truth, clean) < 1e-9

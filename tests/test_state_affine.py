@@ -37,9 +37,9 @@ def recording(samples: int = 300, noise: float = 0.02, seed: int = 0) -> Traject
 
 @pytest.fixture(scope="module")
 def stacked() -> StateAffineRows:
-    model_class = StateAffineClass(2, leading_degree=2, right_degree=2)
+    model_class = StateAffineClass(2, leading_degree=2, right_degree=2, u_range=((0.0, 2.0),))
     dataset = Dataset((recording(), recording(seed=1)))
-    return build_state_affine_rows(dataset, model_class, u_range=[[0.0, 2.0]])
+    return build_state_affine_rows(dataset, model_class)
 
 
 @pytest.fixture(scope="module")

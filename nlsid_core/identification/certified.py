@@ -49,7 +49,7 @@ def certified_simulation_error(
 
     Raises ShapeError for several outputs, input-dependent lagged coefficients or deg q > 2.
     """
-    if problem.rows.identity.sum() != 1 or any(len(left) != 1 for left in problem.left[1:]):
+    if not problem.has_constant_lags:
         raise ShapeError("certified iterates are for one output and constant lagged coefficients")
     if (problem.left[0].sum(axis=1) > 2).any():
         raise ShapeError("certified iterates are for a leading coefficient of degree 2 at most")

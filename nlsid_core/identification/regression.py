@@ -15,6 +15,13 @@ MIN_ROWS_PER_PARAMETER = 5  # fewer and the fit is an interpolation, not an esti
 RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeats the others
 
 
+@dataclass(frozen=True)
+class LinearClass:
+    """Linear difference equations with `lags` n lags of one output and of one input."""
+
+    lags: int
+
+
 @dataclass(frozen=True, eq=False)
 class Regression:
     """Rows t = n … of every trial: g_0 y(t) + … + g_n y(t-n) = b_0 u(t) + … + b_n u(t-n) + c.

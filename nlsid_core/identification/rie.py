@@ -46,7 +46,7 @@ class IdentificationErrorBound:
     """Σ ε²/(2 G_0(w) - c) in [θ; c], with the interface of `Bound`."""
 
     def __init__(self, problem: StateAffineRows) -> None:
-        if problem.rows.identity.sum() != 1 or any(len(left) != 1 for left in problem.left[1:]):
+        if not problem.has_constant_lags:
             raise ShapeError(
                 "the robust identification error is implemented for one output and constant "
                 "coefficients of the lagged outputs"

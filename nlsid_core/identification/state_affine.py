@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.identification.rows import Rows
 from nlsid_core.models import Signal, StateAffineModel
@@ -25,6 +25,7 @@ class StateAffineClass:
     """Which state-affine models: n lags, the input's delays, polynomial degrees in w.
 
     leading_degree: of G_0, lagged_degree: of G_1 … G_n, right_degree: of p. delays: None is 0 … n.
+    u_range: (low, high) of each input, to which the model clips it; None is the range in the data.
     """
 
     lags: int
@@ -32,6 +33,7 @@ class StateAffineClass:
     leading_degree: int = 0
     lagged_degree: int = 0
     right_degree: int = 1
+    u_range: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         if self.lags < 1:
@@ -60,6 +62,11 @@ class StateAffineRows:
     y_scale: tuple[FloatArray, FloatArray]
     u_scale: tuple[FloatArray, FloatArray]
     u_range: FloatArray
+
+    @property
+    def has_constant_lags(self) -> bool:
+        """One output, and G_1 … G_n do not depend on the input."""
+        return bool(self.rows.identity.sum() == 1) and all(len(g) == 1 for g in self.left[1:])
 
     def window_range(self) -> FloatArray:
         """(n_w, 2): the box of normalised windows that the declared input range allows."""
@@ -93,12 +100,9 @@ class StateAffineRows:
         )
 
 
-def build_state_affine_rows(
-    dataset: Dataset, model_class: StateAffineClass, *, u_range: ArrayLike | None = None
-) -> StateAffineRows:
+def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> StateAffineRows:
     """Stack the rows t = n … of every trajectory, signals scaled to zero mean and unit spread.
 
-    u_range: (n_u, 2) the range the model clips its inputs to; None is the range in the data.
     Raises DataError if there are too few rows, or the inputs do not excite the right basis.
     """
     n = model_class.lags
@@ -142,9 +146,11 @@ def build_state_affine_rows(
         Q=np.asfortranarray(np.kron(Q, np.eye(n_y)) if n_y > 1 else Q),
         identity=identity,
     )
-    if u_range is None:
-        u_range = np.column_stack([u_all.min(axis=0), u_all.max(axis=0)])
-    declared = np.array(u_range, dtype=np.float64).reshape(n_u, 2)
+    declared = np.column_stack([u_all.min(axis=0), u_all.max(axis=0)])
+    if model_class.u_range is not None:
+        if len(model_class.u_range) != n_u:
+            raise DataError(f"u_range has {len(model_class.u_range)} inputs, the data {n_u}")
+        declared = np.array(model_class.u_range, dtype=np.float64)
     return StateAffineRows(rows, dataset, left, right, R, window, y_scale, u_scale, declared)
 
 
