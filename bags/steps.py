@@ -12,7 +12,14 @@ from bags.training import load_training, save_training
 from nlsid_core import _json
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign, design_tube
-from nlsid_core.identification import AnyFit, Model, identify
+from nlsid_core.identification import (
+    AnyCandidate,
+    AnyFit,
+    Model,
+    Validation,
+    identify,
+    validate,
+)
 from nlsid_core.trajectory import Dataset
 
 Progress = Callable[[str, float], None]
@@ -59,6 +66,44 @@ def identify_bags(
         write_report(files[-1], fit, train, test, robot=config.robot)
     progress("done", 1.0)
     return Identified(fit, train, test, tuple(files))
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Every method's candidate with its scores on the test trials."""
+
+    rows: tuple[tuple[AnyCandidate, Validation], ...]
+    test: Dataset
+
+
+def compare_bags(
+    bags: Sequence[Path], config: Config, lags: Sequence[int], *, progress: Progress
+) -> Compared:
+    """Every method of the configured model class at each number of lags, on the same test trials.
+
+    Writes nothing. Raises DataError as `identify_bags` does.
+    """
+    train, test = read_split(
+        bags, config, progress=lambda what, fraction: progress(what, 0.3 * fraction)
+    )
+    options = config.identification
+    rows: list[tuple[AnyCandidate, Validation]] = []
+    for number, n in enumerate(lags):
+        model_class = options.model_copy(update={"lags": n}).model_class
+        affine = options.model == "state_affine" and options.lagged_degree == 0
+        certifiable = affine and options.leading_degree <= 2
+        fit = identify(
+            train,
+            model_class,
+            method="rse_certified" if certifiable else "rse",
+            iterations=options.iterations,
+            allow_unproved=True,
+            progress=lambda what, fraction, done=number: progress(
+                what, 0.3 + 0.7 * (done + fraction) / len(lags)
+            ),
+        )
+        rows += [(candidate, validate(candidate.model, test)) for candidate in fit.candidates]
+    return Compared(tuple(rows), test)
 
 
 def read_split(

@@ -24,6 +24,7 @@ from nlsid_core.identification.state_affine import StateAffineRows
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
 START_BOUNDS = (0.9, 1.1)  # of G_0 around the first iterate's start G = I
 START_SLACK = 0.05  # of those bounds, spent on the multipliers of the box
+GROWTH = 4.0  # of h from one iterate to the next, at most: with one lag nothing else bounds it
 TIGHT = 1e-4  # of h - ℓ, how tightly the bounds of G_0 are stated
 STOP = 1e-4  # relative decrease of J that ends the iteration
 
@@ -103,6 +104,9 @@ def _inequalities(
         F = np.zeros((size, n_w + 1, n_w + 1))
         F[1 : 1 + n_q], F[1 + n_g :] = part[:n_q], part[n_q:]
         result.append(MatrixInequality(F))
+    F = np.zeros((size, 1, 1))
+    F[0], F[1 + n_g + 1] = GROWTH * linearised_at[1], -1.0
+    result.append(MatrixInequality(F))
     F = np.zeros((size, 2 * n_w, 2 * n_w))
     for i in range(2 * n_w):
         F[1 + n_g + 2 + i, i, i] = 1.0

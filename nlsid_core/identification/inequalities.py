@@ -35,7 +35,7 @@ class MatrixInequality:
         L = np.linalg.cholesky(self.at(z))
         half = np.linalg.solve(L, self.F[1:])
         scaled = np.linalg.solve(L, half.transpose(0, 2, 1))
-        flat = scaled.reshape(len(scaled), -1)
+        flat = scaled.reshape(len(scaled), scaled.shape[1] ** 2)
         return -np.trace(scaled, axis1=1, axis2=2), flat @ flat.T
 
 
@@ -52,7 +52,7 @@ def centre(
     def value(z: FloatArray) -> float:
         return float(c @ z + sum(inequality.barrier(z) for inequality in inequalities))
 
-    for _ in range(NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS if len(z) else 0):
         parts = [inequality.derivatives(z) for inequality in inequalities]
         gradient = c + np.sum([slope for slope, _ in parts], axis=0)
         hessian = np.sum([curvature for _, curvature in parts], axis=0)

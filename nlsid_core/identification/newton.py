@@ -14,7 +14,7 @@ from scipy.linalg import LinAlgError
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification.bound import Bound, Point
+from nlsid_core.identification.bound import Point
 from nlsid_core.identification.inequalities import MatrixInequality
 from nlsid_core.identification.rows import Rows
 
@@ -43,6 +43,14 @@ class Convex(Protocol):
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian."""
+        ...
+
+    def log_determinant_gradient(self, point: Point) -> FloatArray:
+        """Gradient of log det K."""
+        ...
+
+    def log_determinant_curvature(self, point: Point, probes: FloatArray) -> FloatArray:
+        """Hessian of -log det K, exact or estimated with random probes."""
         ...
 
 
@@ -75,10 +83,6 @@ def minimise(
     else:
         found = search.descend(z, mu=0.0, barrier_on_K=False)
     if found is not None and found.point.factor.smallest_pivot > BOUNDARY_PIVOT:
-        return found
-    if not isinstance(bound, Bound):
-        if found is None:
-            raise SolverError(f"no minimiser of J after {search.steps} Newton steps")
         return found
     inside = search.path(z, barrier_on_K=True)
     if inside is None:
@@ -164,7 +168,6 @@ class _Search:
         inner = slice(0, self.parameters)
         gradient[inner], hessian[inner, inner] = self.bound.derivatives(point)
         if barrier_on_K:
-            assert isinstance(self.bound, Bound)
             gradient[inner] -= mu * self.bound.log_determinant_gradient(point)
             if self._probes is None:
                 rng = np.random.default_rng(0)

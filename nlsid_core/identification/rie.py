@@ -7,6 +7,8 @@ couples c, P and g for all rows at once: the data enter through a diagonal K = 2
 Source: thesis (2.28), Lemma 2.16 and Proposition 4.4 (Q = e₁e₁', W = I).
 """
 
+from functools import cached_property
+
 import numpy as np
 from scipy.linalg import LinAlgError
 
@@ -64,12 +66,26 @@ class IdentificationErrorBound:
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian in [θ; c]."""
-        rows, x = self.rows, point.x
-        slopes = np.zeros((len(rows), len(point.theta)))
-        slopes[:, : self.leading] = 2.0 * rows.weights[:, : self.leading] * x[:, None]
-        slopes[:, -1] = -x
-        errors = np.column_stack([rows.errors, np.zeros(len(rows))])
-        return point.derivatives(errors, slopes)
+        errors = np.column_stack([self.rows.errors, np.zeros(len(self.rows))])
+        return point.derivatives(errors, self._slopes * point.x[:, None])
+
+    @cached_property
+    def _slopes(self) -> FloatArray:
+        """(N, n_g + 1): derivatives of the diagonal K."""
+        slopes = np.zeros((len(self.rows), len(self.rows.offsets) + 1))
+        slopes[:, : self.leading] = 2.0 * self.rows.weights[:, : self.leading]
+        slopes[:, -1] = -1.0
+        return slopes
+
+    def log_determinant_gradient(self, point: Point) -> FloatArray:
+        """Gradient of Σ log K."""
+        return np.asarray(self._slopes.T @ point.factor.L[0] ** -2.0)
+
+    def log_determinant_curvature(self, point: Point, probes: FloatArray) -> FloatArray:
+        """Hessian of -Σ log K, exactly."""
+        del probes
+        scaled = self._slopes / point.factor.L[0][:, None] ** 2
+        return np.asarray(scaled.T @ scaled)
 
     def dissipation(self) -> MatrixInequality:
         """The matrix inequality above, affine in [θ; c; P's upper triangle]."""
