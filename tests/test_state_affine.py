@@ -5,6 +5,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -22,6 +23,8 @@ from nlsid_core.identification.state_affine import (
 )
 from nlsid_core.models import StateAffineModel
 from nlsid_core.trajectory import Dataset, Trajectory
+
+SCHEMAS = Path(__file__).resolve().parent.parent / "docs" / "schema"
 
 
 def recording(samples: int = 300, noise: float = 0.02, seed: int = 0) -> Trajectory:
@@ -158,6 +161,19 @@ def test_a_model_document_round_trips_exactly(model: StateAffineModel) -> None:
     assert again.document() == model.document()
     u = recording(seed=9).u
     np.testing.assert_array_equal(again.simulate(u), model.simulate(u))
+
+
+def test_documents_validate_against_the_published_schemas(documents: tuple[Json, Json]) -> None:
+    for document, name in zip(documents, ("state_affine", "proof"), strict=True):
+        schema = _json.load_document(SCHEMAS / f"{name}.schema.json")
+        jsonschema.Draft202012Validator.check_schema(schema)
+        jsonschema.validate(document, schema)
+        for damaged in (
+            document | {"extra": 1},
+            {k: v for k, v in document.items() if k != "format"},
+        ):
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(damaged, schema)
 
 
 def test_certified_iterates_cost_little_and_never_go_up(stacked: StateAffineRows) -> None:
