@@ -12,8 +12,9 @@ from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.identification.rows import Rows
 from nlsid_core.models import Signal, StateAffineModel
-from nlsid_core.models.monomials import monomial_values, monomials_up_to
 from nlsid_core.models.state_affine import Polynomials
+from nlsid_core.polynomial import monomials
+from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.trajectory import Dataset, Trajectory
 
 CONSTANT = 1e-10  # relative spread below which a signal is constant
@@ -119,10 +120,10 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
     row = np.concatenate([np.arange(len(trial) - n) for trial in dataset])
     w = np.stack([U[:, d, i] for i, d in window], axis=1)
     left = tuple(
-        monomials_up_to(model_class.lagged_degree if k else model_class.leading_degree, len(window))
+        _basis(model_class.lagged_degree if k else model_class.leading_degree, len(window))
         for k in range(n + 1)
     )
-    right = monomials_up_to(model_class.right_degree, len(window))
+    right = _basis(model_class.right_degree, len(window))
     parameters = sum(map(len, left)) * n_y**2 + len(right) * n_y
     if len(Y) * n_y < parameters:
         raise DataError(f"{len(Y) * n_y} equations for {parameters} parameters; give more data")
@@ -152,6 +153,11 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
             raise DataError(f"u_range has {len(model_class.u_range)} inputs, the data {n_u}")
         declared = np.array(model_class.u_range, dtype=np.float64)
     return StateAffineRows(rows, dataset, left, right, R, window, y_scale, u_scale, declared)
+
+
+def _basis(degree: int, variables: int) -> IntArray:
+    """Exponents of every monomial of total degree 0 … `degree`, lowest first."""
+    return monomials(variables, range(degree + 1))
 
 
 def _block(

@@ -15,8 +15,8 @@ import numpy as np
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.monomials import monomial_values
 from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.polynomial.values import monomial_values
 
 KIND = "state_affine"
 
@@ -41,7 +41,9 @@ class Polynomials:
 
     def __call__(self, w: FloatArray) -> FloatArray:
         """(..., *coefficients.shape[1:]) values at w (..., n_w)."""
-        return np.tensordot(monomial_values(self.exponents, w), self.coefficients, axes=1)
+        values = monomial_values(self.exponents, w.reshape(-1, w.shape[-1]))
+        stacked = np.tensordot(values, self.coefficients, axes=1)
+        return np.asarray(stacked.reshape(*w.shape[:-1], *self.coefficients.shape[1:]))
 
     def document(self) -> Json:
         """The JSON form."""
