@@ -46,9 +46,8 @@ def dense(rows: Rows, theta: np.ndarray) -> np.ndarray:
     N = len(rows)
     G = np.zeros((N, N))
     for D, weight, value in zip(rows.offsets, rows.weights.T, theta, strict=True):
-        for r in range(N):
-            if 0 <= r - D < N:
-                G[r, r - D] += value * weight[r]
+        r = np.arange(max(D, 0), N + min(D, 0))
+        G[r, r - D] += value * weight[r]
     return G
 
 
@@ -71,7 +70,7 @@ def near_identity(rows: Rows, seed: int, size: float) -> np.ndarray:
     return np.asarray(rows.identity + size * rng.standard_normal(len(rows.identity)))
 
 
-@pytest.mark.parametrize("outputs", [1, 2, 3])
+@pytest.mark.parametrize("outputs", [1, 2])
 @pytest.mark.parametrize("first", [True, False])
 def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
     outputs: int, first: bool

@@ -17,7 +17,8 @@ from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import exact
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.errors import CertificateRejected
-from nlsid_core.models.state_affine import Polynomials, StateAffineModel
+from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.state_affine import StateAffineModel
 
 Box = list[tuple[Fraction, Fraction]]
 

@@ -12,7 +12,7 @@ from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.identification.rows import Rows
 from nlsid_core.models import Signal, StateAffineModel
-from nlsid_core.models.state_affine import Polynomials
+from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.trajectory import Dataset, Trajectory
