@@ -8,6 +8,7 @@ import pytest
 
 from nlsid_core.identification.bound import Bound
 from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.prediction import one_step_residual
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rows import Rows
 from nlsid_core.identification.rse import robust_simulation_error
@@ -207,3 +208,19 @@ def test_theorem_4_7_the_bound_per_sample_tends_to_an_integral_over_frequencies(
     integral = float(np.mean(abs(Q_star * Y - P_star * U) ** 2 / (2 * Q_star.real - 1)))
     assert expected_dense == pytest.approx(integral, rel=1e-6)
     assert pytest.approx(expected_dense, rel=1e-9) == J
+
+
+def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19() -> None:
+    """Σ ε² sup_z |e₁'(zI - A)⁻¹e₁|², conservative where the model is lightly damped."""
+    for seed in range(4):
+        stacked = problem(
+            trials=1, samples=120, seed=seed, noise=0.1, model_class=StateAffineClass(2)
+        )
+        model, J = robust_identification_error(stacked)
+        trial = stacked.dataset.trajectories[0]
+        errors = one_step_residual(model, trial)[:, 0] / model.y_scale[0]
+        gains, _ = model.explicit(np.zeros((1, len(model.window))))
+        A = np.array([gains[0, 0], [1.0, 0.0]])
+        z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
+        responses = np.linalg.inv(z[:, None, None] * np.eye(2) - A)[:, 0, 0]
+        assert np.max(abs(responses)) ** 2 * (errors @ errors) <= J * (1 + SOLVER)
