@@ -93,7 +93,8 @@ def identify(
     report(LEAST_SQUARES, 0.0)
     started = time.perf_counter()
     bounds: list[float] = []
-    for iterate, model in robust_simulation_error(regression, iterations=iterations):
+    for iterate in robust_simulation_error(regression.rows, iterations=iterations):
+        model = regression.model(iterate.theta, iterate.p)
         if not bounds:
             candidates.append(_candidate(FIRST, model, started))
         bounds.append(iterate.J)

@@ -1,11 +1,13 @@
 """The linear regression all identification methods share: a dataset as rows of lagged signals."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification.rows import Rows
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.trajectory import Dataset
 
@@ -29,6 +31,18 @@ class Regression:
     y_scale: tuple[float, float]
     u_scale: tuple[float, float]
     dataset: Dataset
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The same rows for the robust simulation error."""
+        inside = [self.row >= k for k in range(self.lags + 1)]
+        return Rows(
+            offsets=tuple(range(self.lags + 1)),
+            weights=np.asfortranarray(np.column_stack(inside).astype(np.float64)),
+            errors=np.asfortranarray(self.Y),
+            Q=np.asfortranarray(self.Q),
+            identity=np.eye(self.lags + 1)[0],
+        )
 
     @property
     def lags(self) -> int:
