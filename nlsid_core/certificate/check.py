@@ -10,6 +10,7 @@ from nlsid_core._types import Json
 from nlsid_core.certificate import (
     attraction,
     block_cascade,
+    monotone_equation,
     nonnegative,
     stability,
     state_affine,
@@ -40,6 +41,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "energy_tube": _exact_only(tube.decide),
         "state_affine_stability": _exact_only(state_affine.decide),
         "block_cascade_stability": _exact_only(block_cascade.decide),
+        "monotone_equation_stability": _exact_only(monotone_equation.decide),
         "polynomial_bound": nonnegative.decide_lower_bound,
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,

@@ -2,8 +2,16 @@
 
 from nlsid_core.models.block_cascade import BlockCascade
 from nlsid_core.models.difference_equation import DifferenceEquation
+from nlsid_core.models.monotone_equation import MonotoneEquation
 from nlsid_core.models.signal import Signal
 from nlsid_core.models.spline import Spline
 from nlsid_core.models.state_affine import StateAffineModel
 
-__all__ = ["BlockCascade", "DifferenceEquation", "Signal", "Spline", "StateAffineModel"]
+__all__ = [
+    "BlockCascade",
+    "DifferenceEquation",
+    "MonotoneEquation",
+    "Signal",
+    "Spline",
+    "StateAffineModel",
+]
