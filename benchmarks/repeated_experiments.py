@@ -210,9 +210,7 @@ def main() -> None:
         n, T = (int(part[1:]) for part in name.split("_"))
         golden = GOLDEN.get((n, T), (None,) * 5)
         cells = "".join(
-            f"{entry[m]:9.2f}{f'({g:.2f})' if g is not None else '':>9s}"
-            if m in entry
-            else " " * 18
+            f"{entry[m]:9.2f}{'' if g is None else f'({g:.2f})':>9s}" if m in entry else " " * 18
             for m, g in zip(METHODS, golden, strict=True)
         )
         thesis = PUBLISHED.get((n, T))

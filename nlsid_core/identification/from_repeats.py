@@ -1,4 +1,4 @@
-"""`identify_from_repeats`: repeated experiments in, a stable model without the bias of noise out."""
+"""`identify_from_repeats`: repeats in, a stable model without the bias of noise out."""
 
 from concurrent.futures import Executor
 

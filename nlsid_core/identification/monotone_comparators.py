@@ -90,7 +90,7 @@ def minimise_monotone_simulation_error(
         assert candidate is not None, "the minimiser accepts finite costs only"
         return np.concatenate([_sensitivities(candidate, trial)[:, free] for trial in trials])
 
-    if residual(theta[free]).max() == DIVERGED:
+    if float(np.max(residual(theta[free]))) == DIVERGED:
         raise DataError("the simulation of the first model diverges; start from a stable one")
     found = least_squares(
         residual, theta[free], jac=jacobian, method="lm", x_scale="jac",
