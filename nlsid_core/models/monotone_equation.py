@@ -9,7 +9,6 @@ Source: thesis (3.14).
 
 from dataclasses import dataclass
 from fractions import Fraction
-from math import sqrt
 
 import numpy as np
 
@@ -19,7 +18,8 @@ from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.signal import FORMAT, VERSION, Signal
 
 KIND = "monotone_equation"
-NEWTON_STEPS = 60  # a bracket halves at least every second step: 2^-30 of it, then Newton is exact
+NEWTON_STEPS = 100  # far from the solution a cubic takes a third off the distance a step
+BRACKET_ROOM = 1.0 + 1e-9  # for rounding in the bracket's ends
 ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it is found
 
 
@@ -159,15 +159,19 @@ def is_increasing(e: FloatArray) -> bool:
 def solve_increasing(e: tuple[float, ...], target: float, guess: float) -> float:
     """The v with e₁v + e₂v² + e₃v³ = target: Newton's method kept inside a bracket.
 
-    Source: thesis Section 2.2.2; strict monotonicity, |v - guess| ≤ |residual|/min e', gives the
-    first bracket.
+    The first bracket: with d = v - guess, |residual| = |e(v) - e(guess)| ≥ |d| min e' and, as
+    e(v) - e(guess) = d(e' at some point ≥ 0 + e₃d²/4), also ≥ e₃|d|³/4.
+    Source: thesis Section 2.2.2.
     """
     first, second, third = e
     if third == 0.0:
         return target / first
     least = first - second * second / (3.0 * third)
     residual = ((third * guess + second) * guess + first) * guess - target
-    reach = abs(residual) / least * (1.0 + 1e-9) if least > 0.0 else sqrt(np.finfo(float).max)
+    reach = (4.0 * abs(residual) / third) ** (1.0 / 3.0)
+    if least > 0.0:
+        reach = min(reach, abs(residual) / least)
+    reach *= BRACKET_ROOM
     low, high, v = guess - reach, guess + reach, guess
     for _ in range(NEWTON_STEPS):
         residual = ((third * v + second) * v + first) * v - target
