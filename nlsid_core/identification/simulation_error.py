@@ -6,7 +6,7 @@ from scipy.signal import lfilter, lfiltic
 
 from nlsid_core._types import FloatArray
 from nlsid_core.identification.regression import Regression
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.models import DifferenceEquation, MonotoneEquation
 from nlsid_core.trajectory import Dataset
 
 UNSTABLE_RESIDUAL = 1e6  # in units of the signal's spread: a diverged simulation, kept finite
@@ -14,12 +14,14 @@ LM_TOLERANCE = 1e-12  # relative decrease of the cost at which the minimiser sto
 LM_EVALUATIONS = 300
 
 
-def simulation_error_percent(model: DifferenceEquation, dataset: Dataset) -> float:
+def simulation_error_percent(
+    model: DifferenceEquation | MonotoneEquation, dataset: Dataset
+) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial.
 
     ŷ is simulated from the first n measured outputs with the recorded inputs.
     """
-    n = len(model)
+    n = model.history if isinstance(model, MonotoneEquation) else len(model)
     measured = np.concatenate([trial.y[n:, 0] for trial in dataset])
     simulated = np.concatenate(
         [model.simulate(trial.u[:, 0], trial.y[:n, 0])[n:] for trial in dataset]
