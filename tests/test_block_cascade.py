@@ -18,9 +18,15 @@ from nlsid_core.certificate import check, proof_document
 from nlsid_core.certificate.block_cascade import is_schur, slope_range, state_matrix, states
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, ShapeError
 from nlsid_core.identification.block_cascade import CascadeFit, identify_block_cascade
-from nlsid_core.identification.cascade_fit import Parameters, Trial, simulate
-from nlsid_core.identification.cascade_fit import _sensitivities as sensitivities
+from nlsid_core.identification.cascade_fit import (
+    Parameters,
+    Trial,
+    second_inputs,
+    sensitivities,
+    simulate,
+)
 from nlsid_core.identification.cascade_proof import prove_block_cascade
+from nlsid_core.identification.cascade_search import mean_square, with_intervals, with_phases
 from nlsid_core.models import BlockCascade, Signal, Spline
 from nlsid_core.trajectory import Dataset, Trajectory
 
@@ -193,6 +199,27 @@ def test_a_cascade_is_identified_to_the_noise_and_proved(fit: CascadeFit, tmp_pa
     assert "for every input" in verdict.statement
     assert verdict.margin == pytest.approx(1.0 - fit.proof.rate)
     assert "proved" in str(fit)
+
+
+def test_more_phases_or_knots_start_no_worse_than_they_found_it() -> None:
+    model, rng = truth(), np.random.default_rng(4)
+    p = Parameters(model.a1, model.b1, model.f, model.a2, model.b2)
+    u = rng.standard_normal(1500)
+    u = np.convolve(u, np.ones(4) / 4)[:1500]  # little power near half the sampling frequency
+    y = simulate(p, u) + 0.05 * rng.standard_normal(1500)
+    trials = (Trial(u, y, 60),)
+    before = mean_square(p, trials)
+    for phases in (2, 3):
+        split = with_phases(p, trials, phases)
+        assert split.b1.shape == (phases, 3)
+        assert split.b2.shape == (phases, 2)
+        assert mean_square(split, trials) <= before * (1 + 1e-9)
+    x = second_inputs(with_phases(p, trials, 2), u)[:, 60:-60]
+    halfway = (x[0, 1:] + x[0, :-1]) / 2
+    assert np.abs(x[1, 1:] - halfway).max() < 0.1 * np.abs(x[0]).max()
+    finer = with_intervals(p, trials, 40)
+    assert finer.f.intervals == 40
+    assert mean_square(finer, trials) == pytest.approx(before, rel=0.01)
 
 
 def test_the_proof_holds_on_pairs_of_solutions(documents: tuple[Json, Json]) -> None:

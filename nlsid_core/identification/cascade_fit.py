@@ -86,7 +86,7 @@ def minimise(
     cost = _cost(residual, here, D, weight)
     damping, taken, small = FIRST_DAMPING, 0, 0
     while taken < steps and small < PATIENCE and damping < GIVE_UP_DAMPING:
-        J = np.concatenate([_sensitivities(trial, here) for trial in trials], axis=1)
+        J = np.concatenate([sensitivities(trial, here) for trial in trials], axis=1)
         gradient = J @ residual / len(residual) + weight * (D.T @ (D @ here.vector()))
         H = J @ J.T / len(residual) + weight * (D.T @ D)
         taken += 1
@@ -161,7 +161,7 @@ def _step(
     return candidate if candidate.radius < MAX_RADIUS else None
 
 
-def _sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:
+def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:
     """(number of parameters, N - transient): ∂ŷ/∂θ, rows in the order of `Parameters.vector`."""
     p = parameters
     N = len(trial.u)
