@@ -117,26 +117,31 @@ def is_proved(fit: MomentFit) -> bool:
         return True
 
 
-def models(runs: list[Trajectory], clean: list[Trajectory], n: int) -> dict[str, MonotoneEquation]:
-    """What the comparators find."""
+def models(
+    runs: list[Trajectory], clean: list[Trajectory], n: int, proposed: MonotoneEquation
+) -> dict[str, MonotoneEquation]:
+    """What the comparators find; SEM may start from the proposed model too."""
     model_class = MonotoneClass(n, (0,))
     plain = plain_moments(runs, model_class, OFFSETS)
     exact = plain_moments(clean, model_class, OFFSETS)
     squares = least_squares_equation(plain, model_class, runs[0], OFFSETS)
     return {
         "least_squares": squares,
-        "sem": direct_minimum(squares, runs),
+        "sem": direct_minimum(squares, proposed, runs),
         "naive": minimise_moment_rie(plain, model_class, runs[0], OFFSETS).model,
         "noiseless": minimise_moment_rie(exact, model_class, runs[0], OFFSETS).model,
     }
 
 
-def direct_minimum(squares: MonotoneEquation, runs: list[Trajectory]) -> MonotoneEquation:
-    """The better of the two minima that the thesis's two starts lead to (Section 3.6.3)."""
+def direct_minimum(
+    squares: MonotoneEquation, proposed: MonotoneEquation, runs: list[Trajectory]
+) -> MonotoneEquation:
+    """The best of three minima: from the thesis's two starts (Section 3.6.3) and from ours."""
     zero = replace(
         squares, e=np.array([1.0, 0.0, 1.0]), a=0.0 * squares.a, b=0.0 * squares.b, c=0.0
     )
-    minima = [minimise_monotone_simulation_error(start, runs) for start in (squares, zero)]
+    starts = (squares, zero, proposed)
+    minima = [minimise_monotone_simulation_error(start, runs) for start in starts]
 
     def training_error(model: MonotoneEquation) -> float:
         simulated = [simulate_banded(model, run) for run in runs]
@@ -176,7 +181,7 @@ def measure(trials: int) -> dict[str, dict[str, float | bool]]:
                 proved.setdefault((n, T), []).append(is_proved(fit))
                 score(n, T, "proposed", fit.model)
                 if n != LARGE_ORDER:
-                    for method, model in models(runs, exact, n).items():
+                    for method, model in models(runs, exact, n, fit.model).items():
                         score(n, T, method, model)
         print(f"trial {trial + 1} of {trials}", flush=True)
     return {

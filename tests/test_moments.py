@@ -8,12 +8,14 @@ import pytest
 from scipy.signal import lfilter
 
 from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification.from_repeats import identify_from_repeats
 from nlsid_core.identification.moment_inequalities import Layout
 from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie, moment_bound
 from nlsid_core.identification.moments import (
     Moments,
     MonotoneClass,
+    offsets_of,
     plain_moments,
     repeated_moments,
 )
@@ -148,6 +150,35 @@ def test_without_bias_removal_the_model_is_far_worse(fit: MomentFit) -> None:
     runs = pair(4000, 1)
     naive = minimise_moment_rie(plain_moments(runs, CLASS, OFFSETS), CLASS, runs[0], OFFSETS)
     assert percent(naive.model) > 3.0 * percent(fit.model)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e4])
+def test_the_unit_of_the_response_does_not_matter(fit: MomentFit, size: float) -> None:
+    first, second = (replace(t, y=size * t.y) for t in pair(4000, 1))
+    scaled = identify_from_repeats(Dataset((first, second)), CLASS)
+    assert scaled.bound == pytest.approx(size**2 * fit.bound, rel=1e-3)
+    w = np.random.default_rng(0).uniform(-2.0, 2.0, 300)
+    simulated, own = scaled.model.simulate(w) / size, fit.model.simulate(w)
+    assert np.abs(simulated - own)[10:].max() < 1e-3 * np.ptp(own)
+
+
+def test_responses_without_a_common_signal_are_refused() -> None:
+    w = np.random.default_rng(0).uniform(-1.0, 1.0, 300)
+    first = run(w, NOISE, 1)
+    opposite = replace(first, y=-first.y, name="opposite")
+    offsets = offsets_of([first, opposite])
+    with pytest.raises(DataError, match="nothing in common"):
+        minimise_moment_rie(
+            repeated_moments([[first, opposite]], CLASS, offsets), CLASS, first, offsets
+        )
+
+
+def test_a_bound_for_another_class_is_refused() -> None:
+    trial = run(np.random.default_rng(4).uniform(-2, 2, 100), 0.0, 4)
+    with pytest.raises(ShapeError, match="do not fit"):
+        moment_bound(truth(), plain_moments([trial], MonotoneClass(3, (0,)), OFFSETS))
+    with pytest.raises(DataError, match="cubic"):
+        moment_bound(truth(), plain_moments([trial], MonotoneClass(2, (0,), 1), OFFSETS))
 
 
 def test_the_error_falls_with_more_data() -> None:

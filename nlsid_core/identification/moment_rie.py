@@ -14,15 +14,15 @@ import scipy.sparse as sp
 from nlsid_core import conic
 from nlsid_core._types import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.errors import Infeasible
-from nlsid_core.identification.moment_inequalities import AffineMatrix, Layout
+from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.identification.moment_inequalities import SPLITS, AffineMatrix, Layout
 from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
 from nlsid_core.identification.monotone_proof import MonotoneProof, prove_monotone_equation
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.trajectory import Trajectory
 
 DELTA = 1e-3  # δ of (3.8), V ≥ δ|Δ|² more than needed: what leaves the exact proof room
-DIAGONAL_FLOOR = 1e-12  # of the largest: a monomial that is zero in the data cannot be scaled
+POWER_FLOOR = 1e-3  # an estimated mean square of yᵏ below this part of (mean square of y)ᵏ is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,8 @@ def minimise_moment_rie(
     """The stable model with the least bound on these moments, and its exact proof.
 
     template: names, units and sample time. kappa: bound on |R|_F in the model's units (None: none).
-    Raises Infeasible if the minimiser has no exact proof, SolverError if the solver gives up.
+    Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
+    exact proof, SolverError if the solver gives up.
     """
     problem = _Problem.of(moments, model_class.lags)
     solution = problem.solve(kappa=kappa)
@@ -89,8 +90,17 @@ def minimise_moment_rie(
 def moment_bound(model: MonotoneEquation, moments: Moments, *, kappa: float | None = None) -> float:
     """J(a, M): the least tr(R M) with this model, e and f scaled by a common factor; ≥ 0.
 
-    Raises Infeasible if no V, R of this class prove the model stable. Source: thesis (3.6), J_κ.
+    The moments have to be about the model's offsets. Source: thesis (3.6), J_κ.
+    Raises ShapeError or DataError on moments of another class, Infeasible if no V, R of this class
+    prove the model stable.
     """
+    if len(model) + len(model.window) != moments.mixed.shape[1]:
+        raise ShapeError(
+            f"moments of {moments.mixed.shape[1]} lags and window entries do not fit a model of "
+            f"{len(model)} and {len(model.window)}"
+        )
+    if model.e[moments.degree :].any():
+        raise DataError("moments for a linear e do not judge a model whose e is cubic")
     problem = _Problem.of(moments, len(model))
     coefficients = np.concatenate([model.e[: moments.degree], [-model.c], -model.a, -model.b])
     return float(problem.solve(fixed=coefficients, kappa=kappa).objective * problem.unit**2)
@@ -113,8 +123,7 @@ class _Problem:
         """The scaled problem for n lags."""
         raw = moments.matrix()
         layout = Layout(n, len(raw) - moments.degree - 1 - n, moments.degree)
-        diagonal = np.diag(raw)
-        D = np.sqrt(np.maximum(diagonal, DIAGONAL_FLOOR * np.max(diagonal)))
+        D = _sizes(raw, moments.degree)
         values, vectors = np.linalg.eigh(raw / np.outer(D, D))
         M = (vectors * np.maximum(values, 0.0)) @ vectors.T
         unit = float(D[0])
@@ -127,10 +136,7 @@ class _Problem:
         if moments.degree == 3:
             rows8 = np.concatenate([small, [unit]])
             rows9 = np.concatenate([rows9, [unit, unit]])
-            _, y, y2 = D[moments.degree], D[0], D[1]
-            split = np.array([1.0, y / unit, y2 / unit**2])
-            columns[-6:-3] = 1.0 / split
-            columns[-3:] = 1.0 / (unit * split)
+            columns[-SPLITS:] = 1.0 / np.tile([1.0, D[0], D[1]], 2)
         return cls(
             layout=layout,
             M=M,
@@ -179,6 +185,23 @@ class _Problem:
             cones=tuple(cones),
         )
         return conic.solve(program)
+
+
+def _sizes(M: FloatArray, degree: int) -> FloatArray:
+    """Root mean squares of Λ: positive where an estimate is not, so that M can be scaled.
+
+    Raises DataError if the estimated mean square of y is not positive.
+    """
+    squares = np.diag(M).copy()
+    if not squares[0] > 0:
+        raise DataError(
+            f"the responses have nothing in common: their estimated mean square is {squares[0]:g}; "
+            "are they repeats, and is the noise smaller than the response?"
+        )
+    floors = np.zeros_like(squares)
+    floors[:degree] = POWER_FLOOR * squares[0] ** np.arange(1, degree + 1)
+    sizes = np.sqrt(np.maximum(squares, floors))
+    return np.asarray(np.where(sizes > 0, sizes, 1.0))
 
 
 def equation(
