@@ -7,16 +7,22 @@ from scipy.signal import lfilter
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
-from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.models import DifferenceEquation, MonotoneEquation, StateAffineModel
 from nlsid_core.trajectory import Trajectory
 
 Model = DifferenceEquation | StateAffineModel
+Simulated = Model | MonotoneEquation
 
 
-def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
-    """(N, n_y) outputs, from the first n measured outputs with the recorded inputs."""
-    n = len(model)
-    if isinstance(model, DifferenceEquation):
+def history(model: Simulated) -> int:
+    """How many measured outputs start a simulation."""
+    return model.history if isinstance(model, MonotoneEquation) else len(model)
+
+
+def simulate_trial(model: Simulated, trial: Trajectory) -> FloatArray:
+    """(N, n_y) outputs, from the first measured outputs with the recorded inputs."""
+    n = history(model)
+    if not isinstance(model, StateAffineModel):
         return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
     return model.simulate(trial.u, trial.y[:n])
 

@@ -13,7 +13,14 @@ from scipy.stats import chi2
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
-from nlsid_core.identification.prediction import Model, one_step_residual, predict, simulate_trial
+from nlsid_core.identification.prediction import (
+    Model,
+    Simulated,
+    history,
+    one_step_residual,
+    predict,
+    simulate_trial,
+)
 from nlsid_core.trajectory import Dataset, Trajectory
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
@@ -97,11 +104,11 @@ def validate(
     )
 
 
-def simulation_percent(model: Model, dataset: Dataset) -> float:
+def simulation_percent(model: Simulated, dataset: Dataset) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
     of their spread; ŷ is simulated from those first n.
     """
-    n = len(model)
+    n = history(model)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
         pairs = [(trial.y[n:], simulate_trial(model, trial)[n:]) for trial in dataset]
     return _percent(pairs)
