@@ -67,17 +67,17 @@ class Factor:
         """Factor the lower band K (bandwidth + 1, N)."""
         return cls(cholesky_banded(K, lower=True, check_finite=False))
 
-    def half_solve(self, B: FloatArray) -> FloatArray:
-        """L⁻¹B for B (N,) or (N, m)."""
-        return self._solve(B, "N")
+    def half_solve(self, B: FloatArray, *, overwrite: bool = False) -> FloatArray:
+        """L⁻¹B for B (N,) or (N, m); `overwrite` allows to use B's memory (column by column)."""
+        return self._solve(B, "N", overwrite=overwrite)
 
     def half_solve_transposed(self, B: FloatArray) -> FloatArray:
         """L⁻ᵀB for B (N,) or (N, m)."""
         return self._solve(B, "T")
 
-    def _solve(self, B: FloatArray, trans: str) -> FloatArray:
+    def _solve(self, B: FloatArray, trans: str, *, overwrite: bool = False) -> FloatArray:
         columns = B[:, None] if B.ndim == 1 else B
-        solved, info = dtbtrs(self.L, columns, uplo="L", trans=trans)
+        solved, info = dtbtrs(self.L, columns, uplo="L", trans=trans, overwrite_b=overwrite)
         if info != 0:
             raise LinAlgError(f"triangular solve failed ({info})")
         return np.asarray(solved.reshape(B.shape, order="F"))

@@ -48,7 +48,9 @@ class Point:
 
 def project(rows: Rows, unknowns: FloatArray, theta: FloatArray, factor: Factor) -> Point:
     """The point of J = min_p |L⁻¹(errors θ - Q p)|²; LinAlgError if rounding decides it."""
-    solved = factor.half_solve(np.column_stack([rows.errors @ theta, rows.Q]))
+    both = np.empty((len(rows), 1 + rows.Q.shape[1]), order="F")  # as LAPACK takes it: no copy
+    both[:, 0], both[:, 1:] = rows.errors @ theta, rows.Q
+    solved = factor.half_solve(both, overwrite=True)
     left, projected = solved[:, 0], solved[:, 1:]
     normal = cho_factor(projected.T @ projected, check_finite=False)
     p = cho_solve(normal, projected.T @ left, check_finite=False)
