@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from bags import documents, show
 from bags.bag_cli import bag_app
@@ -180,7 +181,7 @@ def main() -> None:
     try:
         app()
     except NlsidError as error:
-        err.print(f"[red]error:[/red] {error}", soft_wrap=True, markup=True, highlight=False)
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
         sys.exit(1)
     except OSError as error:
         err.print(f"error: {error}", soft_wrap=True, markup=False, highlight=False)

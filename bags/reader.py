@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 from bags.bag import Bag
 from bags.columns import Columns, Progress, expand_paths, read_columns
 from bags.expressions import Expression
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
 
 HEADER_STAMP: Final = "header stamp"
@@ -89,14 +89,24 @@ def read_signals(
 
 
 def bag_digest(bag: Path | str) -> str:
-    """`sha256:<hex>` of the bag's data file (of its data files, joined in the order of names)."""
-    with Bag(bag) as source:
+    """`sha256:<hex>` of the bag's data file (of its data files, joined in their order)."""
+    digest: str = bag_origin(bag)["digest"]
+    return digest
+
+
+def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
+    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data."""
+    with Bag(bag, unfinished=unfinished) as source:
         digest = hashlib.sha256()
         for file in source.files:
             with file.open("rb") as stream:
                 while block := stream.read(2**20):
                     digest.update(block)
-    return f"sha256:{digest.hexdigest()}"
+        return {
+            "digest": f"sha256:{digest.hexdigest()}",
+            "files": {file.name: file.stat().st_size for file in source.files},
+            "custom": source.custom,
+        }
 
 
 def bag_metadata(bag: Path | str) -> dict[str, str]:
