@@ -16,7 +16,7 @@ from bags.folders import expand_bags
 from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
-from bags.steps import design_funnel_files, identify_bags
+from bags.steps import compare_bags, design_funnel_files, identify_bags
 from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
 from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
@@ -54,6 +54,24 @@ def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> No
         out.print(f"wrote {file}", soft_wrap=True)
     if not report_available():
         out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+
+
+@app.command()
+def compare(
+    bags: BagsArgument,
+    config: ConfigOption,
+    lags: Annotated[
+        list[int] | None,
+        typer.Option(help="Numbers of lags to try, repeatable; default the configuration's."),
+    ] = None,
+) -> None:
+    """Score every method on the same test bags: simulation, prediction, residual tests, proof."""
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    with progress_bar("comparing") as progress:
+        tried = lags or [settings.identification.lags]
+        compared = compare_bags(folders, settings, tried, progress=progress)
+    out.print(show.comparison_table(compared))
 
 
 @app.command()
