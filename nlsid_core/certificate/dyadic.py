@@ -5,7 +5,7 @@ diagonally dominant is checked in integers, and proves M ≻ 0. Where that fails
 very ill-conditioned matrices) fraction-free elimination decides.
 """
 
-from math import frexp
+from math import frexp, inf, ldexp
 from typing import TypeAlias
 
 import numpy as np
@@ -96,8 +96,10 @@ def _eliminate(M: Integers) -> int | None:
 
 
 def _ldexp(value: int, power: int) -> float:
-    """value · 2^power, rounded; never overflows on the way."""
+    """value · 2^power, rounded; ±inf and 0 beyond what a float64 holds."""
     excess = max(0, value.bit_length() - 64)
     mantissa, exponent = frexp(float(value >> excess))
     total = exponent + excess + power
-    return float(np.ldexp(mantissa, min(total, 1100))) if total > -1100 else 0.0
+    if total > 1000:
+        return inf if value > 0 else -inf
+    return ldexp(mantissa, total)

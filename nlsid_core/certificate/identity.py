@@ -131,8 +131,8 @@ def _expand(target: Sequence[Product], gram: Gram) -> Terms:
         return Terms(np.zeros((0, n), np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
     return Terms(
         np.concatenate([part.exponents for part in parts]),
-        np.concatenate([part.left for part in parts]),
-        np.concatenate([part.right for part in parts]),
+        _joined([part.left for part in parts]),
+        _joined([part.right for part in parts]),
         np.concatenate([part.weight for part in parts]),
     )
 
@@ -153,6 +153,14 @@ def _raw(factor: Factor, derivative: int | None) -> tuple[IntArray, NDArray[Any]
         weights = exponents[:, derivative].copy()
         exponents[:, derivative] -= 1
     return exponents, coefficients, weights
+
+
+def _joined(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    """One array; rationals throughout if there is one among them."""
+    joined = np.concatenate(arrays)
+    if joined.dtype == object:
+        joined[:] = [Fraction(value) for value in joined]
+    return joined
 
 
 def _refuse_order(gram: Gram) -> None:

@@ -265,7 +265,9 @@ class _Builder:
         blocks, free = [], []
         for g in domain:
             room = max(degree - inner_degree(g.exponents, inner), 0)
-            block = self._block(candidates(names, constraint.forms, room // 2), symmetry)
+            basis = candidates(names, constraint.forms, room // 2)
+            basis = basis[2 * basis.sum(axis=1) >= constraint.lowest]
+            block = self._block(basis, symmetry)
             blocks.append(block)
             pieces.append(gram_terms(block, g))
             support.append(pieces[-1][0])

@@ -24,6 +24,7 @@ class SumOfSquares:
     multipliers. degree: of each summand, in the indeterminates; default: the least even degree
     that fits p and the domain. modulo: one polynomial h; the identity then holds modulo h, without
     a multiplier (the sphere form). basis: (k, n) monomials v; default: chosen from the support.
+    lowest: the least degree of the multipliers σ_i, for a p that vanishes at the origin to that order.
     forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
     """
 
@@ -33,6 +34,7 @@ class SumOfSquares:
     degree: int | None = None
     modulo: Polynomial | None = None
     basis: IntArray | None = None
+    lowest: int = 0
     forms: tuple[str, ...] = ()
     name: str = ""
 
