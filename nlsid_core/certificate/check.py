@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 from nlsid_core import _json
 from nlsid_core._types import Json
-from nlsid_core.certificate import attraction, nonnegative, stability, tube
+from nlsid_core.certificate import attraction, discrete_funnel, nonnegative, stability, tube
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision, Verdict
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Undecided
@@ -31,6 +31,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
         "energy_tube": _exact_only(tube.decide),
+        "discrete_funnel": _exact_only(discrete_funnel.decide),
         "polynomial_bound": nonnegative.decide_lower_bound,
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,
