@@ -1,6 +1,7 @@
 """Discrete funnels of identified models: what is proved holds, its neighbours are refused."""
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,13 @@ import pytest
 
 from nlsid_core import _json
 from nlsid_core.certificate import check, proof_document
+from nlsid_core.certificate.composed import compose
 from nlsid_core.certificate.discrete_funnel import StepProof
+from nlsid_core.certificate.reach import rational
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.motion import plan_motion
 from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
+from nlsid_core.polynomial import Polynomial, compose_affine, monomials
 from tests.tracked import (
     STEPS,
     assumption,
@@ -223,3 +227,17 @@ def test_a_motion_out_of_reach_of_the_data_is_infeasible() -> None:
         plan_motion(pendulum(), [0.0, 0.0], [1.1, 0.0], steps=5)
     with pytest.raises(DataError, match="angle"):
         plan_motion(pendulum(), [0.0, 0.0], [1.3, 0.0], steps=50)
+
+
+def test_the_fast_exact_composition_equals_the_general_one() -> None:
+    rng = np.random.default_rng(3)
+    exponents = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 1], [3, 0, 0], [1, 1, 1]])
+    coefficients = rng.standard_normal((5, 2))
+    A, b = rational(rng.standard_normal((3, 2))), rational(rng.standard_normal(3))
+    rows, bits = compose(exponents, coefficients, A, b)
+    names = ("x", "y", "u")
+    f = [Polynomial(exponents, column, names) for column in coefficients.T]
+    for column, general in zip(rows.T, compose_affine(f, A, b, names=("s", "t")), strict=True):
+        basis = monomials(2, range(4))
+        values = np.array([Fraction(entry, 1 << bits) for entry in column], dtype=object)
+        assert Polynomial(basis, values, ("s", "t")) == general

@@ -31,7 +31,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
         "energy_tube": _exact_only(tube.decide),
-        "discrete_funnel": _exact_only(discrete_funnel.decide),
+        "discrete_funnel": discrete_funnel.decide,
         "polynomial_bound": nonnegative.decide_lower_bound,
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,

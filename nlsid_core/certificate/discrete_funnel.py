@@ -20,6 +20,7 @@ from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import polynomial_data as data
 from nlsid_core.certificate import reach
+from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
@@ -38,7 +39,7 @@ class StepProof:
     sigma: FloatArray
 
 
-def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
+def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> Decision:
     """Decide the funnel of the bound files."""
     if set(about) != {"model", "policy", "funnel"} or set(claim) != {"kind", "about"}:
         raise CertificateRejected("a discrete_funnel claim is about a model, a policy and a funnel")
@@ -54,7 +55,7 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
         raise CertificateRejected("the policy has another sample time than the model")
     refuse_assumption(model, funnel.assumption)
     T, steps = _read_steps(proof, model, funnel)
-    margin = prove_chains(model, policy, funnel, T, steps)
+    margin = prove_chains(model, policy, funnel, T, steps, mode=mode)
     return _statement(model, funnel, margin)
 
 
@@ -64,17 +65,19 @@ def prove_chains(
     funnel: DiscreteFunnel,
     T: FloatArray,
     steps: Mapping[str, Sequence[StepProof]],
+    *,
+    mode: Mode = "exact",
 ) -> float:
     """Prove both chains on plain numbers; the least margin of a Gram matrix. Raises on refusal."""
     if (np.tril(T, -1) != 0).any() or (np.diagonal(T, axis1=1, axis2=2) == 0).any():
         raise CertificateRejected("T should be upper triangular with a nonzero diagonal")
-    equations, margins = model.polynomials(), []
+    margins = []
     form, bound = funnel.assumption.form, funnel.assumption.bound
     for k in range(len(funnel) + 1):
         _refuse_box(model, policy, funnel, k)
     for k in range(len(funnel)):
         g = reach.closed_loop(
-            equations,
+            model,
             x=policy.x[k],
             u=policy.u[k],
             K=policy.K[k],
@@ -83,15 +86,18 @@ def prove_chains(
             S_next=funnel.S[k + 1],
         )
         exact_T, exact_S = reach.rational(T[k]), reach.rational(funnel.S[k])
-        ST = exact_S @ exact_T
-        kappa = reach.inflation(ST)
+        kappa = reach.inflation(exact_S @ exact_T)
         if form == "response":
             unit = reach.rational(funnel.S[k + 1]) @ reach.rational(funnel.A[k]) @ exact_T
             curvature = reach.curvature(g, unit)
         for chain, radii in zip(CHAINS, (funnel.tube, funnel.inlet), strict=True):
             step = steps[chain][k]
             try:
-                margin = reach.prove_reach(g, ST, float(radii[k]), step.reach, step.Q, step.sigma)
+                radius = float(radii[k])
+                inflated = reach.inflate(kappa, radius)
+                margin = reach.prove_reach(
+                    g, radius, inflated, step.reach, step.Q, step.sigma, mode=mode
+                )
             except CertificateRejected as refusal:
                 raise type(refusal)(f"{chain}, step {k}: {refusal}") from refusal
             margins.append(margin)

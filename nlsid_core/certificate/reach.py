@@ -1,23 +1,25 @@
 """How far one step of a closed loop takes an ellipsoid: exact polynomials, and what bounds them.
 
 Around a nominal, x̄ = T z, the step is g(z) = S⁺[f(x_k + Tz, u_k - K_k T z) - x_{k+1}], with all
-floats taken as the rationals they are; T is a rounded inverse of S, and S T itself is used where
-the two meet, so the rounding of T does not matter.
+floats taken as the rationals they are. T is a rounded inverse of S: |z| ≤ κ|S x̄|. The norms of a
+state are |x̄| = |S x̄| before the step and |x̄⁺| = |S⁺ x̄⁺| after it.
 """
 
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import product as every
 from math import comb, factorial, isqrt, prod
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core._types import FloatArray
-from nlsid_core.certificate.identity import Product, decide_gram, decide_identity, one
+from nlsid_core.certificate.composed import compose
+from nlsid_core.certificate.identity import Mode, Product, decide_gram, decide_identity, one
 from nlsid_core.errors import CertificateRejected
-from nlsid_core.polynomial import Gram, Polynomial, compose_affine, monomials
+from nlsid_core.polynomial import Gram, Polynomial, monomials
+from nlsid_core.state_model import StateModel
 
 Rational: TypeAlias = NDArray[np.object_]
 ROOT_BITS = 90  # of an upper bound of a square root, after the binary point
@@ -36,7 +38,7 @@ def names_of(n: int) -> tuple[str, ...]:
 
 
 def closed_loop(
-    equations: NDArray[np.object_],
+    model: StateModel,
     *,
     x: FloatArray,
     u: FloatArray,
@@ -44,79 +46,100 @@ def closed_loop(
     x_next: FloatArray,
     T: FloatArray,
     S_next: FloatArray,
-) -> list[Polynomial]:
-    """The n polynomials g(z), exactly; `equations` are f in [x; u]."""
+) -> Rational:
+    """(m, n): the coefficients of g(z), exactly, over `monomials(n, range(degree + 1))`."""
     exact_T = rational(T)
-    inner = np.vstack([exact_T, -(rational(K) @ exact_T)])
-    shift = np.concatenate([rational(x), rational(u)])
-    f = compose_affine(equations, inner, shift, names=names_of(len(x)))
-    rows: Rational = rational(S_next) @ (f - rational(x_next))
-    return list(rows)
+    whole, bits = compose(
+        model.exponents,
+        model.coefficients,
+        np.vstack([exact_T, -(rational(K) @ exact_T)]),
+        np.concatenate([rational(x), rational(u)]),
+    )
+    f = np.empty(whole.shape, dtype=object)
+    f.ravel()[:] = [Fraction(entry, 1 << bits) for entry in whole.ravel()]
+    f[0] -= rational(x_next)
+    return np.asarray(f @ rational(S_next).T)
 
 
-def scaled(g: Sequence[Polynomial], radius: float) -> list[Polynomial]:
-    """g(radius·z), exactly."""
-    powers = [Fraction(1)]
-    while len(powers) <= max(p.degree for p in g):
-        powers.append(powers[-1] * Fraction(radius))
-    parts = []
-    for p in g:
-        factors = np.array([powers[d] for d in p.exponents.sum(axis=1)], dtype=object)
-        parts.append(Polynomial(p.exponents, p.exact().coefficients * factors, p.names))
-    return parts
+def rounded(g: Rational, radius: float) -> tuple[FloatArray, Fraction]:
+    """Coefficients of g(radius·z) in floats, and how far they can be off anywhere in |z| ≤ 1."""
+    powers = [Fraction(radius) ** degree for degree in range(degree_of(g) + 1)]
+    degrees = monomials(g.shape[1], range(len(powers))).sum(axis=1)
+    exact = g * np.array([powers[degree] for degree in degrees], dtype=object)[:, None]
+    floats = exact.astype(np.float64)
+    gap: Fraction = np.abs(exact - rational(floats)).sum()
+    return floats, gap
+
+
+def degree_of(g: Rational) -> int:
+    """The degree up to which `g` has rows."""
+    n, degree = g.shape[1], 1
+    while comb(n + degree, n) < len(g):
+        degree += 1
+    return degree
 
 
 def prove_reach(
-    g: Sequence[Polynomial],
-    ST: Rational,
+    g: Rational,
     radius: float,
+    inflated: float,
     reach: float,
-    Q: NDArray[Any],
-    sigma: NDArray[Any],
+    Q: FloatArray,
+    sigma: FloatArray,
+    *,
+    mode: Mode = "exact",
 ) -> float:
-    """Prove that |S x̄| ≤ radius implies |S⁺ x̄⁺| ≤ reach, undisturbed; returns the margin.
+    """Prove that |x̄| ≤ radius implies |x̄⁺| ≤ reach, undisturbed; returns the margin.
 
-    The identity, in z with x̄ = radius·T z, σ = w'Σw and v, w all monomials up to degree d, d - 1:
-        reach² - |g(radius·z)|² - σ(z)(1 - |S T z|²) = v'Qv,   Q ⪰ 0, Σ ⪰ 0.
-    Raises CertificateRejected with the reason.
+    inflated: at least κ·radius (`inflation`), so that x̄ = inflated·T z with |z| ≤ 1. With
+    ĝ the rounded g(inflated·z), off by at most δ, and v, w all monomials up to degree d, d - 1,
+        (reach - δ)² - |ĝ(z)|² - w'Σw (1 - |z|²) = v'Qv,   Q ⪰ 0, Σ ⪰ 0;
+    the square on the left is rounded down. Raises CertificateRejected with the reason.
     """
-    n, degree = len(g), max(1, max(p.degree for p in g))
+    n, degree = g.shape[1], degree_of(g)
     names = names_of(n)
     basis, inner = (monomials(n, range(d)) for d in (degree + 1, degree))
     if len(Q) != len(basis) or len(sigma) != len(inner):
         raise CertificateRejected(f"Gram matrices of a step of degree {degree} have another size")
+    coefficients, off = rounded(g, inflated)
+    left = Fraction(reach) - off
+    if left <= 0:
+        raise CertificateRejected(f"reach {reach:.6g} of radius {radius:.6g} is nothing")
+    square = float(left**2)
+    if Fraction(square) > left**2:
+        square = float(np.nextafter(square, 0.0))
     multiplier = Gram(inner, sigma, names)
-    decide_gram(multiplier, strict=False)
-    target = [Product(one(names), one(names, Fraction(reach) ** 2))]
-    target += [Product(p, p, sign=-1) for p in scaled(g, radius)]
-    target.append(Product(multiplier, _ball(ST, names), sign=-1))
-    return decide_identity(target, Gram(basis, Q, names), strict=False)
+    decide_gram(multiplier, strict=False, mode=mode)
+    rows = [Polynomial(basis, column, names) for column in coefficients.T]
+    target = [Product(one(names), one(names, square))]
+    target += [Product(p, p, sign=-1) for p in rows]
+    target.append(Product(multiplier, _ball(names), sign=-1))
+    return decide_identity(target, Gram(basis, Q, names), strict=False, mode=mode)
 
 
-def curvature(g: Sequence[Polynomial], A_unit: Rational | None) -> dict[tuple[int, int], Fraction]:
+def curvature(g: Rational, A_unit: Rational) -> dict[tuple[int, int], Fraction]:
     """c_jl with |g(z + w) - g(z) - A_unit w| ≤ Σ_jl c_jl |z|^j |w|^l, every l ≥ 1.
 
     c_jl² sums, over outputs and over monomials z^α w^β of degrees j and l, the squared coefficient
     over the multinomials of α and β (Cauchy-Schwarz: Σ_α multinomial(α) z^2α = |z|^2j).
     """
+    n = g.shape[1]
     squares: dict[tuple[int, int], Fraction] = {}
-    for row, p in enumerate(g):
-        for exponent, coefficient in p.terms():
-            for beta in every(*(range(e + 1) for e in exponent)):
-                if not any(beta):
-                    continue
-                alpha = tuple(e - b for e, b in zip(exponent, beta, strict=True))
-                term = Fraction(coefficient) * prod(map(comb, exponent, beta))
-                if A_unit is not None and sum(exponent) == 1:
-                    continue  # the linear part is compared with A below
-                key = (sum(alpha), sum(beta))
-                size = term**2 / (_multinomial(alpha) * _multinomial(beta))
-                squares[key] = squares.get(key, Fraction(0)) + size
-        if A_unit is not None:
-            for j, unit in enumerate(np.eye(len(g), dtype=np.int64).tolist()):
-                gap = Fraction(p.coefficient(unit)) - A_unit[row, j]
-                squares[0, 1] = squares.get((0, 1), Fraction(0)) + gap**2
-    return {key: root_above(value) for key, value in squares.items() if value}
+    exponents = monomials(n, range(degree_of(g) + 1)).tolist()
+    for exponent, row in zip(exponents, g, strict=True):
+        if sum(exponent) == 1:
+            row = row - A_unit[:, exponent.index(1)]  # linear: compared with A
+        size: Fraction = (row * row).sum()
+        if not size:
+            continue
+        for beta in every(*(range(e + 1) for e in exponent)):
+            alpha = tuple(e - b for e, b in zip(exponent, beta, strict=True))
+            key = (sum(alpha), sum(beta))
+            if key[1]:
+                share = Fraction(prod(map(comb, exponent, beta)) ** 2)
+                share /= _multinomial(alpha) * _multinomial(beta)
+                squares[key] = squares.get(key, Fraction(0)) + size * share
+    return {key: root_above(value) for key, value in squares.items()}
 
 
 def response_error(
@@ -136,6 +159,14 @@ def inflation(ST: Rational) -> Fraction:
     return 1 / (1 - distance)
 
 
+def inflate(kappa: Fraction, radius: float) -> float:
+    """A float at least κ·radius."""
+    value = float(kappa * Fraction(radius))
+    return (
+        value if Fraction(value) >= kappa * Fraction(radius) else float(np.nextafter(value, np.inf))
+    )
+
+
 def reach_squared(S: Rational, row: Rational) -> Fraction:
     """max (row·x̄)² over |S x̄| ≤ 1, S upper triangular: |S⁻ᵀ row|²."""
     y: list[Fraction] = []
@@ -151,14 +182,11 @@ def root_above(value: Fraction) -> Fraction:
     return Fraction(isqrt(whole) + 1, 1 << ROOT_BITS)
 
 
-def _ball(ST: Rational, names: tuple[str, ...]) -> Polynomial:
-    """1 - |S T z|²."""
-    square = ST.T @ ST
-    unit = np.eye(len(names), dtype=np.int64)
-    total = one(names, Fraction(1))
-    exponents = [unit[i] + unit[j] for i, j in np.ndindex(square.shape)]
-    difference: Polynomial = total - Polynomial(np.array(exponents), square.ravel(), names)
-    return difference
+def _ball(names: tuple[str, ...]) -> Polynomial:
+    """1 - |z|²."""
+    n = len(names)
+    exponents = np.vstack([np.zeros((1, n), dtype=np.int64), 2 * np.eye(n, dtype=np.int64)])
+    return Polynomial(exponents, np.r_[1.0, -np.ones(n)], names)
 
 
 def _multinomial(exponent: Sequence[int]) -> int:

@@ -13,46 +13,34 @@ from math import factorial, prod
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core._types import FloatArray
 from nlsid_core.certificate.discrete_funnel import StepProof
-from nlsid_core.certificate.reach import names_of
+from nlsid_core.certificate.reach import Rational, degree_of, names_of, rounded
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
-from nlsid_core.polynomial.maps import coefficient_table
 from nlsid_core.sos import Compiled, Program, SumOfSquares, compile_program, template
 
+UP = 2.0  # more than the roundings of a square root and a sum
 ROOM = 1e-6  # relative; what β is raised by, well above the solver's 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """g(z) of one step in floats: exponents (m, n) and coefficients (m, n outputs)."""
+    """The exact g(z) of one step, as `certificate.reach.closed_loop` gives it."""
 
-    exponents: IntArray
-    coefficients: FloatArray
-
-    @classmethod
-    def of(cls, g: list[Polynomial]) -> "Step":
-        """From exact polynomials."""
-        return cls(*coefficient_table([p.rounded() for p in g]))
-
-    @property
-    def degree(self) -> int:
-        """Total degree, at least 1."""
-        return max(1, int(np.max(self.exponents.sum(axis=1))))
+    g: Rational
 
     def reach(self, radius: float) -> StepProof:
-        """A reach b with |x̄| ≤ radius ⇒ |x̄⁺| ≤ b in the norms of the step, with its proof.
+        """b with |z| ≤ radius ⇒ |g(z)| ≤ b, with its proof.
 
         Raises SolverError or Infeasible as the solver does.
         """
-        n, degree = self.coefficients.shape[1], self.degree
-        outputs = self.coefficients * radius ** self.exponents.sum(axis=1)[:, None]
-        # Unit size for the solver: the largest value of |g|² is about that of the linear part.
-        size = float((outputs**2).sum())
-        names = names_of(n)
+        n, degree = self.g.shape[1], degree_of(self.g)
+        outputs, off = rounded(self.g, radius)
+        size = float((outputs**2).sum())  # so that the solver sees numbers of size one
+        names, basis = names_of(n), monomials(n, range(degree + 1))
         square: Polynomial = constant(0.0, names=names)
         for column in outputs.T:
-            p = Polynomial(self.exponents, column / np.sqrt(size), names)
+            p = Polynomial(basis, column / np.sqrt(size), names)
             square = square + p * p
         compiled, place = _program(n, degree)
         values = dict.fromkeys(compiled.program.parameters, 0.0)
@@ -64,7 +52,7 @@ class Step:
         identity = solution["reach"]
         Q, sigma = _full(identity.gram, degree), _full(identity.multipliers[0], degree - 1)
         lift_Q, lift_sigma = _lift(n, degree)
-        reach = float(np.sqrt(size * (beta + room)))
+        reach = float(np.sqrt(size * (beta + room))) + UP * float(off)
         return StepProof(reach, size * (Q + room * lift_Q), size * (sigma + room * lift_sigma))
 
 

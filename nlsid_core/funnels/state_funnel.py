@@ -195,7 +195,7 @@ class _DisturbedStep:
         assumption: DisturbanceAssumption,
     ) -> "_DisturbedStep":
         g = reach.closed_loop(
-            model.polynomials(),
+            model,
             x=policy.x[k],
             u=policy.u[k],
             K=policy.K[k],
@@ -209,11 +209,11 @@ class _DisturbedStep:
             unit = reach.rational(norms.S[k + 1]) @ reach.rational(norms.A[k]) @ exact_T
             curvature = reach.curvature(g, unit)
         kappa = reach.inflation(reach.rational(norms.S[k]) @ exact_T)
-        return cls(Step.of(g), curvature, kappa, assumption.bound)
+        return cls(Step(g), curvature, kappa, assumption.bound)
 
     def from_radius(self, radius: float) -> tuple[StepProof, float]:
         """The proof of one step from `radius`, and the radius it needs next."""
-        proof = self.step.reach(radius)
+        proof = self.step.reach(reach.inflate(self.inflation, radius))
         added = Fraction(self.bound)
         if self.curvature is not None:
             added = reach.response_error(self.curvature, self.inflation, radius, self.bound)
