@@ -15,6 +15,7 @@ from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
 from bags.steps import design_funnel_files, identify_bags
+from bags.tracking_cli import app as track_app
 from nlsid_core.certificate import check as check_proof
 from nlsid_core.errors import CertificateRejected, NlsidError
 from nlsid_core.monitor import Status
@@ -26,6 +27,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(track_app, name="track")
 out = Console()
 err = Console(stderr=True)
 

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from nlsid_core._types import FloatArray
 from nlsid_core.certificate.composed import compose
+from nlsid_core.certificate.exact import is_positive_definite
 from nlsid_core.certificate.identity import Mode, Product, decide_gram, decide_identity, one
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.polynomial import Gram, Polynomial, monomials
 from nlsid_core.state_model import StateModel
 
 Rational: TypeAlias = NDArray[np.object_]
+EIGENVALUE_ROOM = 1.0 + 1e-9  # over an eigenvalue computed in floats, to be proved in rationals
 ROOT_BITS = 90  # of an upper bound of a square root, after the binary point
 
 
@@ -120,26 +122,27 @@ def prove_reach(
 def curvature(g: Rational, A_unit: Rational) -> dict[tuple[int, int], Fraction]:
     """c_jl with |g(z + w) - g(z) - A_unit w| ≤ Σ_jl c_jl |z|^j |w|^l, every l ≥ 1.
 
-    c_jl² sums, over outputs and over monomials z^α w^β of degrees j and l, the squared coefficient
-    over the multinomials of α and β (Cauchy-Schwarz: Σ_α multinomial(α) z^2α = |z|^2j).
+    The part of degrees j and l is M m(z, w), m the monomials z^α w^β times the roots of the
+    multinomials of α and β, so that |m|² = |z|^2j |w|^2l. c_jl² is at least the largest
+    eigenvalue of MM', which is rational.
     """
     n = g.shape[1]
-    squares: dict[tuple[int, int], Fraction] = {}
+    squares: dict[tuple[int, int], Rational] = {}
     exponents = monomials(n, range(degree_of(g) + 1)).tolist()
     for exponent, row in zip(exponents, g, strict=True):
         if sum(exponent) == 1:
             row = row - A_unit[:, exponent.index(1)]  # linear: compared with A
-        size: Fraction = (row * row).sum()
-        if not size:
+        if not row.any():
             continue
+        outer = np.multiply.outer(row, row)
         for beta in every(*(range(e + 1) for e in exponent)):
             alpha = tuple(e - b for e, b in zip(exponent, beta, strict=True))
             key = (sum(alpha), sum(beta))
             if key[1]:
                 share = Fraction(prod(map(comb, exponent, beta)) ** 2)
                 share /= _multinomial(alpha) * _multinomial(beta)
-                squares[key] = squares.get(key, Fraction(0)) + size * share
-    return {key: root_above(value) for key, value in squares.items()}
+                squares[key] = squares.get(key, 0) + outer * share
+    return {key: root_above(_largest_eigenvalue(square)) for key, square in squares.items()}
 
 
 def response_error(
@@ -187,6 +190,14 @@ def _ball(names: tuple[str, ...]) -> Polynomial:
     n = len(names)
     exponents = np.vstack([np.zeros((1, n), dtype=np.int64), 2 * np.eye(n, dtype=np.int64)])
     return Polynomial(exponents, np.r_[1.0, -np.ones(n)], names)
+
+
+def _largest_eigenvalue(M: Rational) -> Fraction:
+    """A rational at least the largest eigenvalue of M ⪰ 0; the trace where no less is proved."""
+    estimate = Fraction(float(np.linalg.eigvalsh(M.astype(np.float64))[-1]) * EIGENVALUE_ROOM)
+    shifted = [[estimate * int(i == j) - M[i, j] for j in range(len(M))] for i in range(len(M))]
+    trace: Fraction = np.trace(M)
+    return estimate if estimate < trace and is_positive_definite(shifted) else trace
 
 
 def _multinomial(exponent: Sequence[int]) -> int:

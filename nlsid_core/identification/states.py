@@ -47,14 +47,18 @@ def identify_states(
     *,
     degrees: Sequence[tuple[int, ...]] | None = None,
     refuse_above: float = REFUSED_ERROR,
+    biased_without_repeats: bool = False,
 ) -> StateFit:
     """Fit x⁺ = f(x, u) to repeats; trajectories hold the measured state in y.
 
     degrees: classes to try, the highest power of each of [x; u]; default `classes_to_try`. The
-    least free-run error on `validation` wins. Raises DataError if there are no repeats, or if no
-    class describes the data to `refuse_above` %, saying where they fail.
+    least free-run error on `validation` wins. biased_without_repeats: least squares on single
+    runs, for recordings that have no repeats. Raises DataError if there are none and that was not
+    asked for, or if no class describes the data to `refuse_above` %, saying where they fail.
     """
     groups = list(train.repeats().values())
+    if not groups and biased_without_repeats:
+        groups = [(trial,) for trial in train]
     if not groups:
         raise DataError("no excitation was repeated; record each at least twice, same inputs")
     for members in groups:
@@ -155,7 +159,7 @@ def _instrumented(
     for members in groups:
         total = np.sum([member.y for member in members], axis=0)
         for member in members:
-            others = (total - member.y) / (len(members) - 1)
+            others = (total - member.y) / (len(members) - 1) if len(members) > 1 else total
             u = member.u[:-1]
             instruments = _features(exponents, np.hstack([others[:-1], u]) / scale)
             regressors = _features(exponents, np.hstack([member.y[:-1], u]) / scale)
@@ -184,9 +188,7 @@ def _model(
         unit = (exponents == np.eye(exponents.shape[1], dtype=np.int64)[i]).all(axis=1)
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
-    noise = np.sqrt(
-        np.mean([np.var([m.y for m in group], axis=0, ddof=1).mean(axis=0) for group in groups], 0)
-    )
+    noise = _noise(groups)
     signals = [
         tuple(Signal(*entry) for entry in zip(names, units, paths, strict=True))
         for names, units, paths in (
@@ -207,6 +209,17 @@ def _model(
         bags=tuple((t.name, t.digest) for group in groups for t in group),
     )
     return _with_disturbance(model, groups)
+
+
+def _noise(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
+    """(n,) standard deviation: between repeats, or of third differences where there are none."""
+    variances = [
+        np.var([m.y for m in group], axis=0, ddof=1).mean(axis=0)
+        if len(group) > 1
+        else np.mean(np.diff(group[0].y, 3, axis=0) ** 2, axis=0) / 20.0
+        for group in groups
+    ]
+    return np.sqrt(np.mean(variances, axis=0))
 
 
 def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]]) -> StateModel:
