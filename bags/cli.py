@@ -1,4 +1,4 @@
-"""The command line `nlsid`: identify, funnel, check, monitor, demo."""
+"""The command line `nlsid`: identify, funnel, check, monitor, demo; `bag` for recordings."""
 
 import sys
 from pathlib import Path
@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from bags import documents, show
+from bags.bag_cli import bag_app
 from bags.config import load_config
 from bags.demo import run_demo
 from bags.folders import expand_bags
@@ -16,8 +17,9 @@ from bags.replay import replay_bag
 from bags.report import report_available, write_margins
 from bags.steps import design_funnel_files, identify_bags
 from bags.tracking_cli import app as track_app
+from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
-from nlsid_core.errors import CertificateRejected, NlsidError
+from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
 from nlsid_core.monitor import Status
 
 app = typer.Typer(
@@ -28,6 +30,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(track_app, name="track")
+app.add_typer(bag_app)
 out = Console()
 err = Console(stderr=True)
 
@@ -74,12 +77,19 @@ def funnel(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    mode: Annotated[
+        Mode,
+        typer.Option(help="exact: integers; rigorous: floating point with proved rounding bounds."),
+    ] = "exact",
 ) -> None:
-    """Decide proofs exactly, without a solver: PROVED (status 0) or REJECTED (status 1)."""
+    """Decide proofs without a solver: PROVED (status 0), REJECTED or UNDECIDED (status 1)."""
     rejected = False
     for path in proofs:
         try:
-            verdict = check_proof(path)
+            verdict = check_proof(path, mode=mode)
+        except Undecided as doubt:
+            rejected = True
+            typer.echo(f"UNDECIDED {path.name}: {doubt}")
         except (CertificateRejected, OSError) as refusal:
             rejected = True
             typer.echo(f"REJECTED {path.name}: {refusal}")

@@ -6,7 +6,8 @@ A bag's own definition is used where it differs: the data were written with it.
 
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from typing import Final
 
@@ -25,6 +26,7 @@ from nlsid_core.errors import BagError
 
 HEADER: Final = "std_msgs/msg/Header"
 IDL_SEPARATOR: Final = "=" * 80 + "\n"
+ROS1_DIFFERS: Final = (HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 MAX_FIXED_ARRAY: Final = 2**16  # rosbags writes a line of code per element; none in use is near it
 
 _TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
@@ -82,7 +84,22 @@ def definition(msgtype: str) -> tuple[str, str]:
     return types.generate_msgdef(msgtype, ros_version=2)[0], types.hash_rihs01(msgtype)
 
 
-@lru_cache(maxsize=64)
+def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinition:
+    """A ROS 1 definition as ROS 2 writes it: no `seq` in the header, `time` as a message.
+
+    Raises BagError if it cannot be used.
+    """
+    standard = standard_types().fielddefs
+    with _defining(msgtype):
+        parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
+        _refuse_odd_names(parsed)
+        types = get_typestore(Stores.EMPTY)
+        types.register(parsed)
+        text, _ = types.generate_msgdef(msgtype, ros_version=2)
+    return MessageDefinition(MessageDefinitionFormat.MSG, text)
+
+
+@lru_cache(maxsize=256)
 def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     """The types a bag's messages of `msgtype` were written with.
 
@@ -93,8 +110,8 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     if embedded.format == MessageDefinitionFormat.NONE:
         fields_of(msgtype, standard)
         return standard
-    try:
-        parsed = _parse(msgtype, embedded)
+    with _defining(msgtype):
+        parsed = _completed(_parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
             for name, (_, fields) in parsed.items()
@@ -104,12 +121,18 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(msgtype)
+    return types
+
+
+@contextmanager
+def _defining(msgtype: str) -> Iterator[None]:
+    try:
+        yield
     except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
         raise BagError(
             f"the definition of '{msgtype}' in the bag cannot be used: {type(error).__name__}: "
             f"{str(error)[:200]}"
         ) from error
-    return types
 
 
 def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
@@ -122,6 +145,21 @@ def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
     for part in text.split(IDL_SEPARATOR)[1:]:
         types.update(get_types_from_idl(part.partition("\n")[2]))
     return types
+
+
+def _completed(parsed: Typesdict) -> Typesdict:
+    """With the standard types that the definition uses and leaves out."""
+    standard = standard_types().fielddefs
+    todo, complete = list(parsed), dict(parsed)
+    while todo:
+        for _, description in complete[todo.pop()][1]:
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            name = str(description[1])
+            if description[0] == Nodetype.NAME and name not in complete and name in standard:
+                complete[name] = standard[name]
+                todo.append(name)
+    return complete
 
 
 def _refuse_odd_names(types: Typesdict) -> None:

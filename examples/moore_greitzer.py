@@ -1,8 +1,8 @@
 """A quartic Lyapunov function for the Moore-Greitzer jet engine, a cubic system.
 
-Source: Krstić, Kanellakopoulos and Kokotović 1995; a quartic V was first found by sums of squares in
-Papachristodoulou and Prajna, "On the construction of Lyapunov functions using the sum of squares
-decomposition", CDC 2002. No quadratic V exists.
+Source: Krstić, Kanellakopoulos and Kokotović 1995; a quartic V was first found by sums of squares
+in Papachristodoulou and Prajna, "On the construction of Lyapunov functions using the sum of
+squares decomposition", CDC 2002.
 """
 
 from nlsid_core._types import Json

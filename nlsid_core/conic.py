@@ -7,6 +7,7 @@ rumour: what is returned is judged by the residuals computed here, and a caller 
 takes the solution to `nlsid_core.certificate`.
 """
 
+import importlib
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -17,7 +18,7 @@ import clarabel
 import numpy as np
 import scipy.sparse as sp
 
-from nlsid_core._types import FloatArray
+from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 
 ConeKind: TypeAlias = Literal["zero", "nonnegative", "second_order", "psd"]
@@ -191,7 +192,7 @@ def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
         return _clarabel(program, tolerance, refine=True)
     if rung == "clarabel rescaled":
         return _rescaled(program, tolerance)
-    return _through_cvxpy(program, rung, tolerance)
+    return _through_cvxpy(program, rung)
 
 
 def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outcome:
@@ -220,10 +221,10 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
 
 
 def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
-    """Solve the dual instead where it is smaller: sums of squares have few equalities, many unknowns.
+    """Solve the dual instead where it is smaller: few equalities, many unknowns.
 
-    Columns V that only mirror a cone block (rows -x_V + s = 0) become slack; with the other rows G
-    and columns F it reads: minimise b_G'z, A_GF'z = -q_F, q_V + A_GV'z ∈ K, z ∈ K where G has a cone.
+    Columns V that only mirror a cone block (rows -x_V + s = 0) become slack. With the other rows G
+    and columns F: minimise b_G'z with A_GF'z = -q_F, q_V + A_GV'z ∈ K, and z ∈ K where G has one.
     """
     split = _mirrored(program) if not program.P.nnz else None
     if split is None:
@@ -233,7 +234,9 @@ def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
     free = np.setdiff1d(np.arange(len(program.q)), columns)
     G = program.A.tocsr()[others].tocsc()
     pick = np.searchsorted(others, affine)
-    keep = sp.csc_matrix((-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others)))
+    keep = sp.csc_matrix(
+        (-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others))
+    )
     dual = ConeProgram(
         P=sp.csc_matrix((len(others), len(others))),
         q=program.b[others],
@@ -262,7 +265,11 @@ def _mirrored(program: ConeProgram) -> tuple[Any, Any, Any, Any, list[Cone]] | N
     A = program.A.tocsr()
     single = (np.diff(A.indptr) == 1) & (program.b == 0)
     single[single] = A.data[A.indptr[:-1][single]] == -1.0
-    rows, affine, first, second, start = [], [], [], [], 0
+    rows: list[IntArray] = []
+    affine: list[IntArray] = []
+    first: list[Cone] = []
+    second: list[Cone] = []
+    start = 0
     for cone in program.cones:
         block = np.arange(start, start + cone.rows)
         start += cone.rows
@@ -301,9 +308,9 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, outcome.z / dual)
 
 
-def _through_cvxpy(program: ConeProgram, name: str, tolerance: float) -> _Outcome:
+def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     """Any solver cvxpy has, by its name."""
-    import cvxpy as cp
+    cp: Any = importlib.import_module("cvxpy")  # slow to import, and rarely needed
 
     if name.upper() not in cp.installed_solvers():
         raise SolverError(
@@ -359,13 +366,14 @@ def _residual(program: ConeProgram, x: FloatArray, s: FloatArray, z: FloatArray)
     primal = np.abs(program.A @ x + s - program.b).max(initial=0.0)
     dual = np.abs(Px + program.q + program.A.T @ z).max(initial=0.0)
     gap = abs(float(x @ Px + program.q @ x + program.b @ z))
-    return max(
+    worst = max(
         primal / (1 + np.abs(program.b).max(initial=0.0) + np.abs(s).max(initial=0.0)),
         dual / (1 + np.abs(program.q).max(initial=0.0) + np.abs(Px).max(initial=0.0)),
         gap / (1 + abs(float(program.q @ x))),
         -_smallest(program.cones, s) / (1 + np.abs(s).max(initial=0.0)),
         -_smallest(program.cones, z, dual=True) / (1 + np.abs(z).max(initial=0.0)),
     )
+    return float(worst)
 
 
 def _smallest(cones: Sequence[Cone], s: FloatArray, *, dual: bool = False) -> float:
@@ -381,7 +389,7 @@ def _smallest(cones: Sequence[Cone], s: FloatArray, *, dual: bool = False) -> fl
         elif cone.kind == "second_order":
             worst = min(worst, float(block[0] - np.linalg.norm(block[1:])))
         elif cone.kind == "nonnegative":
-            worst = min(worst, float(block.min()))
+            worst = min(worst, float(np.min(block)))
         else:
             worst = min(worst, -float(np.abs(block).max()))
     return worst

@@ -18,6 +18,7 @@ from examples import (
     van_der_pol,
 )
 from nlsid_core import _json
+from nlsid_core._types import Json
 from nlsid_core.certificate import check
 from nlsid_core.errors import CertificateRejected, Infeasible, Undecided
 from nlsid_core.sos.exact import exact_gram
@@ -82,7 +83,12 @@ def test_no_bound_of_the_motzkin_polynomial_is_a_sum_of_squares() -> None:
 def test_a_camel_bound_above_the_minimum_is_rejected() -> None:
     document = six_hump_camel.document()
     claim = document["claim"] | {"bound": -1.0316}
-    forged = {"format": document["format"], "version": 1, "claim": claim, "proof": document["proof"]}
+    forged = {
+        "format": document["format"],
+        "version": 1,
+        "claim": claim,
+        "proof": document["proof"],
+    }
     with pytest.raises(CertificateRejected):
         _check(forged)
 
@@ -121,12 +127,17 @@ def test_levels_below_one_twentieth_are_proved_and_above_refused() -> None:
 def test_a_proof_for_one_level_is_rejected_for_a_larger_one() -> None:
     document = too_large_a_level.document(0.0499)
     claim = document["claim"] | {"level": 0.0501}
-    forged = {"format": document["format"], "version": 1, "claim": claim, "proof": document["proof"]}
+    forged = {
+        "format": document["format"],
+        "version": 1,
+        "claim": claim,
+        "proof": document["proof"],
+    }
     with pytest.raises(CertificateRejected):
         _check(forged)
 
 
-def _check(document: _json.Json) -> None:
+def _check(document: Json) -> None:
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:

@@ -45,7 +45,7 @@ def matrix_document(
     equalities: Sequence[Polynomial] = (),
     equality_multipliers: Sequence[Polynomial] = (),
 ) -> Json:
-    """matrix(x) ⪰ 0 on the domain, x called `names`; the Gram matrices are in (x, y[0], y[1], …)."""
+    """matrix(x) ⪰ 0 on the domain, x called `names`; the Gram matrices are in (x, y[0], …)."""
     rows: Any = matrix
     claim: Json = {
         "kind": "matrix_inequality",

@@ -37,6 +37,7 @@ class NotRepresentable(Exception):  # noqa: N818 - internal signal, turned into 
         self.index = index
 
 
+@np.errstate(over="ignore", under="ignore", invalid="ignore")  # infinities are undecided below
 def decide(
     terms: "Terms",
     of_terms: IntArray,
@@ -52,18 +53,16 @@ def decide(
     position = np.r_[of_terms, of_pairs]
     size = len(home)
     # Two roundings a product, and one less than `count` additions a coefficient:
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is undecided below
-        summands = np.r_[terms.weight * (left * right), -matrix.ravel()]
-        count = np.bincount(position, minlength=size)
-        magnitude = np.bincount(position, np.abs(summands), size)
-        residual = np.bincount(position, summands, size)
-        error = ((count + 4) * (U * magnitude) + count * TINY) * SLACK
+    summands = np.r_[terms.weight * (left * right), -matrix.ravel()]
+    count = np.bincount(position, minlength=size)
+    magnitude = np.bincount(position, np.abs(summands), size)
+    residual = np.bincount(position, summands, size)
+    error = ((count + 4) * (U * magnitude) + count * TINY) * SLACK
     for k in np.flatnonzero((home < 0) & (count > 0)).tolist():
         _refuse_unless_zero(terms, left, right, np.flatnonzero(of_terms == k), k)
     residual, error, home = residual[home >= 0], error[home >= 0], home[home >= 0]
-    if not (np.isfinite(residual).all() and np.isfinite(error).all()):
-        raise Undecided("a coefficient overflows in floating point; the exact mode decides")
-    if (np.abs(residual) + error).max(initial=0.0) > np.abs(matrix).max(initial=0.0) / RESIDUAL_RATIO:
+    largest = np.abs(matrix).max(initial=0.0)
+    if not (np.abs(residual) + error <= largest / RESIDUAL_RATIO).all():  # also if not finite
         raise Undecided(f"{RESIDUAL_TOO_LARGE}, or overestimated; the exact mode decides")
     # Absorb: each residual into one entry and its mirror image, which rounds once more.
     i, j = np.divmod(home, len(Q))
@@ -78,9 +77,11 @@ def decide(
 def decide_matrix(Q: NDArray[Any], *, strict: bool) -> float:
     """Q ≻ 0 as it stands (strict or not)."""
     del strict
-    return _decide_shifted(_floats(Q), 0.0)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return _decide_shifted(_floats(Q), 0.0)
 
 
+@np.errstate(over="ignore", under="ignore", invalid="ignore")
 def is_positive_definite(A: FloatArray, shift: float = 0.0) -> bool:
     """True proves A - shift·I ≻ 0 for symmetric A; False proves nothing."""
     n = len(A)
@@ -103,9 +104,9 @@ def is_positive_definite(A: FloatArray, shift: float = 0.0) -> bool:
 
 
 def _decide_shifted(Q: FloatArray, rho: float) -> float:
-    if len(Q):
+    if len(Q) and np.isfinite(Q).all():
         half = (float(np.linalg.eigvalsh(Q)[0]) - rho) / 2
-        largest = float(np.diag(Q).max())
+        largest = float(np.max(np.diag(Q)))
         if half > 0 and is_positive_definite(Q, (rho + half) * SLACK):
             return half / largest / SLACK
     if is_positive_definite(Q, rho):
@@ -138,7 +139,10 @@ def _refuse_unless_zero(
         (
             Fraction(a) * Fraction(b) * w
             for a, b, w in zip(
-                left[which].tolist(), right[which].tolist(), terms.weight[which].tolist(), strict=True
+                left[which].tolist(),
+                right[which].tolist(),
+                terms.weight[which].tolist(),
+                strict=True,
             )
         ),
         Fraction(0),

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
+from nlsid_core.polynomial.operations import OPERATORS, REFUSED
+from nlsid_core.polynomial.values import monomial_values
 
 Coefficients: TypeAlias = NDArray[Any]
 Number: TypeAlias = int | float | Fraction
@@ -71,7 +73,7 @@ class Polynomial:
     @property
     def degree(self) -> int:
         """Total degree; 0 for constants and for the zero polynomial."""
-        return int(self.exponents.sum(axis=1).max(initial=0))
+        return int(np.max(self.exponents.sum(axis=1), initial=0))
 
     @property
     def is_exact(self) -> bool:
@@ -189,7 +191,7 @@ class Polynomial:
         kept = self.names[:j] + self.names[j + 1 :]
         reduced = np.delete(self.exponents, j, axis=1)
         result = constant(0, names=kept)
-        for power in range(int(powers.max(initial=0)), -1, -1):
+        for power in range(int(np.max(powers, initial=0)), -1, -1):
             part = Polynomial(
                 reduced[powers == power], self.coefficients[powers == power], kept
             )._horner(rest)
@@ -256,7 +258,7 @@ class Polynomial:
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
         """NumPy's protocol: `array * polynomial` and `np.sqrt(polynomial)` arrive here."""
-        names = _OPERATORS.get(ufunc.__name__)
+        names = OPERATORS.get(ufunc.__name__)
         if method != "__call__" or names is None or len(inputs) > 2:
             raise NotPolynomial(f"{ufunc.__name__} of {_short(self)} is not a polynomial")
         if isinstance(inputs[0], Polynomial):
@@ -292,17 +294,6 @@ class Polynomial:
         return text or "0"
 
 
-_OPERATORS = {
-    "add": ("__add__", "__radd__"),
-    "subtract": ("__sub__", "__rsub__"),
-    "multiply": ("__mul__", "__rmul__"),
-    "divide": ("__truediv__", "__rtruediv__"),
-    "power": ("__pow__", "__rpow__"),
-    "negative": ("__neg__", "__neg__"),
-    "positive": ("__pos__", "__pos__"),
-}
-
-
 def variables(names: str | Sequence[str]) -> tuple[Polynomial, ...]:
     """One polynomial per name (a sequence, or one string split at spaces), in one common space."""
     names = tuple(names.split()) if isinstance(names, str) else tuple(names)
@@ -326,22 +317,9 @@ def as_polynomial(value: Any) -> Polynomial:
         return as_polynomial(value.item())
     if isinstance(value, (Rational, float, np.floating)):
         if isinstance(value, Integral):
-            return constant(int(value) if abs(value) <= 2**53 else Fraction(int(value)))
+            return constant(int(value) if abs(int(value)) <= 2**53 else Fraction(int(value)))
         return constant(Fraction(value) if isinstance(value, Rational) else float(value))
     raise NotPolynomial(f"{value!r} ({type(value).__name__}) is not a real number or a polynomial")
-
-
-def monomial_values(exponents: IntArray, points: FloatArray) -> FloatArray:
-    """(N, m) values of m monomials (m, n) at N points (N, n)."""
-    values = np.ones((len(points), len(exponents)))
-    for j in range(exponents.shape[1]):
-        top = int(exponents[:, j].max(initial=0))
-        if top:
-            powers = np.ones((top + 1, len(points)))
-            for k in range(1, top + 1):
-                powers[k] = powers[k - 1] * points[:, j]
-            values *= powers[exponents[:, j]].T
-    return values
 
 
 def _merge(exponents: IntArray, coefficients: Coefficients) -> tuple[IntArray, Coefficients]:
@@ -416,24 +394,5 @@ def _refusal(operation: str) -> Callable[..., Polynomial]:
     return refuse
 
 
-# NumPy calls these by name on the entries of an object array (np.sin -> .sin()); Python calls the
-# others. Without them the message would not say which operation was to blame.
-for _name in (
-    *"sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh".split(),
-    *"exp exp2 expm1 log log2 log10 log1p sqrt cbrt floor ceil trunc rint hypot arctan2".split(),
-):
-    setattr(Polynomial, _name, _refusal(_name))
-for _name, _operation in {
-    "abs": "abs",
-    "mod": "remainder",
-    "rmod": "remainder",
-    "floordiv": "floor division",
-    "rfloordiv": "floor division",
-    "rpow": "exponentiation with an exponent",
-    "lt": "comparison <",
-    "le": "comparison <=",
-    "gt": "comparison >",
-    "ge": "comparison >=",
-    "bool": "the truth value",
-}.items():
-    setattr(Polynomial, f"__{_name}__", _refusal(_operation))
+for _name, _operation in REFUSED.items():
+    setattr(Polynomial, _name, _refusal(_operation))

@@ -46,10 +46,14 @@ def exact_gram(
     rhs, rows = _identity_rows(p, basis, N)
     G = _interior_gram(rows, rhs, len(N))
     for bits in ROUNDING_BITS:
-        rounded = [[Fraction(round(entry * 2**bits), 2**bits) for entry in row] for row in G.tolist()]
+        rounded = [
+            [Fraction(round(entry * 2**bits), 2**bits) for entry in row] for row in G.tolist()
+        ]
         corrected = _corrected(rounded, rows, rhs)
         if corrected is None:
-            raise Infeasible("p is not a combination of products of the reduced basis: is a zero wrong?")
+            raise Infeasible(
+                "p is not a combination of products of the reduced basis: is a zero wrong?"
+            )
         Q = _congruence(corrected, N)
         gram = Gram(basis, np.array(Q, dtype=object), p.names)
         try:
@@ -67,7 +71,7 @@ def _vanishing(
 ) -> Rational:
     """Rows n with n'v(z) = 0 at every zero: a rational basis of the null space."""
     values = [[_monomial(row, zero) for row in basis.tolist()] for zero in zeros]
-    top = int(basis.sum(axis=1).max(initial=0))
+    top = int(np.max(basis.sum(axis=1), initial=0))
     values += [
         [_monomial(row, zero) if sum(row) == top else Fraction(0) for row in basis.tolist()]
         for zero in directions
@@ -84,9 +88,7 @@ def _vanishing(
     return null
 
 
-def _identity_rows(
-    p: Polynomial, basis: IntArray, N: Rational
-) -> tuple[list[Fraction], Rational]:
+def _identity_rows(p: Polynomial, basis: IntArray, N: Rational) -> tuple[list[Fraction], Rational]:
     """Right-hand sides, and equations Σ_{a ≤ b} rows[α][ab] G_ab = p_α for every monomial α."""
     names = p.names
     u = [Polynomial(basis, np.array(row, dtype=object), names) for row in N]
@@ -126,10 +128,10 @@ def _interior_gram(rows: Rational, rhs: Sequence[Fraction], size: int) -> FloatA
     x = conic.solve(program).x
     if x[0] <= 0:
         raise Infeasible(
-            f"no positive definite Gram matrix on the reduced basis (smallest eigenvalue {x[0]:.1e}): "
-            "p is not a sum of squares, or has zeros that were not given"
+            f"no positive definite Gram matrix on the reduced basis (smallest eigenvalue "
+            f"{x[0]:.1e}): p is not a sum of squares, or has zeros that were not given"
         )
-    return size_of_p * (conic.smat(x[1:]) + x[0] * np.eye(size))
+    return np.asarray(size_of_p * (conic.smat(x[1:]) + x[0] * np.eye(size)))
 
 
 def _corrected(G: Rational, rows: Rational, rhs: Sequence[Fraction]) -> Rational | None:

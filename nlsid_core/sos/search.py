@@ -89,7 +89,7 @@ def lower_bound(
         )
         return Bound(value, optimum, document)
     raise Infeasible(
-        f"the bound {optimum:.9g} was found but none within {BACK_OFF[-1]:g} of it could be proved; "
+        f"the bound {optimum:.9g} was found but none within {BACK_OFF[-1]:g} of it was proved; "
         "raise the degree, or give the zeros to `exact_gram`"
     )
 
@@ -121,7 +121,7 @@ def attraction(
     """
     names = V.names
     rate: Polynomial = -sum(V.derivative(x) * f for x, f in zip(names, field, strict=True))
-    lowest = int(rate.exponents.sum(axis=1).min()) if len(rate) else 0
+    lowest = int(np.min(rate.exponents.sum(axis=1))) if len(rate) else 0
     even = rate.degree + rate.degree % 2
     room = SumOfSquares(
         rate,
@@ -158,7 +158,7 @@ def largest_level(
 
 
 def positive_semidefinite(gram: Gram) -> Gram:
-    """The Gram matrix with its eigenvalues lifted just above zero; the identity takes the change."""
+    """With its eigenvalues lifted just above zero; the identity takes the change."""
     if not len(gram):
         return gram
     lowest = float(np.linalg.eigvalsh(gram.Q)[0])

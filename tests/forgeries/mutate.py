@@ -11,7 +11,7 @@ from nlsid_core._types import Json
 
 LEAST = 5e-324
 WILD = (0.0, -0.0, 1e-300, LEAST, 1e300, -1e300, 1.7976931348623157e308, 1, -1, 2**62, 1e-12)
-ODD = ("1/3", "-7", "1e5", "nan", "", "0x10", None, True, [], {}, "9" * 100)
+ODD: tuple[Any, ...] = ("1/3", "-7", "1e5", "nan", "", "0x10", None, True, [], {}, "9" * 100)
 
 
 def mutant(document: Json, rng: np.random.Generator) -> Json:

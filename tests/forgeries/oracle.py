@@ -18,12 +18,12 @@ def agrees(document: dict[str, Any]) -> bool:
         return _attraction(claim, proof)
     n = len(claim["variables"])
     if kind == "matrix_inequality":
-        p, pad = _form(claim["matrix"], n), len(claim["matrix"])
+        p, pad = _form(claim["matrix"]), len(claim["matrix"])
         bound = Fraction(0)
     else:
         p, pad, bound = _poly(claim["polynomial"]), 0, _number(claim["bound"])
     wide = n + pad
-    factor, total = {(0,) * wide: Fraction(1)}, {}
+    factor: Poly = {(0,) * wide: Fraction(1)}
     if proof.get("factor") is not None:
         if not _definite(proof["factor"], strict=True):
             return False
@@ -52,9 +52,7 @@ def _attraction(claim: dict[str, Any], proof: dict[str, Any]) -> bool:
         return False
     rate: Poly = {}
     for j, f in enumerate(field):
-        gradient = {
-            (*e[:j], e[j] - 1, *e[j + 1 :]): c * e[j] for e, c in V.items() if e[j]
-        }
+        gradient = {(*e[:j], e[j] - 1, *e[j + 1 :]): c * e[j] for e, c in V.items() if e[j]}
         rate = _plus(rate, _times(gradient, f), -1)
     if claim.get("level") is not None:
         level, sigma = _number(claim["level"]), proof["multiplier"]
@@ -126,14 +124,14 @@ def _gram(gram: dict[str, Any]) -> Poly:
     return total
 
 
-def _form(matrix: list[list[Any]], n: int) -> Poly:
-    size, total = len(matrix), {}
+def _form(matrix: list[list[Any]]) -> Poly:
+    size = len(matrix)
+    total: Poly = {}
     for i, row in enumerate(matrix):
         for j, entry in enumerate(row):
             y = [int(k == i) + int(k == j) for k in range(size)]
             part = {(*e, *y): c for e, c in _poly(entry).items()}
             total = _plus(total, part)
-    del n
     return total
 
 

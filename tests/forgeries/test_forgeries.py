@@ -2,6 +2,7 @@
 
 import copy
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.forgeries.genuine import genuine
-from tests.forgeries.mutate import mutant
-from tests.forgeries.oracle import agrees
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.certificate import Verdict, check
+from nlsid_core.certificate.dyadic import is_positive_semidefinite
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, Undecided
+from tests.forgeries.genuine import genuine
+from tests.forgeries.mutate import mutant
+from tests.forgeries.oracle import agrees
 
 KINDS = ("bound", "factor", "domain", "sphere", "matrix", "attraction")
 MUTATIONS = 12_000
@@ -67,7 +69,8 @@ def main_gram(forged: Json) -> Json:
 def flip_an_entry(forged: Json) -> None:
     Q = main_gram(forged)["Q"]
     i, j = max(
-        ((i, j) for i in range(len(Q)) for j in range(i)), key=lambda at: abs(float(Q[at[0]][at[1]]))
+        ((i, j) for i in range(len(Q)) for j in range(i)),
+        key=lambda at: abs(float(Q[at[0]][at[1]])),
     )
     Q[i][j] = Q[j][i] = -Q[i][j]
 
@@ -186,9 +189,7 @@ def test_a_forgery_by_hand_is_refused(
         ("factor", "factor"),
     ],
 )
-def test_a_dropped_multiplier_is_refused(
-    kind: str, key: str, mode: Mode, tmp_path: Path
-) -> None:
+def test_a_dropped_multiplier_is_refused(kind: str, key: str, mode: Mode, tmp_path: Path) -> None:
     def drop(forged: Json) -> None:
         del forged["proof"][key]
 
@@ -240,7 +241,19 @@ def test_the_bound_cannot_be_raised_by_a_thousandth(tmp_path: Path) -> None:
         b"null",
         b'{"format": "nlsid/proof", "version": true}',
     ],
-    ids=["twice", "nan", "infinity", "1e999", "arrays", "objects", "bytes", "empty", "list", "null", "bool"],
+    ids=[
+        "twice",
+        "nan",
+        "infinity",
+        "1e999",
+        "arrays",
+        "objects",
+        "bytes",
+        "empty",
+        "list",
+        "null",
+        "bool",
+    ],
 )
 def test_what_is_no_document_is_refused(text: bytes, tmp_path: Path) -> None:
     with pytest.raises(CertificateRejected):
@@ -277,6 +290,38 @@ def test_a_digest_of_another_file_is_a_mismatch(tmp_path: Path) -> None:
         verdict_of(resealed(genuine()["bound"], bind), tmp_path)
 
 
+def test_a_monomial_stated_twice_is_refused(tmp_path: Path) -> None:
+    def split(forged: Json) -> None:
+        polynomial = forged["claim"]["polynomial"]
+        polynomial["exponents"].append(polynomial["exponents"][0])
+        polynomial["coefficients"].append(1e-30)
+
+    with pytest.raises(CertificateRejected, match="twice"):
+        verdict_of(resealed(genuine()["factor"], split), tmp_path)
+
+
+def test_a_proof_built_to_take_hours_is_left_undecided_in_seconds(tmp_path: Path) -> None:
+    """Singular, so only elimination could decide, with entries of thousands of bits."""
+    size = 120
+
+    def burden(forged: Json) -> None:
+        main_gram(forged).update(
+            basis=[[k + 1, 0] for k in range(size)],
+            Q=[[f"{i * j + 1}/{3**900}" for j in range(size)] for i in range(size)],
+        )
+        polynomial = forged["claim"]["polynomial"]
+        polynomial.update(exponents=[], coefficients=[])
+        forged["claim"]["bound"] = 0.0
+        forged["proof"]["multipliers"] = []
+
+    started = time.perf_counter()
+    with pytest.raises(CertificateRejected):
+        verdict_of(resealed(genuine()["bound"], burden), tmp_path)
+    with pytest.raises(Undecided, match="eliminate"):
+        is_positive_semidefinite([[(i * j + 1) * 3**900 for j in range(size)] for i in range(size)])
+    assert time.perf_counter() - started < 20
+
+
 def test_the_verdict_quotes_the_claim_and_not_the_file(tmp_path: Path) -> None:
     def boast(forged: Json) -> None:
         forged["claim"]["statement"] = "the robot is safe"
@@ -290,7 +335,7 @@ def refute_or_confirm(document: Json, folder: Path) -> str:
     answers = {}
     for mode in ("exact", "rigorous"):
         try:
-            verdict_of(document, folder, mode)  # type: ignore[arg-type]
+            verdict_of(document, folder, mode)
             answers[mode] = "proved"
         except Undecided:
             answers[mode] = "undecided"
