@@ -43,10 +43,11 @@ class MotionConfig(_Section):
 
 
 class DisturbanceConfig(_Section):
-    """form of the assumption; safety_factor over the largest commissioning run."""
+    """form of the assumption, rate if it is fading; safety_factor over the largest run."""
 
-    form: Literal["response", "peak"] = "response"
+    form: Literal["response", "peak", "energy", "fading"] = "response"
     safety_factor: float = Field(default=1.3, ge=1.0, allow_inf_nan=False)
+    rate: float = Field(default=1.0, gt=0.0, le=1.0)
 
 
 class SimulationConfig(_Section):

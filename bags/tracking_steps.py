@@ -144,6 +144,7 @@ def design_tracking_funnel(
         read_states(runs, config),
         form=options.form,
         safety_factor=options.safety_factor,
+        rate=options.rate,
     )
     made = design_state_funnel(model, policy, feedback, assumption=assumption, progress=progress)
     proof = made.proof_document(

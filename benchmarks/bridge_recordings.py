@@ -94,7 +94,7 @@ def attempt(
         error, stage = fit.error, STAGES[1]
         model = fit.model
         middle = np.mean(model.x_range, axis=1)
-        far = model.x_range[0, 0] + 0.6 * np.ptp(model.x_range[0])
+        far = model.x_range[0, 0] + 0.55 * np.ptp(model.x_range[0])
         motion = {"start": (middle[0], 0.0), "goal": (far, 0.0)}
         config = config.model_copy(update={"motion": config.motion.model_copy(update=motion)})
         tracking_steps.plan_tracking(out / documents.MODEL, config, out)
@@ -129,7 +129,7 @@ def _config(robot: str, joint: int, period: float, validation: list[Path]) -> Tr
                 "refuse_above": REFUSE_ABOVE,
                 "biased_without_repeats": True,
             },
-            "motion": {"start": (0.0, 0.0), "goal": (0.0, 0.0), "duration": 100 * period},
+            "motion": {"start": (0.0, 0.0), "goal": (0.0, 0.0), "duration": 200 * period},
         }
     )
 

@@ -10,16 +10,18 @@ from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnel import FORMAT, VERSION
 
 KIND = "discrete"
-FORMS = ("response", "peak")  # how the disturbance is bounded
+FORMS = ("response", "peak", "energy", "fading")  # how the disturbance is bounded
 
 
 @dataclass(frozen=True)
 class DisturbanceAssumption:
     """What the tube rests on: d_k = x̂_{k+1} - f(x̂_k, u_k), the observer's correction, stays small.
 
-    form `response`: r_{k+1} = A_k r_k + d_k, r_0 = 0, and |S_k r_k| ≤ bound. form `peak`:
-    |S_{k+1} d_k| ≤ bound. bound ≥ safety_factor · measured, measured being the largest over the
-    commissioning runs `measured_on` (name, digest), none of which the model was fitted on.
+    form `response`: r_{k+1} = A_k r_k + d_k, r_0 = 0, and |S_k r_k| ≤ bound. `peak`:
+    |S_{k+1} d_k| ≤ bound. `energy` and `fading`: E_{k+1} = rate·E_k + gain·|S_{k+1} d_k|²,
+    E_0 = 0, and √E_k ≤ bound; rate is 1 for `energy`, below 1 for `fading`. bound ≥ safety_factor ·
+    measured, measured being the largest over the commissioning runs `measured_on` (name, digest),
+    none of which the model was fitted on.
     """
 
     form: str
@@ -27,6 +29,13 @@ class DisturbanceAssumption:
     measured: float
     safety_factor: float
     measured_on: tuple[tuple[str, str], ...]
+    rate: float = 1.0
+    gain: float = 1.0
+
+    @property
+    def widens(self) -> float:
+        """What is added to a radius for it: the bound, but for `peak`, which is in the radius."""
+        return 0.0 if self.form == "peak" else self.bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +44,7 @@ class DiscreteFunnel:
 
     S: (N + 1, n, n), upper triangular, S'S the shape. A: (N, n, n), of the disturbance's response.
     tube: (N + 1,) radii of what starts with |S_0 x̄_0| ≤ tube_0 do; inlet: (N + 1,) radii from
-    which the goal inlet_N is reached. With the form `response` the radius is tube + bound. Radii
+    which the goal inlet_N is reached. Unless the form is `peak` the radius is tube + bound. Radii
     are in the norm of S, without unit. `model` and `policy` are digests.
 
     Raises ShapeError or DataError on numbers that do not fit.
@@ -85,7 +94,7 @@ class DiscreteFunnel:
     @property
     def margin(self) -> float:
         """What the disturbance adds to a radius."""
-        return self.assumption.bound if self.assumption.form == "response" else 0.0
+        return self.assumption.widens
 
     @property
     def half_widths(self) -> FloatArray:
@@ -100,12 +109,14 @@ class DiscreteFunnel:
             "format": FORMAT,
             "version": VERSION,
             "kind": KIND,
-            "set": "|S[k] (xhat - x[k])| <= tube[k] (+ bound, form response)",
+            "set": "|S[k] (xhat - x[k])| <= tube[k] (+ bound, unless form peak)",
             "model": self.model,
             "policy": self.policy,
             "assumption": {
                 "form": a.form,
                 "bound": a.bound,
+                "rate": a.rate,
+                "gain": a.gain,
                 "measured": a.measured,
                 "safety_factor": a.safety_factor,
                 "measured_on": [{"name": n, "digest": d} for n, d in a.measured_on],
@@ -133,6 +144,8 @@ class DiscreteFunnel:
             assumption=DisturbanceAssumption(
                 form=_json.member(nested, "form", str, source=where),
                 bound=_json.number(nested, "bound", source=where),
+                rate=_json.number(nested, "rate", source=where),
+                gain=_json.number(nested, "gain", source=where),
                 measured=_json.number(nested, "measured", source=where),
                 safety_factor=_json.number(nested, "safety_factor", source=where),
                 measured_on=tuple(_json.named_digests(runs, source=where)),

@@ -74,6 +74,28 @@ class StateObserver:
         return self.x
 
 
+class DisturbanceMeter:
+    """What an assumption bounds, sample by sample; see `DisturbanceAssumption`."""
+
+    def __init__(
+        self, S: FloatArray, A: FloatArray, form: str, rate: float = 1.0, gain: float = 1.0
+    ) -> None:
+        self._S, self._A, self._form, self._rate, self._gain = S, A, form, rate, gain
+        self._r: FloatArray = np.zeros(S.shape[1])
+        self._energy = 0.0
+
+    def update(self, k: int, d: FloatArray) -> float:
+        """The quantity at sample k > 0, d (n,) being the observer's correction there."""
+        size = float(np.linalg.norm(self._S[k] @ d))
+        if self._form == "peak":
+            return size
+        if self._form == "response":
+            self._r = self._A[k - 1] @ self._r + d
+            return float(np.linalg.norm(self._S[k] @ self._r))
+        self._energy = self._rate * self._energy + self._gain * size**2
+        return math.sqrt(self._energy)
+
+
 def disturbance_of(
     model: StateModel,
     policy: TrackingPolicy,
@@ -82,6 +104,8 @@ def disturbance_of(
     S: FloatArray,
     A: FloatArray,
     form: str = "response",
+    rate: float = 1.0,
+    gain: float = 1.0,
 ) -> FloatArray:
     """(N + 1,) what an assumption of this form bounds, along a run of the policy.
 
@@ -90,14 +114,13 @@ def disturbance_of(
     """
     if len(run) < len(policy):
         raise DataError(f"{run.name}: {len(run)} samples, the policy has {len(policy)} steps")
-    observer, r = StateObserver(model, policy.L), np.zeros(len(model))
+    observer, meter = StateObserver(model, policy.L), DisturbanceMeter(S, A, form, rate, gain)
     sizes = np.zeros(len(policy) + 1)
     last = min(len(run) - 1, len(policy))
     for k in range(last + 1):
         observer.update(run.y[k], run.u[k - 1] if k else None)
         if k:
-            r = A[k - 1] @ r + observer.d
-            sizes[k] = np.linalg.norm(S[k] @ (r if form == "response" else observer.d))
+            sizes[k] = meter.update(k, observer.d)
     return sizes
 
 
@@ -124,7 +147,8 @@ class TrackingMonitor:
     def restart(self) -> None:
         """Begin a new run."""
         self._observer = StateObserver(self.model, self.policy.L)
-        self._r = np.zeros(len(self.model))
+        a = self.funnel.assumption
+        self._meter = DisturbanceMeter(self.funnel.S, self.funnel.A, a.form, a.rate, a.gain)
         self._u_before: FloatArray | None = None
         self._k = 0
         self._last_t = -math.inf
@@ -168,12 +192,9 @@ class TrackingMonitor:
     def _judge(self, t: float, y: FloatArray, u: FloatArray | None) -> TrackingReading:
         k, funnel = self._k, self.funnel
         x = self._observer.update(y, self._u_before)
-        if k:
-            self._r = funnel.A[k - 1] @ self._r + self._observer.d
         x_bar, S = x - self.policy.x[k], funnel.S[k]
         size = float(np.linalg.norm(S @ x_bar))
-        watched = self._r if funnel.assumption.form == "response" else self._observer.d
-        disturbance = float(np.linalg.norm(S @ watched)) if k else 0.0
+        disturbance = self._meter.update(k, self._observer.d) if k else 0.0
         self._note_violations(t, k, size, disturbance, x, u)
         radius = float(self._radius[k])
         margin = 1.0 - size / radius

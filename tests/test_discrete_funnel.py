@@ -28,7 +28,7 @@ from tests.tracked import (
 )
 
 
-@pytest.mark.parametrize("form", ["response", "peak"])
+@pytest.mark.parametrize("form", ["response", "peak", "energy", "fading"])
 def test_a_funnel_of_a_nonlinear_model_is_proved_exactly(form: str, tmp_path: Path) -> None:
     verdict = check(write(designed(form), tmp_path))
     assert verdict.margin > 0
@@ -72,6 +72,38 @@ def test_the_worst_disturbance_inside_the_assumption_stays_in_the_tube(form: str
             assert size <= funnel.radius[k + 1]
             closest = max(closest, size / funnel.radius[k + 1])
     assert closest > 0.97
+
+
+@pytest.mark.parametrize("form", ["energy", "fading"])
+def test_disturbances_that_spend_their_energy_at_once_or_slowly_stay_in_the_tube(form: str) -> None:
+    design = designed(form)
+    funnel, policy, a = design.funnel, design.policy, design.funnel.assumption
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        z = rng.standard_normal(2)
+        x = policy.x[0] + np.linalg.solve(funnel.S[0], z / np.linalg.norm(z) * funnel.tube[0])
+        energy, share = 0.0, rng.uniform(0.05, 1.0)
+        for k in range(STEPS):
+            away = funnel.S[k + 1] @ (step(design, k, x) - policy.x[k + 1])
+            left = (0.999 * a.bound) ** 2 - a.rate * energy
+            d = np.sqrt(share * left / a.gain) * away / np.linalg.norm(away)
+            energy = a.rate * energy + a.gain * float(d @ d)
+            x = step(design, k, x) + np.linalg.solve(funnel.S[k + 1], d)
+            size = float(np.linalg.norm(funnel.S[k + 1] @ (x - policy.x[k + 1])))
+            assert size <= funnel.radius[k + 1]
+
+
+@pytest.mark.parametrize(("rate", "gain"), [(0.9, 90.0), (0.99, 5.0), (1.0, 90.0), (0.99, 0.5)])
+def test_a_fading_assumption_the_loop_does_not_keep_up_with_is_refused(
+    rate: float, gain: float, tmp_path: Path
+) -> None:
+    design = designed("fading" if rate < 1 else "energy")
+    changed = replace(design.funnel.assumption, rate=rate, gain=gain)
+    if rate == 1.0:
+        changed = replace(changed, rate=0.9)
+    proof = write(resigned(design, funnel=replace(design.funnel, assumption=changed)), tmp_path)
+    with pytest.raises(CertificateRejected, match=r"rate|gain"):
+        check(proof)
 
 
 def forged(design: FunnelDesign, what: str) -> FunnelDesign:

@@ -3,10 +3,12 @@
 With x̄ = x̂ - x_k and d_k the observer's correction, x̄⁺ = f̄_k(x̄) + d_k exactly. In the norms |S_k ·|:
 form `response`: ξ = x̄ - r, r⁺ = A_k r + d_k, |r| ≤ η. Where |ξ| ≤ s_k implies |f̄_k(ξ)| ≤ b_k,
     |ξ⁺| = |f̄_k(ξ + r) - A_k r| ≤ b_k + e_k(s_k, η) ≤ s_{k+1},
-so |x̄_k| ≤ s_k + η at every sample. Form `peak`: b_k + η ≤ s_{k+1}, and |x̄_k| ≤ s_k. b_k is proved
-by an identity (`reach.prove_reach`), e_k by the coefficients of f̄_k (`reach.curvature`). Both
-chains, the tube from its start and the inlet to its goal, stay in the box of the model's data,
-policy's inputs included, so the drives never saturate in the funnel.
+so |x̄_k| ≤ s_k + η at every sample. Form `peak`: b_k + η ≤ s_{k+1}, and |x̄_k| ≤ s_k. Forms `energy`
+and `fading`: ξ⁺ = f̄_k(ξ) undisturbed, b_k ≤ s_{k+1}; w = x̄ - ξ obeys |w⁺| ≤ μ_k|w| + |d|, hence
+|w⁺|² ≤ c/(c-1)·μ_k²|w|² + c|d|² ≤ λ|w|² + c|d|² where c μ_k² ≤ (c-1) λ, so that |w_k|² ≤ E_k ≤ η².
+b_k is proved by an identity (`reach.prove_reach`), e_k and μ_k by the coefficients of f̄_k
+(`reach.curvature`). Both chains, the tube from its start and the inlet to its goal, stay in the
+box of the model's data, policy's inputs included, so the drives never saturate in the funnel.
 Source: thesis Section 5.1 in discrete time.
 """
 
@@ -72,7 +74,7 @@ def prove_chains(
     if (np.tril(T, -1) != 0).any() or (np.diagonal(T, axis1=1, axis2=2) == 0).any():
         raise CertificateRejected("T should be upper triangular with a nonzero diagonal")
     margins = []
-    form, bound = funnel.assumption.form, funnel.assumption.bound
+    form = funnel.assumption.form
     for k in range(len(funnel) + 1):
         _refuse_box(model, policy, funnel, k)
     for k in range(len(funnel)):
@@ -87,9 +89,10 @@ def prove_chains(
         )
         exact_T, exact_S = reach.rational(T[k]), reach.rational(funnel.S[k])
         kappa = reach.inflation(exact_S @ exact_T)
-        if form == "response":
-            unit = reach.rational(funnel.S[k + 1]) @ reach.rational(funnel.A[k]) @ exact_T
-            curvature = reach.curvature(g, unit)
+        unit = reach.rational(funnel.S[k + 1]) @ reach.rational(funnel.A[k]) @ exact_T
+        curvature = (
+            {} if form == "peak" else reach.curvature(g, unit if form == "response" else 0 * unit)
+        )
         for chain, radii in zip(CHAINS, (funnel.tube, funnel.inlet), strict=True):
             step = steps[chain][k]
             try:
@@ -101,15 +104,36 @@ def prove_chains(
             except CertificateRejected as refusal:
                 raise type(refusal)(f"{chain}, step {k}: {refusal}") from refusal
             margins.append(margin)
-            added = Fraction(bound)
-            if form == "response":
-                added = reach.response_error(curvature, kappa, float(radii[k]), bound)
+            added = disturbed(funnel.assumption, curvature, kappa, float(radii[k]))
             if step.reach < 0 or Fraction(step.reach) + added > Fraction(float(radii[k + 1])):
                 raise CertificateRejected(
                     f"{chain}, step {k}: reach {step.reach:.6g} and disturbance {float(added):.3g} "
                     f"exceed the next radius {radii[k + 1]:.6g}"
                 )
     return min(margins)
+
+
+def disturbed(
+    a: DisturbanceAssumption,
+    curvature: Mapping[tuple[int, int], Fraction],
+    kappa: Fraction,
+    radius: float,
+) -> Fraction:
+    """What the disturbance adds to one step's reach from `radius`.
+
+    Raises CertificateRejected if deviations do not shrink as `energy` and `fading` need.
+    """
+    if a.form == "peak":
+        return Fraction(a.bound)
+    if a.form == "response":
+        return reach.response_error(curvature, kappa, radius, a.bound)
+    mu, c = reach.stretch(curvature, kappa, radius, a.bound), Fraction(a.gain)
+    if c * mu**2 > (c - 1) * Fraction(a.rate):
+        raise CertificateRejected(
+            f"deviations shrink by {float(mu):.6g} a step at radius {radius:.4g}, too little for "
+            f"rate {a.rate:g} and gain {a.gain:g}"
+        )
+    return Fraction(0)
 
 
 def refuse_assumption(model: StateModel, a: DisturbanceAssumption) -> None:
@@ -123,6 +147,8 @@ def refuse_assumption(model: StateModel, a: DisturbanceAssumption) -> None:
                 f"commissioning run {name} is a recording the model was fitted on: its disturbance "
                 "is too small; record the policy running"
             )
+    if not 0 < a.rate <= 1 or (a.form == "energy" and a.rate != 1) or a.gain < 1:
+        raise CertificateRejected(f"rate {a.rate:g} or gain {a.gain:g} is none of form {a.form}")
     if a.safety_factor < 1 or a.measured < 0:
         raise CertificateRejected(f"safety factor {a.safety_factor:g}, measured {a.measured:g}")
     if Fraction(a.bound) < Fraction(a.safety_factor) * Fraction(a.measured):
@@ -212,7 +238,7 @@ def _statement(model: StateModel, funnel: DiscreteFunnel, margin: float) -> Deci
         f"{signal.name} {width:.3g} {signal.unit}".rstrip()
         for signal, width in zip(model.x, funnel.half_widths[-1], strict=True)
     )
-    letter = {"response": "|r|", "peak": "|d|"}[a.form]
+    letter = {"response": "|r|", "peak": "|d|"}.get(a.form, "sqrt(E)")
     return Decision(
         statement=(
             f"funnel: from its inlet the state estimate stays in the tube for "

@@ -5,7 +5,7 @@ floats taken as the rationals they are. T is a rounded inverse of S: |z| ≤ κ|
 state are |x̄| = |S x̄| before the step and |x̄⁺| = |S⁺ x̄⁺| after it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from itertools import product as every
 from math import comb, factorial, isqrt, prod
@@ -146,11 +146,20 @@ def curvature(g: Rational, A_unit: Rational) -> dict[tuple[int, int], Fraction]:
 
 
 def response_error(
-    c: dict[tuple[int, int], Fraction], inflation: Fraction, radius: float, bound: float
+    c: Mapping[tuple[int, int], Fraction], inflation: Fraction, radius: float, bound: float
 ) -> Fraction:
     """Σ c_jl (κ·radius)^j (κ·bound)^l: what a response up to `bound` adds to one step's reach."""
     s, r = inflation * Fraction(radius), inflation * Fraction(bound)
     return sum((value * s**j * r**i for (j, i), value in c.items()), Fraction(0))
+
+
+def stretch(
+    c: Mapping[tuple[int, int], Fraction], inflation: Fraction, radius: float, bound: float
+) -> Fraction:
+    """μ with |g(z + w) - g(z)| ≤ μ|w| for |z| ≤ radius and |w| ≤ bound, c of A = 0."""
+    s, r = inflation * Fraction(radius), inflation * Fraction(bound)
+    terms = (value * s**j * r ** (i - 1) for (j, i), value in c.items())
+    return inflation * sum(terms, Fraction(0))
 
 
 def inflation(ST: Rational) -> Fraction:

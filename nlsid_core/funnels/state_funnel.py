@@ -13,9 +13,9 @@ import numpy as np
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import proof_document, reach
-from nlsid_core.certificate.discrete_funnel import CHAINS, StepProof, refuse_assumption
+from nlsid_core.certificate.discrete_funnel import CHAINS, StepProof, disturbed, refuse_assumption
 from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.motion import Feedback
 from nlsid_core.funnels.reach import Step
 from nlsid_core.state_model import StateModel
@@ -27,6 +27,8 @@ AIM = 1.0 - 5e-5  # of the next radius: where the search for a radius aims ...
 CLOSE = 1.0 - 4e-4  # ... and from where it is content
 ATTEMPTS = 8  # semidefinite programs a step; two or three are usual
 UP = 1.0 + 1e-12  # a radius written down is above its value by more than rounding
+BISECTIONS = 40
+SMALLEST = 1e-3  # of the box: below it no radius is worth having
 INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
 
 Progress = Callable[[str, float], None]
@@ -113,8 +115,7 @@ def design_state_funnel(
     """
     refuse_assumption(model, assumption)
     norms = frame(model, policy, feedback)
-    added = assumption.bound if assumption.form == "response" else 0.0
-    cap = norms.cap - added
+    cap = norms.cap - assumption.widens
     if np.min(cap) <= 0:
         k = int(np.argmin(cap))
         raise Infeasible(
@@ -122,6 +123,8 @@ def design_state_funnel(
             f"data ({norms.cap[k]:.3g}); record more widely, or disturb less"
         )
     steps = [_DisturbedStep.at(model, policy, norms, k, assumption) for k in range(len(policy))]
+    for k, step in enumerate(steps):
+        cap[k] = step.largest(float(cap[k]))
     inlet, inlet_proof = _inlet(steps, cap, goal, progress)
     first = float(inlet[0]) if start is None else start
     if not 0 < first <= inlet[0]:
@@ -149,15 +152,20 @@ def assume(
     *,
     form: str = "response",
     safety_factor: float = 1.5,
+    rate: float = 1.0,
 ) -> DisturbanceAssumption:
     """The bound that commissioning runs of the policy give: safety_factor times their largest.
+
+    rate: by which `fading` forgets a sample, below 1.
 
     Raises DataError if a run is shorter than the policy, CertificateRejected if one of them is a
     recording the model was fitted on.
     """
     norms = frame(model, policy, feedback)
+    gain = _gain(norms, rate) if form in ("energy", "fading") else 1.0
+    options = {"S": norms.S, "A": norms.A, "form": form, "rate": rate, "gain": gain}
     measured = max(
-        float(np.max(disturbance_of(model, policy, run, S=norms.S, A=norms.A, form=form)))
+        float(np.max(disturbance_of(model, policy, run, **options)))  # type: ignore[arg-type]
         for run in runs
     )
     assumption = DisturbanceAssumption(
@@ -166,6 +174,8 @@ def assume(
         measured=measured,
         safety_factor=safety_factor,
         measured_on=tuple((run.name, run.digest) for run in runs),
+        rate=rate,
+        gain=gain,
     )
     refuse_assumption(model, assumption)
     return assumption
@@ -181,9 +191,9 @@ class _DisturbedStep:
     """One step: its semidefinite program, and what the disturbance adds to its reach."""
 
     step: Step
-    curvature: dict[tuple[int, int], Fraction] | None
+    curvature: dict[tuple[int, int], Fraction]
     inflation: Fraction
-    bound: float
+    assumption: DisturbanceAssumption
 
     @classmethod
     def at(
@@ -204,20 +214,36 @@ class _DisturbedStep:
             S_next=norms.S[k + 1],
         )
         exact_T = reach.rational(norms.T[k])
-        curvature = None
-        if assumption.form == "response":
+        curvature = {}
+        if assumption.form != "peak":
             unit = reach.rational(norms.S[k + 1]) @ reach.rational(norms.A[k]) @ exact_T
-            curvature = reach.curvature(g, unit)
+            curvature = reach.curvature(g, unit if assumption.form == "response" else 0 * unit)
         kappa = reach.inflation(reach.rational(norms.S[k]) @ exact_T)
-        return cls(Step(g), curvature, kappa, assumption.bound)
+        return cls(Step(g), curvature, kappa, assumption)
 
     def from_radius(self, radius: float) -> tuple[StepProof, float]:
         """The proof of one step from `radius`, and the radius it needs next."""
         proof = self.step.reach(reach.inflate(self.inflation, radius))
-        added = Fraction(self.bound)
-        if self.curvature is not None:
-            added = reach.response_error(self.curvature, self.inflation, radius, self.bound)
+        added = disturbed(self.assumption, self.curvature, self.inflation, radius)
         return proof, float(Fraction(proof.reach) + added) * UP
+
+    def largest(self, cap: float) -> float:
+        """The largest radius up to `cap` at which the form's own condition holds."""
+        low, high = 0.0, cap
+        radius = cap  # usually there is nothing to search for
+        for _ in range(BISECTIONS):
+            try:
+                disturbed(self.assumption, self.curvature, self.inflation, radius)
+            except CertificateRejected as refusal:
+                if radius < SMALLEST * cap:
+                    raise Infeasible(f"{refusal}; use the form response") from refusal
+                high = radius
+            else:
+                low = radius
+            if low == cap:
+                break
+            radius = (low + high) / 2
+        return low
 
 
 def _inlet(
@@ -243,7 +269,7 @@ def _inlet(
         if best is None:
             raise Infeasible(
                 f"at sample {k} no radius fits in the next, {target:.3g}: the disturbance "
-                f"({steps[k].bound:.3g}) or the curvature is too large for this goal"
+                f"({steps[k].assumption.bound:.3g}) or the curvature is too large for this goal"
             )
         radii[k], growth = best[0], max(1e-3, best[0] / target)
         proofs.append(best[1])
@@ -262,6 +288,21 @@ def _tube(
         proofs.append(proof)
         progress("tube", (k + 1) / len(steps))
     return np.array(radii), proofs
+
+
+def _gain(norms: Frame, rate: float) -> float:
+    """c of E⁺ = rate·E + c|d|², with half of what the linear part leaves kept for curvature."""
+    linear = max(
+        float(np.linalg.norm(S @ A @ T, 2))
+        for S, A, T in zip(norms.S[1:], norms.A, norms.T, strict=True)
+    )
+    mu = (linear + np.sqrt(rate)) / 2
+    if linear >= np.sqrt(rate):
+        raise Infeasible(
+            f"the loop shrinks deviations by {linear:.4g} a sample; a rate of {rate:g} forgets "
+            f"faster; use one above {linear**2:.4g}"
+        )
+    return float(rate / (rate - mu**2))
 
 
 def _room(centre: FloatArray, ranges: FloatArray) -> FloatArray:

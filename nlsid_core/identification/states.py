@@ -33,7 +33,7 @@ class StateFit:
     """The model of least free-run error on validation data, and every class that was tried.
 
     errors: (degrees per variable, % in free run on the validation trajectories; infinite if it
-    diverged). error: the chosen model's.
+    diverged or was not determined). error: the chosen model's.
     """
 
     model: StateModel
@@ -74,13 +74,16 @@ def identify_states(
     for choice in degrees if degrees is not None else classes_to_try(n, p):
         exponents = _monomials(choice)
         theta = _instrumented(groups, exponents, scale)
+        if theta is None:
+            tried.append((tuple(choice), np.inf))
+            continue
         model = _model(train, groups, exponents, theta, scale, data)
         error = free_run_error(model, validation)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
             best = StateFit(model, error, ())
     if best is None or not best.error <= refuse_above:
-        reached = "nothing was tried" if best is None else f"the best gets {best.error:.3g} %"
+        reached = f"the best gets {best.error:.3g} %" if best else "the excitation determines none"
         raise DataError(
             f"no polynomial map describes this data to {refuse_above:g} % in free run ({reached}); "
             + ("" if best is None else where_it_fails(best.model, train))
@@ -152,8 +155,8 @@ def _features(exponents: IntArray, points: FloatArray) -> FloatArray:
 
 def _instrumented(
     groups: Sequence[Sequence[Trajectory]], exponents: IntArray, scale: FloatArray
-) -> FloatArray:
-    """θ (m, n) of x⁺ - x in monomials of the scaled variables."""
+) -> FloatArray | None:
+    """θ (m, n) of x⁺ - x in scaled monomials; None if the excitation does not determine it."""
     m, n = len(exponents), groups[0][0].y.shape[1]
     moments, target = np.zeros((m, m)), np.zeros((m, n))
     for members in groups:
@@ -166,11 +169,7 @@ def _instrumented(
             moments += instruments.T @ regressors
             target += instruments.T @ np.diff(member.y, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(moments, target, rcond=None)
-    if rank < m:
-        raise DataError(
-            f"the excitation determines {rank} of {m} monomials; excite more, or lower the degrees"
-        )
-    return np.asarray(solution)
+    return np.asarray(solution) if rank == m else None
 
 
 def _model(
