@@ -12,7 +12,13 @@ from nlsid_core.certificate import check, proof_document
 from nlsid_core.certificate.composed import compose
 from nlsid_core.certificate.discrete_funnel import StepProof
 from nlsid_core.certificate.reach import rational
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
+from nlsid_core.errors import (
+    CertificateMismatch,
+    CertificateRejected,
+    DataError,
+    Infeasible,
+    Undecided,
+)
 from nlsid_core.funnels.motion import plan_motion
 from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
 from nlsid_core.polynomial import Polynomial, compose_affine, monomials
@@ -219,6 +225,16 @@ def test_a_model_without_its_data_box_is_refused(key: str, tmp_path: Path) -> No
     whole["claim"]["about"]["model"]["digest"] = _json.digest(document)
     _json.write_document(proof, proof_document(whole["claim"], whole["proof"]))
     with pytest.raises(CertificateRejected, match=key):
+        check(proof)
+
+
+def test_a_model_made_to_keep_the_checker_busy_is_undecided_at_once(tmp_path: Path) -> None:
+    design = designed()
+    exponents = design.model.exponents.copy()
+    exponents[-1] = [15, 15, 0]
+    huge = resigned(design, model=replace(design.model, exponents=exponents))
+    proof = write(huge, tmp_path)
+    with pytest.raises(Undecided, match="order"):
         check(proof)
 
 

@@ -73,6 +73,7 @@ def prove_chains(
     """Prove both chains on plain numbers; the least margin of a Gram matrix. Raises on refusal."""
     if (np.tril(T, -1) != 0).any() or (np.diagonal(T, axis1=1, axis2=2) == 0).any():
         raise CertificateRejected("T should be upper triangular with a nonzero diagonal")
+    reach.refuse_size(model)
     margins = []
     form = funnel.assumption.form
     for k in range(len(funnel) + 1):

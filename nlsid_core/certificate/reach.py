@@ -17,8 +17,15 @@ from numpy.typing import NDArray
 from nlsid_core._types import FloatArray
 from nlsid_core.certificate.composed import compose
 from nlsid_core.certificate.exact import is_positive_definite
-from nlsid_core.certificate.identity import Mode, Product, decide_gram, decide_identity, one
-from nlsid_core.errors import CertificateRejected
+from nlsid_core.certificate.identity import (
+    MAX_ORDER,
+    Mode,
+    Product,
+    decide_gram,
+    decide_identity,
+    one,
+)
+from nlsid_core.errors import CertificateRejected, Undecided
 from nlsid_core.polynomial import Gram, Polynomial, monomials
 from nlsid_core.state_model import StateModel
 
@@ -32,6 +39,17 @@ def rational(values: FloatArray) -> Rational:
     exact = np.empty(values.shape, dtype=object)
     exact.ravel()[:] = [Fraction(entry) for entry in values.ravel().tolist()]
     return exact
+
+
+def refuse_size(model: StateModel) -> None:
+    """Raise Undecided, before any work, if a step's Gram matrices would be too large to decide."""
+    n, degree = len(model), int(np.max(model.exponents.sum(axis=1)))
+    order = comb(n + degree, n)
+    if order > MAX_ORDER:
+        raise Undecided(
+            f"{n} states and degree {degree} make Gram matrices of order {order}; this checker "
+            f"decides {MAX_ORDER}"
+        )
 
 
 def names_of(n: int) -> tuple[str, ...]:
