@@ -149,7 +149,8 @@ def main() -> None:
             out = Path(name) / f"out_{index}"
             results.append(attempt(bags, config, fitted, validating, out))
     for result in results:
-        print(f"{result.robot}: {result.refused_at or 'PROVED'}: {result.said}\n")
+        stage = f"refused at {result.refused_at}" if result.refused_at else "proved"
+        print(f"{result.robot} (free run {result.error:.3g} %), {stage}: {result.said}\n")
     if arguments.json:
         print(json.dumps({r.robot: r.refused_at or "proved" for r in results}))
 

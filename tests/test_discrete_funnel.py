@@ -231,7 +231,7 @@ def test_a_model_without_its_data_box_is_refused(key: str, tmp_path: Path) -> No
 def test_a_model_made_to_keep_the_checker_busy_is_undecided_at_once(tmp_path: Path) -> None:
     design = designed()
     exponents = design.model.exponents.copy()
-    exponents[-1] = [15, 15, 0]
+    exponents[-1] = [15, 15, 15]
     huge = resigned(design, model=replace(design.model, exponents=exponents))
     proof = write(huge, tmp_path)
     with pytest.raises(Undecided, match="order"):
