@@ -62,7 +62,7 @@ def identify_states(
     if not groups:
         raise DataError("no excitation was repeated; record each at least twice, same inputs")
     for members in groups:
-        _refuse_unequal(members)
+        refuse_unequal(members)
     first = groups[0][0]
     n, p = first.y.shape[1], first.u.shape[1]
     data = np.concatenate([np.hstack([m.y, m.u]) for group in groups for m in group])
@@ -72,7 +72,7 @@ def identify_states(
     best: StateFit | None = None
     tried: list[tuple[tuple[int, ...], float]] = []
     for choice in degrees if degrees is not None else classes_to_try(n, p):
-        exponents = _monomials(choice)
+        exponents = monomials_of(choice)
         theta = _instrumented(groups, exponents, scale)
         if theta is None:
             tried.append((tuple(choice), np.inf))
@@ -137,14 +137,14 @@ def where_it_fails(model: StateModel, dataset: Dataset) -> str:
     return words or "too little data to say where"
 
 
-def _monomials(degrees: Sequence[int]) -> IntArray:
+def monomials_of(degrees: Sequence[int]) -> IntArray:
     """All products with at most these powers, of total degree at most the largest."""
     powers = product(*(range(d + 1) for d in degrees))
     rows = [e for e in powers if sum(e) <= max(degrees)]
     return np.array(rows, dtype=np.int64)
 
 
-def _features(exponents: IntArray, points: FloatArray) -> FloatArray:
+def features(exponents: IntArray, points: FloatArray) -> FloatArray:
     values = np.ones((len(points), len(exponents)))
     for j, column in enumerate(points.T):
         values *= np.vander(column, int(np.max(exponents[:, j])) + 1, increasing=True)[
@@ -164,8 +164,8 @@ def _instrumented(
         for member in members:
             others = (total - member.y) / (len(members) - 1) if len(members) > 1 else total
             u = member.u[:-1]
-            instruments = _features(exponents, np.hstack([others[:-1], u]) / scale)
-            regressors = _features(exponents, np.hstack([member.y[:-1], u]) / scale)
+            instruments = features(exponents, np.hstack([others[:-1], u]) / scale)
+            regressors = features(exponents, np.hstack([member.y[:-1], u]) / scale)
             moments += instruments.T @ regressors
             target += instruments.T @ np.diff(member.y, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(moments, target, rcond=None)
@@ -187,7 +187,7 @@ def _model(
         unit = (exponents == np.eye(exponents.shape[1], dtype=np.int64)[i]).all(axis=1)
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
-    noise = _noise(groups)
+    noise = noise_between(groups)
     signals = [
         tuple(Signal(*entry) for entry in zip(names, units, paths, strict=True))
         for names, units, paths in (
@@ -210,7 +210,7 @@ def _model(
     return _with_disturbance(model, groups)
 
 
-def _noise(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
+def noise_between(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
     """(n,) standard deviation: between repeats, or of third differences where there are none."""
     variances = [
         np.var([m.y for m in group], axis=0, ddof=1).mean(axis=0)
@@ -234,7 +234,7 @@ def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]])
     return replace(model, disturbance=np.sqrt(variance))
 
 
-def _refuse_unequal(members: Sequence[Trajectory]) -> None:
+def refuse_unequal(members: Sequence[Trajectory]) -> None:
     first = members[0]
     for other in members[1:]:
         if len(other) != len(first):
