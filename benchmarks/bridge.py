@@ -41,7 +41,6 @@ from nlsid_core.trajectory import Dataset
 START = 0.97  # of the inlet's level, on which the runs start
 COMMISSIONING = 30  # runs the assumption is measured on
 LEVEL_OF_COMMISSIONING = 0.25  # of the undisturbed inlet's level, at most, where they start
-SAFETY_FACTOR = 1.3
 INPUT_WEIGHT = 0.3  # against the state's, in units of the data box
 HEAVIER = 1.3
 
@@ -55,6 +54,7 @@ class Task:
     steps: int
     push: tuple[float, ...]
     push_at: int
+    safety_factor: float
     published: dict[str, str]
 
 
@@ -65,6 +65,7 @@ TASKS = {
         steps=150,
         push=(60.0,),
         push_at=30,
+        safety_factor=1.3,
         published={"free_run_percent": "0.55", "design_seconds": "<= 30", "tube_floor_mrad": "7"},
     ),
     "arm": Task(
@@ -73,6 +74,7 @@ TASKS = {
         steps=100,
         push=(5.0, 0.0),
         push_at=30,
+        safety_factor=1.2,
         published={
             "free_run_percent": "3.2-5.5",
             "design_seconds": "<= 90",
@@ -165,7 +167,7 @@ def designed(robot: Robot, task: Task, model: StateModel, seed: int) -> Made:
         for i, radius in enumerate(radii)
     ]
     assumption = assume(
-        model, policy, feedback, Dataset(tuple(commissioning)), safety_factor=SAFETY_FACTOR
+        model, policy, feedback, Dataset(tuple(commissioning)), safety_factor=task.safety_factor
     )
     started, cpu = time.perf_counter(), time.process_time()
     design = design_state_funnel(model, policy, feedback, assumption=assumption)

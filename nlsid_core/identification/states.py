@@ -145,6 +145,7 @@ def monomials_of(degrees: Sequence[int]) -> IntArray:
 
 
 def features(exponents: IntArray, points: FloatArray) -> FloatArray:
+    """(N, m) values of the monomials (m, k) at points (N, k)."""
     values = np.ones((len(points), len(exponents)))
     for j, column in enumerate(points.T):
         values *= np.vander(column, int(np.max(exponents[:, j])) + 1, increasing=True)[
