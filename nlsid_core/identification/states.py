@@ -236,6 +236,7 @@ def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]])
 
 
 def refuse_unequal(members: Sequence[Trajectory]) -> None:
+    """Raise DataError unless all have the length and the inputs of the first."""
     first = members[0]
     for other in members[1:]:
         if len(other) != len(first):
