@@ -13,7 +13,7 @@ from rosbags.typesys.store import Typestore
 from bags.batch import Batch
 from bags.folders import COMPRESSED, bag_files
 from bags.mcap_file import MAGIC
-from bags.message_types import types_in_bag
+from bags.message_types import are_same, types_in_bag
 from bags.names import did_you_mean, listed
 from bags.storage import Channel, McapStorage, RosbagsStorage, Storage
 from bags.writer import CUSTOM_DATA
@@ -115,7 +115,7 @@ class Bag:
             types = [types_in_bag(channel.msgtype, channel.definition) for channel in found]
         except BagError as error:
             raise BagError(f"{self.path}: {topic}: {error}") from error
-        if any(other is not types[0] for other in types):
+        if not all(are_same(types[0], other) for other in types):
             raise BagError(f"{self.path}: {topic} has parts with different definitions of its type")
         return found[0].msgtype, types[0]
 

@@ -31,6 +31,7 @@ def show_info(console: Console, info: BagInfo) -> None:
         f"{info.duration:.3f} s, {files}, {info.size / 1e6:.2f} MB",
         soft_wrap=True,
         markup=False,
+        highlight=False,
     )
     if info.ending is not None:
         _say(console, f"unfinished: {info.ending}; `nlsid bag recover` makes a whole bag of it")
@@ -42,7 +43,7 @@ def show_info(console: Console, info: BagInfo) -> None:
     for topic in info.topics:
         table.add_row(
             Text(topic.topic),
-            Text(topic.msgtype),
+            Text(topic.msgtype.replace("/msg/", "/")),
             str(topic.count),
             "-" if math.isnan(topic.rate) else f"{topic.rate:.4g} Hz",
             topic.jitter,
@@ -56,7 +57,7 @@ def show_info(console: Console, info: BagInfo) -> None:
             _say(console, f"{topic.topic}: {what}")
     for key, value in info.custom.items():
         _say(console, f"{key}: {value}")
-    console.print(JITTER_KEY, style="dim")
+    console.print(JITTER_KEY, style="dim", highlight=False)
 
 
 def signals_table(bag: Bag) -> Table:

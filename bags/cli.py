@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from bags import documents, show
 from bags.bag_cli import bag_app
@@ -15,7 +16,7 @@ from bags.folders import expand_bags
 from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
-from bags.steps import design_funnel_files, identify_bags
+from bags.steps import compare_bags, design_funnel_files, identify_bags
 from bags.tracking_cli import app as track_app
 from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
@@ -55,6 +56,24 @@ def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> No
         out.print(f"wrote {file}", soft_wrap=True)
     if not report_available():
         out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+
+
+@app.command()
+def compare(
+    bags: BagsArgument,
+    config: ConfigOption,
+    lags: Annotated[
+        list[int] | None,
+        typer.Option(help="Numbers of lags to try, repeatable; default the configuration's."),
+    ] = None,
+) -> None:
+    """Score every method on the same test bags: simulation, prediction, residual tests, proof."""
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    with progress_bar("comparing") as progress:
+        tried = lags or [settings.identification.lags]
+        compared = compare_bags(folders, settings, tried, progress=progress)
+    out.print(show.comparison_table(compared))
 
 
 @app.command()
@@ -164,7 +183,7 @@ def main() -> None:
     try:
         app()
     except NlsidError as error:
-        err.print(f"[red]error:[/red] {error}", soft_wrap=True, markup=True, highlight=False)
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
         sys.exit(1)
     except OSError as error:
         err.print(f"error: {error}", soft_wrap=True, markup=False, highlight=False)

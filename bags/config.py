@@ -8,6 +8,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from nlsid_core.errors import DataError
+from nlsid_core.identification import LinearClass, ModelClass, StateAffineClass
 from nlsid_core.models import Signal
 from nlsid_core.monitor import Nominal
 
@@ -60,10 +61,34 @@ class SplitConfig(_Section):
 
 
 class IdentificationConfig(_Section):
-    """lags n of the difference equation; the most iterates of the robust simulation error."""
+    """lags n of the difference equation; the most iterates of the robust simulation error.
+
+    model: `linear`, or `state_affine` with polynomial degrees in the window of inputs (see
+    `StateAffineClass`); input_range: to which that model clips its input (default: the data's).
+    method: which candidate is kept.
+    """
 
     lags: int = Field(ge=1, le=100)
     iterations: int = Field(default=40, ge=1, le=1000)
+    model: Literal["linear", "state_affine"] = "linear"
+    method: Literal["least_squares", "rie", "rse_first", "rse", "rse_certified", "sem"] = "rse"
+    leading_degree: int = Field(default=0, ge=0, le=5)
+    lagged_degree: int = Field(default=0, ge=0, le=5)
+    right_degree: int = Field(default=1, ge=0, le=5)
+    input_range: Corner | None = None
+
+    @property
+    def model_class(self) -> ModelClass:
+        """The same as the core's noun."""
+        if self.model == "linear":
+            return LinearClass(self.lags)
+        return StateAffineClass(
+            self.lags,
+            leading_degree=self.leading_degree,
+            lagged_degree=self.lagged_degree,
+            right_degree=self.right_degree,
+            u_range=None if self.input_range is None else (self.input_range,),
+        )
 
 
 class LqrConfig(_Section):

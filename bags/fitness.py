@@ -15,10 +15,11 @@ from scipy.signal import welch
 
 from bags.bag import Bag
 from bags.columns import expand_paths, read_columns
+from bags.delays import delay
 from bags.reader import HEADER_STAMP, Samples, read_signals
 from bags.repeats import find_period, same_excitation
 from bags.signals import SignalPath
-from bags.timing import clock_relation, delay
+from bags.timing import clock_relation
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import BagError, DataError
 

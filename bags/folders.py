@@ -1,5 +1,6 @@
 """Which bags a person means by a path, and which files a bag is made of."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +37,8 @@ class BagFiles:
 def expand_bags(paths: Iterable[Path]) -> list[Path]:
     """Each path that is a bag itself, and the bags directly in each path that is not, by name.
 
+    A folder without metadata.yaml is a bag if its files are numbered as the parts of one.
+
     Raises BagError for a path that is not there or holds no bag.
     """
     found: list[Path] = []
@@ -45,7 +48,11 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
         if path.is_file() or _is_bag(path):
             found.append(path)
             continue
-        inside = sorted(p for p in path.iterdir() if p.is_dir() and _is_bag(p))
+        inside = sorted(
+            p
+            for p in path.iterdir()
+            if (p.is_dir() and _is_bag(p)) or (p.is_file() and p.suffix in DATA_FILES)
+        )
         if not inside:
             raise BagError(f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)})")
         found += inside
@@ -132,8 +139,8 @@ def _inside(folder: Path, name: str, version: int) -> Path:
     file = folder / name
     if version < 4:  # these named the file from the folder above
         file = folder / Path(name).name
-    file_there, home = file.resolve(), folder.resolve()
-    if not file_there.is_relative_to(home):
+    there, home = Path(os.path.realpath(file)), folder.resolve()  # realpath bears loops of links
+    if not there.is_relative_to(home):
         raise _bad(folder / METADATA, f"it names {name}, which is outside the bag")
     if not file.is_file():
         raise _bad(folder / METADATA, f"it names {name}, which is not there")
@@ -145,4 +152,11 @@ def _bad(file: Path, what: str) -> BagError:
 
 
 def _is_bag(folder: Path) -> bool:
-    return (folder / METADATA).is_file() or any(p.suffix in DATA_FILES for p in folder.iterdir())
+    if (folder / METADATA).is_file():
+        return True
+    stems = sorted(p.stem for p in folder.iterdir() if p.suffix in DATA_FILES)
+    if len(stems) < 2:
+        return bool(stems)
+    numbered = [stem.rpartition("_") for stem in stems]
+    one_name = len({name for name, _, _ in numbered}) == 1
+    return one_name and {number for *_, number in numbered} == set(map(str, range(len(stems))))

@@ -27,7 +27,9 @@ from nlsid_core.errors import BagError
 HEADER: Final = "std_msgs/msg/Header"
 IDL_SEPARATOR: Final = "=" * 80 + "\n"
 ROS1_DIFFERS: Final = (HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-MAX_FIXED_ARRAY: Final = 2**16  # rosbags writes a line of code per element; none in use is near it
+MAX_FIXED_ARRAY: Final = 2**16  # numbers
+MAX_UNROLLED: Final = 1024  # strings or messages: rosbags writes lines of code for each of them
+MAX_ELEMENTS: Final = 2**16  # of a whole message, arrays in arrays multiplied out
 
 _TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
 _FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -92,7 +94,7 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
     standard = standard_types().fielddefs
     with _defining(msgtype):
         parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
-        _refuse_odd_names(parsed)
+        _refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         text, _ = types.generate_msgdef(msgtype, ros_version=2)
@@ -117,11 +119,16 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
             for name, (_, fields) in parsed.items()
         ):
             return standard
-        _refuse_odd_names(parsed)
+        _refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(msgtype)
     return types
+
+
+def are_same(first: Typestore, second: Typestore) -> bool:
+    """Whether two results of `types_in_bag` define the same, however their texts differ."""
+    return first is second or first.fielddefs == second.fielddefs
 
 
 @contextmanager
@@ -162,8 +169,25 @@ def _completed(parsed: Typesdict) -> Typesdict:
     return complete
 
 
-def _refuse_odd_names(types: Typesdict) -> None:
-    """rosbags turns definitions into code, so from a bag only plain names may reach it."""
+def _elements(name: str, types: Typesdict, sizes: dict[str, int]) -> int:
+    """How many fields a message has, those of messages in it and in fixed arrays multiplied out."""
+    if name not in sizes:
+        total = 0
+        for _, description in types[name][1] if name in types else ():
+            times = int(str(description[1][1])) if description[0] == Nodetype.ARRAY else 1
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            if description[0] == Nodetype.NAME:
+                total += times * _elements(str(description[1]), types, sizes)
+            total += 1
+        if total > MAX_ELEMENTS:
+            raise ValueError(f"'{name}' has more than {MAX_ELEMENTS} fields")
+        sizes[name] = total
+    return sizes[name]
+
+
+def _refuse_what_code_cannot_be(types: Typesdict) -> None:
+    """rosbags turns definitions into code: from a bag only plain names and sane sizes reach it."""
     for name, (constants, fields) in types.items():
         if not _TYPE_NAME.fullmatch(name):
             raise ValueError(f"{name!r} is not a type name")
@@ -172,9 +196,14 @@ def _refuse_odd_names(types: Typesdict) -> None:
                 raise ValueError(f"{field!r} is not a field name")
         for _, description in fields:
             if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-                length = description[1][1]
-                if not isinstance(length, int) or not 0 <= length <= MAX_FIXED_ARRAY:
-                    raise ValueError(f"an array of {length} elements")
-                description = description[1][0]
+                is_array, (element, length) = description[0] == Nodetype.ARRAY, description[1]
+                numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
+                most = MAX_FIXED_ARRAY if numbers else MAX_UNROLLED
+                if is_array and not (isinstance(length, int) and 0 <= length <= most):
+                    raise ValueError(f"an array of {length} elements; at most {most} are read")
+                description = element
             if description[0] == Nodetype.NAME and not _TYPE_NAME.fullmatch(str(description[1])):
                 raise ValueError(f"{description[1]!r} is not a type name")
+    sizes: dict[str, int] = {}
+    for name in types:
+        _elements(name, types, sizes)

@@ -12,7 +12,8 @@ from rosbags.typesys.store import Typestore
 from bags.bag import Bag
 from bags.columns import Columns, Progress, expand_paths, read_columns
 from bags.expressions import Expression
-from nlsid_core._types import FloatArray, IntArray
+from bags.timing import without_duplicates
+from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
 
 HEADER_STAMP: Final = "header stamp"
@@ -49,6 +50,7 @@ def read_signals(
     *,
     clock: str | None = None,
     sort: bool = False,
+    drop_duplicates: bool = False,
     unfinished: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Samples]:
@@ -56,6 +58,7 @@ def read_signals(
 
     clock: which times are the stamps (None: header stamps, log time for types without a header).
     sort: put messages in the order of their stamps instead of refusing stamps that go back.
+    drop_duplicates: of messages with one stamp keep the first.
     unfinished: read what there is of a recording that was not closed.
     `[*]` gives one entry per element. Every path is checked against the types in the bag before a
     message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
@@ -81,6 +84,8 @@ def read_signals(
         for topic, found in columns.items():
             topics[topic] = _Topic(source, found, clock, sort=sort)
             topics[topic].check_stamps(source.count(topic))
+            if drop_duplicates:
+                topics[topic].drop_duplicates()
         samples = {}
         for name, expression in wanted.items():
             recorded = topics[expression.path.topic].samples(name)
@@ -89,14 +94,24 @@ def read_signals(
 
 
 def bag_digest(bag: Path | str) -> str:
-    """`sha256:<hex>` of the bag's data file (of its data files, joined in the order of names)."""
-    with Bag(bag) as source:
+    """`sha256:<hex>` of the bag's data file (of its data files, joined in their order)."""
+    digest: str = bag_origin(bag)["digest"]
+    return digest
+
+
+def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
+    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data."""
+    with Bag(bag, unfinished=unfinished) as source:
         digest = hashlib.sha256()
         for file in source.files:
             with file.open("rb") as stream:
                 while block := stream.read(2**20):
                     digest.update(block)
-    return f"sha256:{digest.hexdigest()}"
+        return {
+            "digest": f"sha256:{digest.hexdigest()}",
+            "files": {file.name: file.stat().st_size for file in source.files},
+            "custom": source.custom,
+        }
 
 
 def bag_metadata(bag: Path | str) -> dict[str, str]:
@@ -179,6 +194,12 @@ class _Topic:
                 f"{stamp_text(int(stamps[i + 1]))} "
                 f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
             )
+
+    def drop_duplicates(self) -> None:
+        kept = without_duplicates(self._stamps)
+        if len(kept) < len(self._stamps):
+            self._stamps = self._stamps[kept]
+            self._values = {name: values[kept] for name, values in self._values.items()}
 
     def samples(self, name: str) -> Samples:
         values = self._values[name]

@@ -39,10 +39,10 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
     files = _files(path)
     lost: list[str] = []
     sums: dict[str, tuple[int, int]] = {}
-    total, done = sum(file.stat().st_size for file in files), 0
+    sizes = [file.stat().st_size for file in files]
     with BagWriter(out, custom=_custom(path)) as writer:
-        for file in files:
-            for channel, batch in _messages(path, file, lost):
+        for k, file in enumerate(files):
+            for channel, batch in _messages(file, lost):
                 try:
                     writer.add_topic(channel.topic, channel.msgtype, like=channel)
                     if batch is not None:
@@ -50,9 +50,8 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
                 except BagError as error:
                     count = 0 if batch is None else len(batch)
                     lost.append(f"{file.name}: {count} messages: {error}")
-            done += file.stat().st_size
             if progress is not None:
-                progress(done, total)
+                progress(sum(sizes[: k + 1]), sum(sizes))
         if not sums and lost:
             raise BagError(f"{path}: no message can be read: {'; '.join(lost[:5])}")
         counts = dict(writer.counts)
@@ -61,12 +60,13 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
 
 
 def _files(path: Path) -> list[Path]:
-    """The data files that are there, also if the metadata beside them are damaged or missing."""
+    """The MCAP files that are there, also if the metadata are damaged; else the bag as it is."""
+    found = [path]
     if path.is_dir():
-        found = sorted(p for p in path.iterdir() if p.suffix == ".mcap" and p.is_file())
-        if found:
-            return found
-    return list(bag_files(path).files)
+        found = sorted(p for p in path.iterdir() if p.suffix == ".mcap" and p.is_file()) or found
+    elif not path.is_file():
+        raise BagError(f"there is no bag {path}; name a rosbag2 folder or an .mcap file")
+    return found
 
 
 def _custom(path: Path) -> dict[str, str]:
@@ -76,10 +76,10 @@ def _custom(path: Path) -> dict[str, str]:
         return {}  # damaged metadata; an MCAP file carries its own
 
 
-def _messages(path: Path, file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch | None]]:
+def _messages(file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch | None]]:
     """Every channel once without a batch, then the batches."""
-    if file.suffix != ".mcap":
-        with Bag(path, unfinished=True) as bag:
+    if file.is_dir() or file.suffix in (".db3", ".bag"):
+        with Bag(file, unfinished=True) as bag:
             yield from ((channel, None) for channel in bag.channels)
             yield from bag.batches()
         return

@@ -6,8 +6,9 @@ from rich.table import Table
 
 from bags.config import Config
 from bags.replay import Replay
+from bags.steps import Compared
 from nlsid_core.funnels import TubeDesign
-from nlsid_core.identification import Fit
+from nlsid_core.identification import AnyFit
 from nlsid_core.monitor import Nominal, Status
 from nlsid_core.trajectory import Dataset
 
@@ -19,7 +20,7 @@ COLOURS = {
 }
 
 
-def methods_table(fit: Fit, test: Dataset) -> Table:
+def methods_table(fit: AnyFit, test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{len(fit.model)} lags, {len(test)} test trials", title_justify="left")
     table.add_column("method")
@@ -34,6 +35,33 @@ def methods_table(fit: Fit, test: Dataset) -> Table:
             f"{candidate.seconds * 1e3:.0f} ms",
             "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
             style="bold" if chosen else "",
+        )
+    return table
+
+
+def comparison_table(compared: Compared) -> Table:
+    """Every method at every number of lags, scored on the same test trials."""
+    table = Table(title=f"{len(compared.test)} test trials", title_justify="left")
+    table.add_column("lags", justify="right")
+    table.add_column("method")
+    table.add_column("simulation", justify="right")
+    horizons = list(compared.rows[0][1].prediction_percent)
+    for horizon in horizons:
+        table.add_column(f"{horizon} ahead", justify="right")
+    for name in ("residual", "stability"):
+        table.add_column(name)
+    table.add_column("time", justify="right")
+    for candidate, scores in compared.rows:
+        flaws = [] if scores.white else ["not white"]
+        flaws += [] if scores.independent else ["follows the input"]
+        table.add_row(
+            str(len(candidate.model)),
+            candidate.method,
+            f"{scores.simulation_percent:.2f} %",
+            *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),
+            ", ".join(flaws) or "white, independent",
+            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
+            f"{candidate.seconds * 1e3:.0f} ms",
         )
     return table
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from bags.plants import PERIOD, Plant, Robot
 from nlsid_core._types import FloatArray
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_monitor import StateObserver
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset, Trajectory

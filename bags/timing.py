@@ -1,11 +1,10 @@
-"""The clocks of a recording: offset and drift between them, gaps, duplicates, delays."""
+"""The clocks of a recording: offset and drift between them, gaps, duplicates."""
 
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from scipy.signal import correlate, correlation_lags
 
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError
@@ -13,6 +12,7 @@ from nlsid_core.errors import DataError
 SEGMENTS: Final = 50  # of the recording, each giving its least latency to the line of the drift
 SAME_CLOCK: Final = 1.0  # s; latencies stay below, an offset between clocks rarely does
 DRIFT_SIGNIFICANT: Final = 5.0  # times the scatter of the segments about the line
+OWN_PACE: Final = 1e-3  # s per s; two real clocks differ by less
 DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency says nothing
 
 
@@ -40,6 +40,8 @@ class ClockRelation:
             return (
                 f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
             )
+        if abs(self.drift) > OWN_PACE:
+            return f"stamps run at {1 + self.drift:.3g} times the pace of log time: simulated time?"
         drift = f", drifting {1e6 * self.drift:+.3g} ppm" if self.drift else ", constant"
         return f"stamps {self.offset:+.3f} s from log time{drift}"
 
@@ -90,40 +92,3 @@ def segments(stamp_ns: IntArray, max_gap: float) -> list[tuple[int, int]]:
 def without_duplicates(stamp_ns: IntArray) -> IntArray:
     """Indices of the first message of each stamp (stamps sorted)."""
     return np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[:1] - 1) > 0).astype(np.int64)
-
-
-@dataclass(frozen=True)
-class Delay:
-    """seconds: by which the response follows the command. correlation: there, -1 to 1."""
-
-    seconds: float
-    correlation: float
-
-
-def delay(command: FloatArray, response: FloatArray, period: float, max_delay: float) -> Delay:
-    """The delay (N,) samples `period` s apart show: where command and response correlate most.
-
-    Of two signals on one grid the normalised cross-correlation about their means, over delays from
-    0 to `max_delay` s, refined by a parabola through its peak. A lag in the response counts as
-    part of the delay. Raises DataError if either is constant or `max_delay` leaves no overlap.
-
-    Source: C. Knapp, G. Carter, IEEE Trans. ASSP 24 (1976) 320, the unweighted correlator.
-    """
-    most = min(round(max_delay / period), len(command) - 2)
-    if most < 1 or len(command) != len(response):
-        raise DataError(f"{len(command)} samples leave no delay of up to {max_delay:g} s to find")
-    u, y = command - command.mean(), response - response.mean()
-    if not (u @ u > 0 and y @ y > 0):
-        raise DataError("a constant signal has no delay")
-    lags = correlation_lags(len(y), len(u))
-    wanted = (lags >= 0) & (lags <= most)
-    overlap = len(u) - lags[wanted]
-    found = correlate(y, u, method="fft")[wanted] * (len(u) / overlap)
-    found = found / np.sqrt((u @ u) * (y @ y))
-    k = int(np.argmax(np.abs(found)))
-    shift = 0.0
-    if 0 < k < len(found) - 1:
-        before, here, after = np.abs(found[k - 1 : k + 2])
-        bend = before - 2 * here + after
-        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return Delay((k + shift) * period, float(np.clip(found[k], -1.0, 1.0)))

@@ -19,7 +19,7 @@ from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.funnels.state_funnel import FunnelDesign, assume, design_state_funnel, frame
 from nlsid_core.identification.states import StateFit, identify_states
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_monitor import TrackingMonitor, TrackingReading
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset

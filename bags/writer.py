@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Final
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from bags.message_types import definition
+from bags.message_types import are_same, definition, types_in_bag
 from bags.storage import FORMATS, Channel
 from nlsid_core._json import write_atomically
 from nlsid_core.errors import BagError
@@ -54,6 +54,7 @@ class BagWriter:
         self._types: dict[str, str] = {}
         self._hashes: dict[str, str] = {}
         self._encodings: dict[str, str] = {}
+        self._like: dict[str, Channel] = {}
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels: dict[str, int] = {}
         self._custom = dict(custom or {})
@@ -96,6 +97,8 @@ class BagWriter:
                     f"{self.path}: {topic} holds '{self._types[topic]}', not '{msgtype}'; "
                     "a topic has one type"
                 )
+            if like is not None and self._like.setdefault(topic, like) is not like:
+                self._refuse_another(self._like[topic], like)
             return
         if like is None:
             text, type_hash = definition(msgtype)
@@ -104,11 +107,24 @@ class BagWriter:
         else:
             schema, encoding = self._schema_like(like), like.encoding
             metadata = dict(like.metadata)
+            self._like[topic] = like
         self._channels[topic] = self._mcap.register_channel(topic, encoding, schema, metadata)
         self._types[topic] = msgtype
         self._hashes[topic] = metadata.get("topic_type_hash", "")
         self._encodings[topic] = encoding
         self.counts[topic] = 0
+
+    def _refuse_another(self, first: Channel, second: Channel) -> None:
+        """BagError if two channels copied to one topic were written with different definitions."""
+        if first.encoding == second.encoding and (
+            first.definition == second.definition
+            or are_same(*(types_in_bag(c.msgtype, c.definition) for c in (first, second)))
+        ):
+            return
+        raise BagError(
+            f"{self.path}: {first.topic} comes with two definitions of '{first.msgtype}'; keep "
+            "them in two bags"
+        )
 
     def _schema_like(self, like: Channel) -> int:
         if not like.definition.data and like.encoding == "cdr":

@@ -33,8 +33,8 @@ from nlsid_core.funnels.state_funnel import (
     undisturbed,
 )
 from nlsid_core.identification.states import free_run_error, identify_states
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.monitor import Status
-from nlsid_core.state_model import StateModel
 from nlsid_core.tracking_monitor import TrackingMonitor
 from nlsid_core.trajectory import Dataset
 

@@ -3,7 +3,7 @@
 from bags.grid import read_dataset
 from bags.samples import f1tenth
 from nlsid_core.funnels import design_tube
-from nlsid_core.identification import identify, simulation_error_percent
+from nlsid_core.identification import LinearClass, identify, simulation_percent
 from nlsid_core.monitor import Monitor, Status
 
 TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
@@ -15,7 +15,7 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
     dataset = read_dataset(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
     train, test = dataset.without(TEST), dataset.select(TEST)
 
-    fit = identify(train, lags=4)
+    fit = identify(train, LinearClass(4))
     design = design_tube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)], horizon=2.9)
 
     inside = 0
@@ -25,7 +25,7 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
         readings = [monitor.update(t, y, u) for t, y, u in samples]
         inside += all(r.status in (Status.INSIDE, Status.UNKNOWN) for r in readings)
 
-    error = simulation_error_percent(fit.model, test)
+    error = simulation_percent(fit.model, test)
     return {"error": error, "inside": inside}, {"error": 8.5, "inside": 8}
 
 

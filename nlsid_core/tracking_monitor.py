@@ -16,8 +16,8 @@ from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.discrete_funnel import DiscreteFunnel
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE, Status
-from nlsid_core.state_model import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Trajectory
 

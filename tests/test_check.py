@@ -13,6 +13,7 @@ from nlsid_core.certificate import check, proof_document
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.funnels import TubeDesign
 from nlsid_core.identification import Fit
+from nlsid_core.models import DifferenceEquation
 
 
 def rewrite(path: Path, document: Json) -> None:
@@ -45,7 +46,9 @@ def rebind(folder: Path) -> tuple[Json, Json, Json]:
     return model, policy, funnel
 
 
-def test_both_proofs_are_proved_and_say_of_what(design_folder: Path, fit: Fit) -> None:
+def test_both_proofs_are_proved_and_say_of_what(
+    design_folder: Path, fit: Fit[DifferenceEquation]
+) -> None:
     stability = check(design_folder / MODEL_PROOF)
     assert str(stability).startswith("PROVED incremental stability")
     assert stability.margin == pytest.approx(1 - fit.proof.rate)
@@ -154,7 +157,9 @@ def test_a_rate_that_is_no_decay_is_rejected(design_folder: Path, rate: float) -
         check(design_folder / MODEL_PROOF)
 
 
-def test_a_rate_below_the_slowest_pole_is_rejected(design_folder: Path, fit: Fit) -> None:
+def test_a_rate_below_the_slowest_pole_is_rejected(
+    design_folder: Path, fit: Fit[DifferenceEquation]
+) -> None:
     document = _json.load_document(design_folder / MODEL_PROOF)
     radius = float(np.abs(fit.model.poles).max())
     for factor, proved in ((1.0 + 1e-3, None), (1.0 - 1e-9, False)):

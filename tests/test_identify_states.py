@@ -8,7 +8,7 @@ import pytest
 from nlsid_core import _json
 from nlsid_core.errors import DataError, DocumentError
 from nlsid_core.identification.states import identify_states
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.trajectory import Dataset, Trajectory
 from tests.tracked import PERIOD, pendulum
 

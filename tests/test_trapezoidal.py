@@ -6,9 +6,9 @@ import pytest
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.implicit import ImplicitStep
 from nlsid_core.identification.trapezoidal import identify_trapezoidal
+from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.polynomial import compose_affine, variables
 from nlsid_core.trajectory import Dataset, Trajectory
-from nlsid_core.trapezoidal_model import TrapezoidalModel
 
 PERIOD = 0.02
 EXPONENTS = np.array([[1, 0, 0], [3, 0, 0], [0, 1, 0], [0, 0, 1]])

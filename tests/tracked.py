@@ -12,7 +12,7 @@ from nlsid_core.discrete_funnel import DisturbanceAssumption
 from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
 from nlsid_core.models import Signal
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
 
 PERIOD = 0.02

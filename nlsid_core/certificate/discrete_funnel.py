@@ -26,7 +26,7 @@ from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
 
 CHAINS = ("tube", "inlet")

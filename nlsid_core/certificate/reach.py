@@ -26,8 +26,8 @@ from nlsid_core.certificate.identity import (
     one,
 )
 from nlsid_core.errors import CertificateRejected, Undecided
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.polynomial import Gram, Polynomial, monomials
-from nlsid_core.state_model import StateModel
 
 Rational: TypeAlias = NDArray[np.object_]
 EIGENVALUE_ROOM = 1.0 + 1e-9  # over an eigenvalue computed in floats, to be proved in rationals

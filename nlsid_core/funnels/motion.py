@@ -11,7 +11,7 @@ from nlsid_core import _json, conic
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
 
 ITERATIONS = 30  # of linearising the model around the last motion

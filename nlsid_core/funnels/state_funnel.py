@@ -18,7 +18,7 @@ from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.motion import Feedback
 from nlsid_core.funnels.reach import Step
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_monitor import disturbance_of
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset

@@ -15,7 +15,7 @@ import numpy as np
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.models import Signal
-from nlsid_core.state_model import StateModel
+from nlsid_core.models.state_map import StateModel
 from nlsid_core.trajectory import Dataset, Trajectory
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds

@@ -12,8 +12,8 @@ import numpy as np
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
 from nlsid_core.identification.states import features, monomials_of, refuse_unequal
+from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.trajectory import Dataset
-from nlsid_core.trapezoidal_model import TrapezoidalModel
 
 
 def identify_trapezoidal(train: Dataset, *, degrees: Sequence[int]) -> TrapezoidalModel:

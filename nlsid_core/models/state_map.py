@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, VERSION, Signal
 from nlsid_core.polynomial import Polynomial
 
 KIND = "state_map"
