@@ -17,6 +17,7 @@ from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
 from bags.steps import compare_bags, design_funnel_files, identify_bags
+from bags.tracking_cli import app as track_app
 from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
 from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
@@ -29,6 +30,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(track_app, name="track")
 app.add_typer(bag_app)
 out = Console()
 err = Console(stderr=True)

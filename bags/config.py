@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -23,6 +23,9 @@ class _Section(BaseModel):
     """A part of the file: unknown keys are errors, values are not coerced across types."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+Section = TypeVar("Section", bound=_Section)
 
 
 class SignalConfig(_Section):
@@ -139,6 +142,11 @@ def load_config(path: Path | str) -> Config:
 
     OS errors pass through.
     """
+    return read_yaml(path, Config)
+
+
+def read_yaml(path: Path | str, kind: type[Section]) -> Section:
+    """A YAML file as a configuration of `kind`; see `load_config`."""
     path = Path(path)
     if path.stat().st_size > MAX_CONFIG_BYTES:
         raise DataError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")
@@ -149,7 +157,7 @@ def load_config(path: Path | str) -> Config:
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected sections (robot, signals, grid, ...), found none")
     try:
-        return Config.model_validate(content)
+        return kind.model_validate(content)
     except ValidationError as error:
         problems = [
             f"  {_where(problem['loc'])}: {problem['msg']} (found {problem['input']!r:.60})"

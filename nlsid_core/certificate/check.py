@@ -10,6 +10,7 @@ from nlsid_core._types import Json
 from nlsid_core.certificate import (
     attraction,
     block_cascade,
+    discrete_funnel,
     implicit,
     monotone_equation,
     nonnegative,
@@ -40,6 +41,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
         "energy_tube": _exact_only(tube.decide),
+        "discrete_funnel": discrete_funnel.decide,
         "state_affine_stability": _exact_only(state_affine.decide),
         "block_cascade_stability": _exact_only(block_cascade.decide),
         "monotone_equation_stability": _exact_only(monotone_equation.decide),

@@ -7,6 +7,8 @@ from nlsid_core.models.monotone_equation import MonotoneEquation
 from nlsid_core.models.signal import Signal
 from nlsid_core.models.spline import Spline
 from nlsid_core.models.state_affine import StateAffineModel
+from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.trapezoidal import TrapezoidalModel
 
 __all__ = [
     "BlockCascade",
@@ -16,4 +18,6 @@ __all__ = [
     "Signal",
     "Spline",
     "StateAffineModel",
+    "StateModel",
+    "TrapezoidalModel",
 ]
