@@ -24,6 +24,10 @@ class DocumentError(DataError):
     """A JSON document (model, policy, funnel, proof) that is not what its format says."""
 
 
+class NotPolynomial(NlsidError, TypeError):  # noqa: N818 - says what it is
+    """An operation whose result is not a polynomial; the message names it."""
+
+
 class SolverError(NlsidError, RuntimeError):
     """A numerical solver gave up; the message says at what and how far it got."""
 
@@ -34,6 +38,10 @@ class Infeasible(SolverError):  # noqa: N818 - a result of the field, named as t
 
 class CertificateRejected(NlsidError):  # noqa: N818 - a verdict, not a fault
     """A proof does not prove its claim."""
+
+
+class Undecided(CertificateRejected):
+    """Not decided in the mode that was asked for; another mode may decide it. Never a proof."""
 
 
 class CertificateMismatch(CertificateRejected):

@@ -7,32 +7,49 @@ from types import MappingProxyType
 
 from nlsid_core import _json
 from nlsid_core._types import Json
-from nlsid_core.certificate import stability, tube
+from nlsid_core.certificate import attraction, nonnegative, stability, tube
+from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision, Verdict
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Undecided
 
 FORMAT = "nlsid/proof"
 VERSION = 1
 
-Decide = Callable[[Json, Json, Mapping[str, Json]], Decision]
+Decide = Callable[[Json, Json, Mapping[str, Json], Mode], Decision]
+
+
+def _exact_only(decide: Callable[[Json, Json, Mapping[str, Json]], Decision]) -> Decide:
+    def decided(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> Decision:
+        if mode != "exact":
+            raise Undecided(f"a claim of this kind is decided in mode exact only, not {mode}")
+        return decide(claim, proof, about)
+
+    return decided
+
 
 CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
-        "incremental_stability": stability.decide,
-        "energy_tube": tube.decide,
+        "incremental_stability": _exact_only(stability.decide),
+        "energy_tube": _exact_only(tube.decide),
+        "polynomial_bound": nonnegative.decide_lower_bound,
+        "matrix_inequality": nonnegative.decide_matrix,
+        "region_of_attraction": attraction.decide,
     }
 )
 
 
-def check(path: Path | str) -> Verdict:
-    """Decide the claim in the proof file `path` from the model, policy and funnel files beside it.
+def check(path: Path | str, *, mode: Mode = "exact") -> Verdict:
+    """Decide the claim in the proof file `path` from the files it names in the same folder.
 
-    Returns a Verdict if, and only if, the claim is proved. Raises CertificateMismatch if a file
-    beside it is not the one the proof is about, CertificateRejected if the proof is damaged,
-    incomplete or does not prove its claim; the message says why. OS errors for `path` itself pass
-    through.
+    Mode `exact` computes in integers and rationals, `rigorous` in floating point with proved
+    bounds. Returns a Verdict if, and only if, the claim is proved. Raises CertificateMismatch if a
+    file beside it is not the one the proof is about, Undecided if this mode cannot tell,
+    CertificateRejected if the proof is damaged, incomplete or does not prove its claim; the
+    message says why. OS errors for `path` itself pass through.
     """
     started = time.perf_counter()
+    if mode not in ("exact", "rigorous"):
+        raise ValueError(f"mode is {mode!r}; known: exact, rigorous")
     path = Path(path)
     try:
         document = _json.load_document(path)
@@ -44,7 +61,7 @@ def check(path: Path | str) -> Verdict:
         if kind not in CLAIMS:
             raise CertificateRejected(f"claim '{kind}' is unknown; known: {', '.join(CLAIMS)}")
         about = _files_named_in(claim, path)
-        decision = CLAIMS[kind](claim, proof, about)
+        decision = CLAIMS[kind](claim, proof, about, mode)
     except (DataError, ValueError, ArithmeticError) as error:
         if isinstance(error, CertificateRejected):
             raise
@@ -53,7 +70,7 @@ def check(path: Path | str) -> Verdict:
         statement=decision.statement,
         margin=decision.margin,
         assumptions=decision.assumptions,
-        mode="exact",
+        mode=mode,
         digests={role: _json.digest(content) for role, content in about.items()},
         seconds=time.perf_counter() - started,
     )

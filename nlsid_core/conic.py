@@ -1,0 +1,324 @@
+"""Cone programs and the only place that calls a solver.
+
+    minimise ½x'Px + q'x   subject to   Ax + s = b,  s in a product of cones
+
+Clarabel is called directly; every other solver by name through cvxpy. A solver's status is a
+rumour: what is returned is judged by the residuals computed here, and a caller that needs a proof
+takes the solution to `nlsid_core.certificate`.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import clarabel
+import numpy as np
+import scipy.sparse as sp
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
+
+ConeKind: TypeAlias = Literal["zero", "nonnegative", "second_order", "psd"]
+
+# A solution is accepted with relative residuals below this; certificates keep a margin above it.
+ACCEPTED_RESIDUAL = 1e-5
+# Clarabel's own default; tighter stalls on problems whose optimum is not strictly feasible.
+TOLERANCE = 1e-8
+MAX_ITERATIONS = 200
+# SCS is a first-order method: asked for more digits it does not return in useful time.
+SCS_TOLERANCE = 1e-7
+SQRT2 = float(np.sqrt(2.0))
+
+
+@dataclass(frozen=True)
+class Cone:
+    """One block of s: `size` entries, or for `psd` the order n of an n×n matrix.
+
+    A `psd` block holds the upper triangle column by column, off-diagonal entries times √2.
+    """
+
+    kind: ConeKind
+    size: int
+
+    @property
+    def rows(self) -> int:
+        """How many rows of A the block takes."""
+        return self.size * (self.size + 1) // 2 if self.kind == "psd" else self.size
+
+
+@dataclass(frozen=True, eq=False)
+class ConeProgram:
+    """P (n, n) symmetric, q (n,), A (m, n), b (m,), cones covering the m rows in order.
+
+    Raises ShapeError if sizes do not fit, DataError on NaN or infinity.
+    """
+
+    P: sp.csc_matrix
+    q: FloatArray
+    A: sp.csc_matrix
+    b: FloatArray
+    cones: tuple[Cone, ...]
+
+    def __post_init__(self) -> None:
+        m, n = self.A.shape
+        rows = sum(cone.rows for cone in self.cones)
+        if self.P.shape != (n, n) or self.q.shape != (n,) or self.b.shape != (m,) or rows != m:
+            raise ShapeError(
+                f"A is {m}x{n}: P {self.P.shape}, q {self.q.shape}, b {self.b.shape}, "
+                f"cones with {rows} rows do not fit"
+            )
+        for name in ("q", "b"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise DataError(f"{name} of a cone program is not finite")
+        if not (np.isfinite(self.A.data).all() and np.isfinite(self.P.data).all()):
+            raise DataError("A or P of a cone program is not finite")
+
+
+@dataclass(frozen=True, eq=False)
+class ConeSolution:
+    """x (n,) primal, s (m,) slack, z (m,) dual; `residual` the worst relative KKT residual.
+
+    attempts: what was tried, in order, with the status each solver reported. seconds: wall clock.
+    """
+
+    x: FloatArray
+    s: FloatArray
+    z: FloatArray
+    objective: float
+    residual: float
+    attempts: tuple[str, ...]
+    seconds: float
+
+    def __str__(self) -> str:
+        return (
+            f"objective {self.objective:.9g}, residual {self.residual:.1e}, "
+            f"{self.seconds * 1e3:.1f} ms ({'; '.join(self.attempts)})"
+        )
+
+
+def solve(
+    program: ConeProgram, solver: str = "clarabel", *, tolerance: float = TOLERANCE
+) -> ConeSolution:
+    """Solve one cone program.
+
+    "clarabel" climbs a ladder until the residuals are acceptable: fast settings, iterative
+    refinement on, data rescaled, SCS. Another name is given to cvxpy as it is. Raises Infeasible
+    if a solver certifies that there is no solution, SolverError if none finds one.
+    """
+    started = time.perf_counter()
+    attempts: list[str] = []
+    best: ConeSolution | None = None
+    ladder = _LADDER if solver.lower() == "clarabel" else (solver,)
+    for rung in ladder:
+        outcome = _attempt(program, rung, tolerance)
+        attempts.append(f"{rung}: {outcome.status}")
+        if "infeasible" in outcome.status.lower() or "unbounded" in outcome.status.lower():
+            raise Infeasible(
+                f"{'; '.join(attempts)}. Raise degrees, lower the level that is asked for, or "
+                "bound the variables."
+            )
+        if outcome.x is None:
+            continue
+        residual = _residual(program, outcome.x, outcome.s, outcome.z)
+        candidate = ConeSolution(
+            x=outcome.x,
+            s=outcome.s,
+            z=outcome.z,
+            objective=float(program.q @ outcome.x + outcome.x @ (program.P @ outcome.x) / 2),
+            residual=residual,
+            attempts=tuple(attempts),
+            seconds=time.perf_counter() - started,
+        )
+        if best is None or residual < best.residual:
+            best = candidate
+        if residual <= ACCEPTED_RESIDUAL:
+            return replace(best, attempts=tuple(attempts), seconds=time.perf_counter() - started)
+    found = f" (best residual {best.residual:.1e})" if best else ""
+    raise SolverError(f"no acceptable solution{found}: {'; '.join(attempts)}")
+
+
+def solve_all(
+    programs: Iterable[ConeProgram], *, executor: Executor | None = None, solver: str = "clarabel"
+) -> list[ConeSolution]:
+    """Solve independent programs, in order; threads by default, as Clarabel releases the GIL."""
+    programs = list(programs)
+    if executor is not None:
+        return list(executor.map(solve, programs, [solver] * len(programs)))
+    with ThreadPoolExecutor() as threads:
+        return list(threads.map(solve, programs, [solver] * len(programs)))
+
+
+def svec(matrix: FloatArray) -> FloatArray:
+    """Upper triangle column by column, off-diagonal entries times √2; keeps inner products."""
+    i, j = triangle(len(matrix))
+    return np.asarray(matrix[i, j] * np.where(i == j, 1.0, SQRT2))
+
+
+def smat(vector: FloatArray) -> FloatArray:
+    """The symmetric matrix whose `svec` is `vector`."""
+    n = int((np.sqrt(8 * len(vector) + 1) - 1) / 2 + 0.5)
+    i, j = triangle(n)
+    matrix = np.zeros((n, n))
+    matrix[i, j] = matrix[j, i] = vector / np.where(i == j, 1.0, SQRT2)
+    return matrix
+
+
+def triangle(n: int) -> tuple[Any, Any]:
+    """Row and column of each entry of `svec`."""
+    j, i = np.tril_indices(n)
+    return i, j
+
+
+# -- the ladder ------------------------------------------------------------------------------
+
+_LADDER = ("clarabel", "clarabel refined", "clarabel rescaled", "SCS")
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    status: str
+    x: Any = None
+    s: Any = None
+    z: Any = None
+
+
+def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
+    if rung == "clarabel":
+        return _clarabel(program, tolerance, refine=False)
+    if rung == "clarabel refined":
+        return _clarabel(program, tolerance, refine=True)
+    if rung == "clarabel rescaled":
+        return _rescaled(program, tolerance)
+    return _through_cvxpy(program, rung, tolerance)
+
+
+def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outcome:
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_iter = MAX_ITERATIONS
+    settings.max_threads = 1  # small problems: threads go to independent programs instead
+    # Half the time of small programs is refinement that the next rung does if it is needed.
+    settings.iterative_refinement_enable = refine
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    kinds = {
+        "zero": clarabel.ZeroConeT,
+        "nonnegative": clarabel.NonnegativeConeT,
+        "second_order": clarabel.SecondOrderConeT,
+        "psd": clarabel.PSDTriangleConeT,
+    }
+    cones = [kinds[cone.kind](cone.size) for cone in program.cones if cone.size]
+    solver = clarabel.DefaultSolver(
+        sp.triu(program.P, format="csc"), program.q, program.A, program.b, cones, settings
+    )
+    solution = solver.solve()
+    status = str(solution.status)
+    if status.startswith("Almost") and "Infeasible" in status:
+        return _Outcome("stalled")  # no proof of infeasibility: a later rung decides
+    return _Outcome(status, *(np.array(part) for part in (solution.x, solution.s, solution.z)))
+
+
+def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
+    """Columns of A to unit size, then b and q to unit size; undone afterwards."""
+    size = np.sqrt(np.asarray(program.A.multiply(program.A).sum(axis=0)).ravel())
+    D = 1.0 / np.where(size > 0, size, 1.0)
+    primal = 1.0 / max(float(np.abs(program.b).max(initial=0.0)), 1e-300)
+    dual = 1.0 / max(float(np.abs(D * program.q).max(initial=0.0)), 1e-300)
+    scaled = ConeProgram(
+        P=sp.csc_matrix(sp.diags(D) @ program.P @ sp.diags(D) * (dual / primal)),
+        q=dual * D * program.q,
+        A=sp.csc_matrix(program.A @ sp.diags(D)),
+        b=primal * program.b,
+        cones=program.cones,
+    )
+    outcome = _clarabel(scaled, tolerance, refine=True)
+    if outcome.x is None:
+        return outcome
+    return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, outcome.z / dual)
+
+
+def _through_cvxpy(program: ConeProgram, name: str, tolerance: float) -> _Outcome:
+    """Any solver cvxpy has, by its name."""
+    import cvxpy as cp
+
+    if name.upper() not in cp.installed_solvers():
+        raise SolverError(
+            f"solver '{name}' is not installed; there are: {', '.join(cp.installed_solvers())}"
+        )
+    x = cp.Variable(len(program.q))
+    constraints, duals, start = [], [], 0
+    slack = program.b - program.A @ x
+    for cone in program.cones:
+        block = slack[start : start + cone.rows]
+        start += cone.rows
+        if cone.kind == "psd":
+            i, j = triangle(cone.size)
+            rows = np.r_[i + cone.size * j, j + cone.size * i][np.r_[[True] * len(i), i != j]]
+            columns = np.r_[np.arange(len(i)), np.arange(len(i))][np.r_[[True] * len(i), i != j]]
+            weight = np.where(i == j, 1.0, 1 / SQRT2)[columns]
+            spread = sp.csc_matrix((weight, (rows, columns)), (cone.size**2, cone.rows))
+            matrix = cp.reshape(spread @ block, (cone.size, cone.size), order="F")
+            constraints.append(matrix >> 0)
+        elif cone.kind == "second_order":
+            constraints.append(cp.SOC(block[0], block[1:]))
+        else:
+            constraints.append(block == 0 if cone.kind == "zero" else block >= 0)
+        duals.append((cone, constraints[-1]))
+    objective = program.q @ x
+    if program.P.nnz:
+        objective = objective + cp.quad_form(x, cp.psd_wrap(program.P)) / 2
+    options = {"eps_abs": SCS_TOLERANCE, "eps_rel": SCS_TOLERANCE, "max_iters": 100_000}
+    problem = cp.Problem(cp.Minimize(objective), constraints)
+    try:
+        problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
+    except cp.SolverError as error:
+        return _Outcome(f"failed ({error})")
+    if x.value is None:
+        return _Outcome(str(problem.status))
+    z = np.concatenate([_dual(cone, constraint) for cone, constraint in duals] or [np.zeros(0)])
+    return _Outcome(str(problem.status), np.array(x.value), program.b - program.A @ x.value, z)
+
+
+def _dual(cone: Cone, constraint: Any) -> FloatArray:
+    value = constraint.dual_value
+    if cone.kind == "psd":
+        return svec(np.asarray(value))
+    if cone.kind == "second_order":
+        return np.concatenate([np.atleast_1d(part).ravel() for part in value])
+    flat = np.atleast_1d(np.asarray(value, dtype=np.float64)).ravel()
+    return -flat if cone.kind == "zero" else flat  # cvxpy adds equalities to its Lagrangian
+
+
+def _residual(program: ConeProgram, x: FloatArray, s: FloatArray, z: FloatArray) -> float:
+    """The worst of primal and dual residual and gap, each relative to the data it is made of."""
+    Px = program.P @ x
+    primal = np.abs(program.A @ x + s - program.b).max(initial=0.0)
+    dual = np.abs(Px + program.q + program.A.T @ z).max(initial=0.0)
+    gap = abs(float(x @ Px + program.q @ x + program.b @ z))
+    return max(
+        primal / (1 + np.abs(program.b).max(initial=0.0) + np.abs(s).max(initial=0.0)),
+        dual / (1 + np.abs(program.q).max(initial=0.0) + np.abs(Px).max(initial=0.0)),
+        gap / (1 + abs(float(program.q @ x))),
+        -_smallest(program.cones, s) / (1 + np.abs(s).max(initial=0.0)),
+        -_smallest(program.cones, z, dual=True) / (1 + np.abs(z).max(initial=0.0)),
+    )
+
+
+def _smallest(cones: Sequence[Cone], s: FloatArray, *, dual: bool = False) -> float:
+    """How far inside its cone each block is; negative outside, 0 at most."""
+    worst, start = 0.0, 0
+    for cone in cones:
+        block = s[start : start + cone.rows]
+        start += cone.rows
+        if not cone.size or (cone.kind == "zero" and dual):
+            continue
+        if cone.kind == "psd":
+            worst = min(worst, float(np.linalg.eigvalsh(smat(block))[0]))
+        elif cone.kind == "second_order":
+            worst = min(worst, float(block[0] - np.linalg.norm(block[1:])))
+        elif cone.kind == "nonnegative":
+            worst = min(worst, float(block.min()))
+        else:
+            worst = min(worst, -float(np.abs(block).max()))
+    return worst

@@ -1,0 +1,131 @@
+"""Vectors and matrices of polynomials: from a Python function, values, Jacobian, affine maps."""
+
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core.errors import NotPolynomial, ShapeError
+from nlsid_core.polynomial.algebra import (
+    Polynomial,
+    as_polynomial,
+    monomial_values,
+    variables,
+)
+
+
+def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray[Any]:
+    """Call `function` on polynomial vectors and return the polynomials it computes, exactly.
+
+    `arguments` names each positional argument and its length: {"x": 6, "u": 3} calls
+    function(x, u) with object arrays of the variables x0..x5 and u0..u2. Every float the function
+    uses enters as the rational it is, so nothing is rounded; `.rounded()` makes float64 ones.
+    Returns an object array of the shape the function returned.
+
+    Raises NotPolynomial naming the operation if the function is not polynomial.
+    """
+    names = [f"{name}{i}" for name, size in arguments.items() for i in range(size)]
+    unknowns = [variable.exact() for variable in variables(names)]
+    vectors, start = [], 0
+    for size in arguments.values():
+        vectors.append(_object_array(unknowns[start : start + size]))
+        start += size
+    title = getattr(function, "__name__", "function")
+    try:
+        result = function(*vectors)
+    except NotPolynomial as error:
+        raise NotPolynomial(f"{title}: {error}") from error
+    except TypeError as error:
+        raise NotPolynomial(f"{title} cannot be called on polynomials: {error}") from error
+    array = result if isinstance(result, np.ndarray) else np.array(result, dtype=object)
+    traced = np.empty(array.shape, dtype=object)
+    for index in np.ndindex(array.shape):
+        try:
+            traced[index] = as_polynomial(array[index]).exact().over(names)
+        except NotPolynomial as error:
+            raise NotPolynomial(f"{title}, output {list(index)}: {error}") from error
+    return traced
+
+
+def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
+    """Values (..., *shape) of an array of polynomials at points (..., n).
+
+    All are in the same variables; monomials they share are evaluated once.
+    """
+    array = np.asarray(polynomials, dtype=object)
+    points = np.asarray(points, dtype=np.float64)
+    exponents, table = coefficient_table(array.ravel().tolist())
+    if points.shape[-1:] != (exponents.shape[1],):
+        raise ShapeError(f"points should have shape (..., {exponents.shape[1]})")
+    values = monomial_values(exponents, points.reshape(-1, exponents.shape[1])) @ table
+    return values.reshape(points.shape[:-1] + array.shape)
+
+
+def jacobian(polynomials: ArrayLike, names: Sequence[str]) -> NDArray[Any]:
+    """∂p_i/∂names_j as an object array (..., len(names))."""
+    array = np.asarray(polynomials, dtype=object)
+    result = np.empty((*array.shape, len(names)), dtype=object)
+    for index in np.ndindex(array.shape):
+        for j, name in enumerate(names):
+            result[(*index, j)] = array[index].derivative(name)
+    return result
+
+
+def compose_affine(
+    polynomials: ArrayLike, A: ArrayLike, b: ArrayLike, *, names: Sequence[str]
+) -> NDArray[Any]:
+    """q_i(z) = p_i(A z + b), z called `names`: a shift to a trajectory, normalised coordinates.
+
+    A: (n, k) and b: (n,) of floats or Fractions, n the variables of the p_i in their order.
+    Returns an object array of the shape of `polynomials`. Exact if A and b are Fractions.
+    """
+    array = np.asarray(polynomials, dtype=object)
+    A, b = np.asarray(A), np.asarray(b)
+    n = len(array.flat[0].names) if array.size else 0
+    if A.shape != (n, len(names)) or b.shape != (n,):
+        raise ShapeError(f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}")
+    z = _object_array(variables(names))
+    rational = A.dtype == object or b.dtype == object
+    inner = [
+        (row @ z if row.any() else z[0] * 0) + (Fraction(shift) if rational else shift)
+        for row, shift in zip(A, b, strict=True)
+    ]
+    result = np.empty(array.shape, dtype=object)
+    for index in np.ndindex(array.shape):
+        p = array[index]
+        # Fresh names first: z may be called as the old variables are.
+        old = [f"\0{i}" for i in range(n)]
+        renamed = Polynomial(p.exponents, p.coefficients, tuple(old))
+        result[index] = renamed.substitute(dict(zip(old, inner, strict=True))).over(names)
+    return result
+
+
+def monomials(n: int, degrees: Sequence[int]) -> IntArray:
+    """(m, n) exponents of every monomial in n variables whose total degree is in `degrees`."""
+    rows = []
+    for degree in sorted(set(degrees)):
+        for chosen in combinations_with_replacement(range(n), degree):
+            rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=n))
+    return np.array(rows, dtype=np.int64).reshape(-1, n)
+
+
+def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, FloatArray]:
+    """Common monomials (m, n) of polynomials in the same variables, and coefficients (m, k)."""
+    if any(p.names != polynomials[0].names for p in polynomials):
+        raise ShapeError("the polynomials should be in the same variables, in the same order")
+    stacked = np.concatenate([p.exponents for p in polynomials])
+    exponents, position = np.unique(stacked, axis=0, return_inverse=True)
+    table = np.zeros((len(exponents), len(polynomials)))
+    column = np.repeat(np.arange(len(polynomials)), [len(p) for p in polynomials])
+    table[position.ravel(), column] = np.concatenate([p.coefficients for p in polynomials])
+    return exponents, table
+
+
+def _object_array(entries: Sequence[Any]) -> NDArray[Any]:
+    array = np.empty(len(entries), dtype=object)
+    array[:] = entries
+    return array

@@ -1,0 +1,170 @@
+"""Sum-of-squares programs as data: what is unknown, what has to be a sum of squares.
+
+Unknowns are ordinary variables of ordinary polynomials: every variable that is neither an
+indeterminate nor a parameter of the program is a decision, and may occur linearly.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.polynomial import Gram, Polynomial
+
+
+@dataclass(frozen=True)
+class SumOfSquares:
+    """p = v'Qv + Σ σ_i g_i + Σ μ_j h_j with Q ⪰ 0 and σ_i sums of squares: p ≥ 0 on a domain.
+
+    p: polynomial, affine in the decisions. domain: the g_i ≥ 0. equalities: the h_j = 0, with free
+    multipliers. degree: of each summand, in the indeterminates; default: the least even degree
+    that fits p and the domain. modulo: one polynomial h; the identity then holds modulo h, without
+    a multiplier (the sphere form). basis: (k, n) monomials v; default: chosen from the support.
+    forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
+    """
+
+    p: Polynomial
+    domain: tuple[Polynomial, ...] = ()
+    equalities: tuple[Polynomial, ...] = ()
+    degree: int | None = None
+    modulo: Polynomial | None = None
+    basis: IntArray | None = None
+    forms: tuple[str, ...] = ()
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Zero:
+    """Every coefficient of p in the indeterminates is zero."""
+
+    p: Polynomial
+
+
+@dataclass(frozen=True)
+class NonNegative:
+    """An affine expression in the decisions, without indeterminates, is ≥ 0."""
+
+    p: Polynomial
+
+
+@dataclass(frozen=True)
+class NormBound:
+    """|(p_1, …, p_k)| ≤ bound, all affine in the decisions, without indeterminates."""
+
+    entries: tuple[Polynomial, ...]
+    bound: Polynomial
+
+
+Constraint: TypeAlias = SumOfSquares | Zero | NonNegative | NormBound
+
+
+@dataclass(frozen=True)
+class Program:
+    """Find decisions that satisfy the constraints and maximise (or minimise) an affine objective.
+
+    indeterminates: the variables the inequalities hold for. parameters: variables whose values are
+    given to each solve; they may occur in any power. scale: the size of an indeterminate in its
+    unit (default 1); the program is solved in variables of size 1. Powers of two are used, so that
+    scaling rounds nothing.
+    """
+
+    indeterminates: tuple[str, ...]
+    constraints: tuple[Constraint, ...]
+    maximise: Polynomial | None = None
+    minimise: Polynomial | None = None
+    parameters: tuple[str, ...] = ()
+    scale: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        both = set(self.indeterminates) & set(self.parameters)
+        if both:
+            raise DataError(f"{', '.join(sorted(both))}: both indeterminate and parameter")
+        if self.maximise is not None and self.minimise is not None:
+            raise DataError("state one objective: maximise or minimise")
+        for name, size in self.scale.items():
+            if name not in self.indeterminates or not (np.isfinite(size) and size > 0):
+                raise DataError(f"scale {name}: {size}; expected a positive size of an indeterminate")
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """What a solved `SumOfSquares` says: p = gram + Σ multipliers·domain + Σ free·equalities.
+
+    Up to solver tolerance: `nlsid_core.certificate` decides whether it proves anything.
+    """
+
+    p: Polynomial
+    gram: Gram
+    multipliers: tuple[Gram, ...]
+    equality_multipliers: tuple[Polynomial, ...]
+    name: str
+
+
+def template(name: str, basis: ArrayLike, names: Sequence[str]) -> Polynomial:
+    """Σ_k name[k]·monomial_k: a polynomial with one free decision per monomial of basis (m, n)."""
+    basis = np.asarray(basis, dtype=np.int64)
+    if basis.ndim != 2 or basis.shape[1] != len(names):
+        raise ShapeError(f"the basis should have shape (m, {len(names)}), has {basis.shape}")
+    m = len(basis)
+    unknowns = tuple(f"{name}[{k}]" for k in range(m))
+    exponents = np.hstack([basis, np.eye(m, dtype=np.int64)])
+    return Polynomial(exponents, np.ones(m), tuple(names) + unknowns)
+
+
+def symmetric_template(name: str, size: int) -> NDArray[Any]:
+    """A symmetric matrix of decisions name[i,j], i ≤ j, as an object array."""
+    index = [(i, j) for i in range(size) for j in range(i, size)]
+    names = tuple(f"{name}[{i},{j}]" for i, j in index)
+    unit = np.eye(len(index), dtype=np.int64)
+    matrix = np.empty((size, size), dtype=object)
+    for k, (i, j) in enumerate(index):
+        matrix[i, j] = matrix[j, i] = Polynomial(unit[[k]], np.ones(1), names)
+    return matrix
+
+
+def matrix_sum_of_squares(
+    M: ArrayLike,
+    *,
+    domain: tuple[Polynomial, ...] = (),
+    equalities: tuple[Polynomial, ...] = (),
+    degree: int | None = None,
+    name: str = "",
+) -> SumOfSquares:
+    """M(x) ⪰ 0 on the domain, for a symmetric matrix of polynomials: y'M(x)y is a sum of squares.
+
+    Constant in x, this is a linear matrix inequality. The program's indeterminates have to
+    include `forms_of(size)`, the y.
+    """
+    M = np.asarray(M, dtype=object)
+    if M.ndim != 2 or M.shape[0] != M.shape[1]:
+        raise ShapeError(f"a square matrix of polynomials is needed, shape {M.shape} was given")
+    names = forms_of(len(M))
+    unit = np.eye(len(M), dtype=np.int64)
+    total: Any = 0
+    for i in range(len(M)):
+        for j in range(i, len(M)):
+            factor = 1.0 if i == j else 2.0
+            total = total + Polynomial(unit[[i]] + unit[[j]], np.array([factor]), names) * M[i, j]
+    return SumOfSquares(
+        total, domain=domain, equalities=equalities, degree=degree, forms=names, name=name
+    )
+
+
+def forms_of(size: int) -> tuple[str, ...]:
+    """The auxiliary indeterminates y of a matrix constraint of this size."""
+    return tuple(f"y[{i}]" for i in range(size))
+
+
+def round_to_power_of_two(size: float) -> float:
+    """The power of two nearest to `size` on a logarithmic scale."""
+    return float(2.0 ** np.round(np.log2(size)))
+
+
+def scaling(program: Program) -> FloatArray:
+    """(n,) sizes of the indeterminates, as powers of two."""
+    sizes = [program.scale.get(name, 1.0) for name in program.indeterminates]
+    return np.array([round_to_power_of_two(size) for size in sizes])

@@ -1,0 +1,319 @@
+"""The fast path: the largest m with g(z) - m = v(z)'Xv(z) on |z| = 1, X ⪰ 0.
+
+v holds monomials of degree 1 and 2, g is any function in the span of their products (on the
+sphere every polynomial of degree ≤ 4), known only by its values at N unisolvent points:
+
+    maximise m      subject to  v_i'Xv_i + m = g_i  (i = 1..N),  X ⪰ 0
+    minimise g'y    subject to  Σ y_i v_i v_i' = Z ⪰ 0,  Σ y_i = 1
+
+Every constraint matrix is rank one, so the Schur complement of the HKM direction is a Hadamard
+product, (V X V') ∘ (V Z⁻¹ V'). Both sides have known strictly feasible points, and one least-norm
+correction a step keeps the equalities, so every iterate is a certificate.
+Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Todd and Tütüncü,
+"SDPT3", 1999, for the predictor-corrector.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import blas, lapack, qr
+
+from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core.errors import DataError, ShapeError, SolverError
+from nlsid_core.polynomial import monomials
+from nlsid_core.polynomial.algebra import monomial_values
+
+CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
+RANK_TOLERANCE = 1e-10  # of the QR diagonal: degree-4 monomials on a sphere keep 12 digits
+MAX_ITERATIONS = 60  # 8 to 12 are usual
+STEP_TO_BOUNDARY = 0.97  # of the way to where X or Z would stop being positive definite
+REGULARISATIONS = (1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
+REFINEMENTS = 1  # a second one was never seen to change the number of iterations
+CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
+WARM_GAP = 0.03  # of the spread: closer to the optimum an iterate is no good start for another g
+WARM_CLEARANCE = 0.5  # of the distance to the boundary that a warm start has to keep
+
+
+@dataclass(frozen=True, eq=False)
+class SphereSolution:
+    """m ≤ max m ≤ upper, and the multipliers that show it.
+
+    m: shown up to rounding by X (k, k); upper: the dual bound, from y (N,). Both in the unit of g.
+    gap: (upper - m) relative to the spread of g. centred: an earlier iterate (X, y, m) of the
+    normalised problem, far enough from the boundary to start a similar problem from.
+    """
+
+    m: float
+    upper: float
+    X: FloatArray
+    y: FloatArray
+    gap: float
+    iterations: int
+    centred: tuple[FloatArray, FloatArray, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SphereProgram:
+    """Everything that depends on the number of variables only; build it once and solve often.
+
+    n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
+    are kept only if they contain one of them (default: all). basis: (k, n) exponents of v, degree
+    1 first. points: (N, n) where g has to be evaluated.
+
+    Raises DataError if there is no nonlinear variable or n < 2.
+    """
+
+    n: int
+    nonlinear: tuple[int, ...] | None = None
+    basis: IntArray = field(init=False)
+    points: FloatArray = field(init=False)
+    _V: FloatArray = field(init=False)
+    _whiten: FloatArray = field(init=False)
+    _unit: FloatArray = field(init=False)
+    _unit_root: FloatArray = field(init=False)
+    _centre: FloatArray = field(init=False)
+    _normal: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        chosen = tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
+        if self.n < 2 or not chosen or not set(chosen) <= set(range(self.n)):
+            raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n, n >= 2")
+        pairs = monomials(self.n, [2])
+        basis = np.vstack([monomials(self.n, [1]), pairs[pairs[:, list(chosen)].any(axis=1)]])
+        points = _unisolvent_points(basis)
+        # Weights with Σ (weight·monomial)² = 1 on the sphere: Σ|z_l|² + ½|z_nl|² + ½|z_nl|²|z|².
+        inside = basis[:, list(chosen)].sum(axis=1)
+        alone = basis.max(axis=1) == 2
+        weight = np.where((inside == 0) | ((inside == 2) & ~alone), 1.0, np.sqrt(0.5))
+        moments = _sphere_moments(basis) * np.outer(weight, weight)
+        values, vectors = np.linalg.eigh(moments)
+        # v = root⁻¹·weight·monomials is orthonormal on the sphere, and v'(moments)v = 1 there.
+        whiten = (vectors / np.sqrt(values)) @ vectors.T * weight
+        V = monomial_values(basis, points) @ whiten.T
+        normal = (V @ V.T) ** 2
+        factor, info = lapack.dpotrf(normal, lower=1, clean=1)
+        if info:
+            raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
+        target = _sphere_means(basis, points, factor, V)
+        for key, value in (
+            ("basis", basis),
+            ("points", points),
+            ("_V", V),
+            ("_whiten", whiten),
+            ("_unit", moments),
+            ("_unit_root", np.linalg.inv(np.linalg.cholesky(moments))),
+            ("_centre", target),
+            ("_normal", np.asfortranarray(factor)),
+        ):
+            value.setflags(write=False)
+            object.__setattr__(self, key, value)
+
+    def solve(
+        self, g: ArrayLike, *, tolerance: float = 1e-8, start: SphereSolution | None = None
+    ) -> SphereSolution:
+        """Maximise m for g (N,), the values at `points`, until `gap` ≤ tolerance.
+
+        start: the solution of a similar problem. Raises ShapeError or DataError on bad values,
+        SolverError if no progress is made.
+        """
+        values = np.asarray(g, dtype=np.float64)
+        if values.shape != (len(self.points),):
+            raise ShapeError(f"g should have {len(self.points)} values, has shape {values.shape}")
+        if not np.isfinite(values).all():
+            raise DataError("g is not finite on the sphere")
+        middle, spread = float(values.mean()), float(np.ptp(values))
+        if spread <= 1e-15 * abs(middle):
+            middle_point = (self._unit, self._centre, -1.0)
+            return SphereSolution(
+                middle, middle, 0 * self._unit, self._centre, 0.0, 0, middle_point
+            )
+        found = _interior_point(self, (values - middle) / spread, tolerance, start)
+        return SphereSolution(
+            m=middle + spread * found.m,
+            upper=middle + spread * found.upper,
+            X=found.X * spread,
+            y=found.y,
+            gap=found.gap,
+            iterations=found.iterations,
+            centred=found.centred,
+        )
+
+    def gram(self, solution: SphereSolution) -> FloatArray:
+        """(k, k) Gram matrix of the solution in the monomials `basis`."""
+        Q = self._whiten.T @ solution.X @ self._whiten
+        return np.asarray((Q + Q.T) / 2)
+
+
+def _interior_point(
+    program: SphereProgram, g: FloatArray, tolerance: float, start: SphereSolution | None
+) -> SphereSolution:
+    """Predictor-corrector along the HKM direction, for g of spread 1."""
+    V, ones = program._V, np.ones(len(g))
+    k = V.shape[1]
+    X, y, m = _first_iterate(program, g, start)
+    for iteration in range(MAX_ITERATIONS + 1):
+        Z = (V.T * y) @ V
+        upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
+        if upper - m >= WARM_GAP or iteration == 0:
+            centred = (X, y, m)
+        if upper - m <= tolerance:
+            found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
+            return _certified(program, g, found)
+        Lx, Lz = _factor(X), _factor(Z)
+        if Lx is None or Lz is None:
+            break
+        inverse, _ = lapack.dtrtri(Lz, lower=1)
+        across, dual = V @ Lx, V @ inverse.T
+        M = blas.dsyrk(1.0, across, lower=1) * blas.dsyrk(1.0, dual, lower=1)
+        factor = _factor_or_regularise(M)
+        if factor is None:
+            break
+        # M y = diag(VXV'), so dy = shift - y + dm·unit: only small right-hand sides are solved for.
+        unit = _solve(M, factor, ones)
+        inverse_Z = inverse.T @ inverse
+        dm = 1.0 / unit.sum()
+        dZ = (V.T * (dm * unit - y)) @ V
+        dX = -X - _symmetric(X @ dZ @ inverse_Z)
+        a, b = _step(dX, Lx), _step(dZ, Lz)
+        predicted = float(np.vdot(X + a * dX, Z + b * dZ)) / k
+        aim = mu * min(1.0, max(predicted / mu, 0.0)) ** CENTRING_POWER
+        second = _symmetric(dX @ dZ @ inverse_Z)
+        diagonal = np.einsum("ij,ij->i", dual, dual)
+        bend = np.einsum("ij,ij->i", V @ second, V)
+        missing = g - m - np.einsum("ij,ij->i", V @ X, V)
+        shift = _solve(M, factor, aim * diagonal - bend - missing)
+        dm = (1.0 - shift.sum()) / unit.sum()
+        dy = shift + dm * unit - y
+        dZ = (V.T * dy) @ V
+        dX = aim * inverse_Z - second - X - _symmetric(X @ dZ @ inverse_Z)
+        a, b = _step(dX, Lx), _step(dZ, Lz)
+        X, m, y = X + a * dX, m + a * dm, y + b * dy
+    raise SolverError(
+        f"sphere program of {k} monomials: stopped at gap {upper - m:.1e} of the spread after "
+        f"{iteration} iterations; asked for {tolerance:.1e}"
+    )
+
+
+def _first_iterate(
+    program: SphereProgram, g: FloatArray, start: SphereSolution | None
+) -> tuple[FloatArray, FloatArray, float]:
+    """Strictly feasible X, y, m: least-norm X for the equalities, shifted until positive definite."""
+    if start is None:
+        X, y, m = 0 * program._unit, program._centre, float(g.min())
+        clearance = 1.0
+    else:
+        # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.
+        X, y, m = start.centred
+        clearance = WARM_CLEARANCE * _lowest(program, X)
+    X = _corrected(program, X, g - m)
+    shift = max(0.0, clearance - _lowest(program, X)) if start else clearance - _lowest(program, X)
+    return X + shift * program._unit, y, m - shift
+
+
+def _certified(
+    program: SphereProgram, g: FloatArray, found: SphereSolution
+) -> SphereSolution:
+    """Meet the equalities to rounding, and give up as much of m as keeps X positive definite."""
+    X = _corrected(program, found.X, g - found.m)
+    shift = max(0.0, -_lowest(program, X)) * (1 + 1e-6)
+    m = found.m - shift
+    return replace(found, X=X + shift * program._unit, m=m, gap=found.upper - m)
+
+
+def _lowest(program: SphereProgram, X: FloatArray) -> float:
+    """The largest t with X - t·unit ⪰ 0; v'(unit)v = 1 on the sphere, so m moves by t."""
+    relative = program._unit_root @ X @ program._unit_root.T
+    return float(np.linalg.eigvalsh(_symmetric(relative))[0])
+
+
+def _corrected(program: SphereProgram, X: FloatArray, values: FloatArray) -> FloatArray:
+    """X plus the least-norm matrix that makes v_i'Xv_i equal the values."""
+    V = program._V
+    residual = values - np.einsum("ij,ij->i", V @ X, V)
+    w = lapack.dpotrs(program._normal, residual, lower=1)[0]
+    X = X + (V.T * w) @ V
+    return np.asarray((X + X.T) / 2)
+
+
+def _factor(A: FloatArray) -> FloatArray | None:
+    L, info = lapack.dpotrf(A, lower=1, clean=1)
+    return None if info else np.asarray(L)
+
+
+def _factor_or_regularise(M: FloatArray) -> FloatArray | None:
+    """Cholesky factor of M, with the least regularisation that lets it complete."""
+    diagonal = np.diag(M)
+    factor, info = lapack.dpotrf(M, lower=1)
+    for regularisation in REGULARISATIONS:
+        if not info:
+            return np.asarray(factor)
+        shifted = M.copy(order="F")
+        shifted[np.diag_indices(len(M))] += regularisation * diagonal
+        factor, info = lapack.dpotrf(shifted, lower=1, overwrite_a=1)
+    return None if info else np.asarray(factor)
+
+
+def _solve(M: FloatArray, factor: FloatArray, rhs: FloatArray) -> FloatArray:
+    """M⁻¹rhs with refinement: M has condition 1e16 near the end, and the equalities need it."""
+    x = lapack.dpotrs(factor, rhs, lower=1)[0]
+    for _ in range(REFINEMENTS):
+        residual = blas.dsymv(-1.0, M, x, beta=1.0, y=rhs, lower=1)
+        x = x + lapack.dpotrs(factor, residual, lower=1)[0]
+    return np.asarray(x)
+
+
+def _symmetric(A: FloatArray) -> FloatArray:
+    return np.asarray((A + A.T) / 2)
+
+
+def _step(dA: FloatArray, L: FloatArray) -> float:
+    """The longest step that keeps LL' + step·dA positive definite, with a margin; at most 1."""
+    half, _ = lapack.dtrtrs(L, dA, lower=1)
+    relative, _ = lapack.dtrtrs(L, half.T, lower=1)
+    lowest = float(lapack.dsyevr(relative, compute_v=0, range="I", il=1, iu=1)[0][0])
+    return min(1.0, STEP_TO_BOUNDARY / -lowest) if lowest < 0 else 1.0
+
+
+def _unisolvent_points(basis: IntArray) -> FloatArray:
+    """Points on the sphere that determine every function in the span of products of the basis."""
+    n = basis.shape[1]
+    products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
+    degree = products.sum(axis=1)
+    if len(basis) == n + n * (n + 1) // 2:
+        products = products[degree > 2]  # on the sphere degree 4 contains degree 2
+    rng = np.random.default_rng(n)  # one fixed set per n: results repeat
+    cloud = rng.normal(size=(int(CANDIDATES * len(products)) + 10, n))
+    cloud /= np.linalg.norm(cloud, axis=1)[:, None]
+    table = monomial_values(products, cloud)
+    table /= np.linalg.norm(table, axis=0)
+    R, order = qr(table.T, mode="r", pivoting=True, overwrite_a=True, check_finite=False)
+    diagonal = np.abs(np.diag(R))
+    rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
+    return np.asarray(cloud[np.sort(order[:rank])])
+
+
+def _sphere_moment(exponents: IntArray) -> FloatArray:
+    """Mean over the unit sphere of each monomial: Π (a_i - 1)!! / (n (n + 2) …), zero if odd."""
+    n = exponents.shape[1]
+    odd_factorial = np.array([1.0, 0.0, 1.0, 0.0, 3.0])
+    result = odd_factorial[exponents].prod(axis=-1)
+    for step in range(2):
+        result = result / np.where(exponents.sum(axis=-1) > 2 * step, n + 2 * step, 1)
+    return np.asarray(result)
+
+
+def _sphere_moments(basis: IntArray) -> FloatArray:
+    """(k, k) means of products of the basis."""
+    k, n = basis.shape
+    pairs = (basis[:, None] + basis[None]).reshape(-1, n)
+    return _sphere_moment(pairs).reshape(k, k)
+
+
+def _sphere_means(
+    basis: IntArray, points: FloatArray, factor: FloatArray, V: FloatArray
+) -> FloatArray:
+    """Weights y with Σ y_i p(z_i) = mean of p on the sphere: then Σ y_i v_i v_i' = I."""
+    del basis, points
+    # v_i'(·)v_i ranges over the span, and Σ y_i v_i v_i' = I is V'diag(y)V = I.
+    rhs = np.einsum("ij,ij->i", V, V)
+    return np.asarray(lapack.dpotrs(factor, rhs, lower=1)[0])
