@@ -13,6 +13,8 @@ from nlsid_core.sos.program import (
     symmetric_template,
     template,
 )
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+from nlsid_core.sos.sphere_proof import SphereProof, sphere_proof
 
 __all__ = [
     "Compiled",
@@ -21,12 +23,16 @@ __all__ = [
     "NormBound",
     "Program",
     "Solution",
+    "SphereProgram",
+    "SphereProof",
+    "SphereSolution",
     "SumOfSquares",
     "Zero",
     "compile_program",
     "forms_of",
     "matrix_sum_of_squares",
     "solve",
+    "sphere_proof",
     "symmetric_template",
     "template",
 ]
