@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlsid_core._types import FloatArray
-from nlsid_core.certificate.arithmetic import Arithmetic, Exact, Number
+from nlsid_core.certificate.arithmetic import Arithmetic, Ball, Exact, Number
 from nlsid_core.certificate.graded import (
     Graded,
     add,
@@ -162,3 +162,24 @@ class _Loop:
 def _linear(values: FloatArray) -> FloatArray:
     """(K-1, 2, ...) control points of the piecewise linear function through (K, ...)."""
     return np.stack([values[:-1], values[1:]], axis=1)
+
+
+def error_at_end(
+    field: VectorField, policy: Policy, funnel: Funnel, pieces: "Pieces", end: int
+) -> FloatArray:
+    """(B, n, M) coefficients of f(x₀ + Tz, u) - ẋ₀ at one end of each piece, in floating point.
+
+    M: monomials in z of degree 0 up to the largest that occurs. For the search, not for proofs.
+    """
+    loop = _Loop(field, policy, funnel, pieces, Ball)
+    x_rate = loop.nominal_rate()
+    h = np.diff(funnel.t)[pieces.interval]
+    rows = []
+    for i, rate in enumerate(loop.field_times_h()):
+        error = add(rate, {0: -x_rate[:, :, i][:, :, None]})
+        parts = [
+            error[q].approximate()[:, -end] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
+            for q in range(field.degree + 1)
+        ]
+        rows.append(np.concatenate(parts, axis=1) / h[:, None])
+    return np.stack(rows, axis=1)

@@ -150,7 +150,7 @@ def _pieces(
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
-            one = _end_proof(program, solution, target, h * rho[b], solution.m + growth)
+            one = end_proof(program, solution, target, h * rho[b], solution.m + growth)
             gram.append(one[0])
             mu.append(one[1] / rho[b])
         frames.append(np.array(T))
@@ -173,19 +173,26 @@ def _pieces(
     )
 
 
-def _end_proof(
+def end_proof(
     program: SphereProgram,
     solution: SphereSolution,
     target: dict[int, FloatArray],
     scale: float,
     m: float,
+    *,
+    constant: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, target/scale ≥ m on the sphere, all of m used up."""
+    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, target/scale ≥ m on the sphere, all of m used up.
+
+    constant: the share of m that stays a constant; the rest makes Q positive definite.
+    """
     n = program.n
     basis = np.vstack([np.zeros((1, n), dtype=np.int64), program.basis])
     Q = np.zeros((len(basis), len(basis)))
     Q[1:, 1:] = program.gram(solution) * scale
-    Q[np.diag_indices(len(basis))] += scale * m * np.r_[0.25, 0.75 * program.weight**2]
+    spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
+    spread[0] += constant
+    Q[np.diag_indices(len(basis))] += scale * m * spread
     # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below.
     offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in range(5)])
     rows = np.concatenate([monomials_of(n, q) for q in range(5)])

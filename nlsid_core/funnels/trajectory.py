@@ -17,6 +17,7 @@ from nlsid_core.certificate.trajectory_funnel import document_pieces, refuse_goa
 from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
 from nlsid_core.continuous.funnel import ellipsoid_inside
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.alternation import alternate_shape
 from nlsid_core.funnels.lstep import LSteps, section_at, sections
 from nlsid_core.funnels.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.funnels.sweep import Progress, sweep_rho
@@ -134,11 +135,9 @@ def design_funnel(
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
-        from nlsid_core.funnels.alternation import alternate_shape
-
         started = time.perf_counter()
         funnel, proved, steps_taken = alternate_shape(
-            steps, policy, funnel, margin=margin, executor=executor, progress=progress
+            steps, policy, funnel, margin=margin, progress=progress
         )
         history += steps_taken
         seconds["P"] = time.perf_counter() - started
