@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
-from examples.satellite_funnel import FINAL_TIME, goal_matrix, initial_funnel, problem
+from examples.satellite import FINAL_TIME
+from examples.satellite_funnel import goal_matrix, initial_funnel, problem
 from nlsid_core.certificate import check
 from nlsid_core.funnels import FunnelDesign, design_funnel
 from nlsid_core.funnels.alternation import alternate_rho

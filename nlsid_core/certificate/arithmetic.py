@@ -9,7 +9,7 @@ Assumes IEEE 754 double precision and rounding to nearest.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,38 @@ TINY = 2.0**-1070  # more than one underflow can lose
 SLACK = 1 + 2.0**-48  # covers the roundings made in the radii: fewer than 16 each
 
 Index: TypeAlias = Any
+
+
+class Number(Protocol):
+    """What both have; two numbers that meet are always of the same kind."""
+
+    @classmethod
+    def of(cls, array: FloatArray) -> "Number":
+        """Floats, exactly."""
+
+    @classmethod
+    def rationals(cls, numbers: Sequence[Fraction], unit: int) -> "Number":
+        """Rationals times `unit`."""
+
+    @classmethod
+    def zeros(cls, shape: tuple[int, ...]) -> "Number":
+        """Zeros of a shape."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+
+    def __getitem__(self, index: Index) -> "Number": ...
+    def __neg__(self) -> "Number": ...
+    def __add__(self, other: Any) -> "Number": ...
+    def __sub__(self, other: Any) -> "Number": ...
+    def __mul__(self, other: Any) -> "Number": ...
+
+    def accumulate(self, index: Index, other: Any) -> None:
+        """self[index] += other; no position occurs twice in `index`."""
+
+    def approximate(self) -> FloatArray:
+        """Nearby floats."""
 
 
 @dataclass(eq=False)
@@ -90,10 +122,6 @@ class Exact:
             self.values, self.bits = self._shifted(other.bits), other.bits
         self.values[index] += other._shifted(self.bits)
 
-    def put(self, index: Index, other: "Exact") -> None:
-        """self[index] = other, where self was zero."""
-        self.accumulate(index, other)
-
     def approximate(self) -> FloatArray:
         """Nearest floats, or nearly so."""
         scale = 1 << self.bits
@@ -160,19 +188,15 @@ class Ball:
 
     def accumulate(self, index: Index, other: "Ball") -> None:
         """self[index] += other; no position occurs twice in `index`."""
-        self.put(index, self[index] + other)
-
-    def put(self, index: Index, other: "Ball") -> None:
-        """self[index] = other."""
-        self.middle[index], self.radius[index] = other.middle, other.radius
+        total = self[index] + other
+        self.middle[index], self.radius[index] = total.middle, total.radius
 
     def approximate(self) -> FloatArray:
         """The middles."""
         return self.middle
 
     def _occupied(self) -> NDArray[np.bool_]:
-        return (self.middle != 0) | (self.radius != 0)
+        return np.asarray((self.middle != 0) | (self.radius != 0))
 
 
-Number: TypeAlias = Exact | Ball
-Arithmetic: TypeAlias = type[Exact] | type[Ball]
+Arithmetic: TypeAlias = type[Number]

@@ -27,9 +27,7 @@ def _exact_only(decide: Callable[[Json, Json, Mapping[str, Json]], Decision]) ->
     return decided
 
 
-def _trajectory_funnel(
-    claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode
-) -> Decision:
+def _trajectory_funnel(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> Decision:
     # Imported when needed: the nouns it is about read their polynomials with this package.
     from nlsid_core.certificate import trajectory_funnel
 

@@ -72,7 +72,7 @@ def _multiplier(pieces: "Pieces", arithmetic: Arithmetic) -> Graded:
 
 
 class _Loop:
-    """The variables t, x, u, w of the field as polynomials in z and s, one batch entry per piece."""
+    """The variables t, x, u, w of the field in z and s, one batch entry per piece."""
 
     def __init__(
         self,
@@ -178,7 +178,9 @@ def error_at_end(
     for i, rate in enumerate(loop.field_times_h()):
         error = add(rate, {0: -x_rate[:, :, i][:, :, None]})
         parts = [
-            error[q].approximate()[:, -end] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
+            error[q].approximate()[:, -end]
+            if q in error
+            else np.zeros((len(h), len(monomials_of(field.n, q))))
             for q in range(field.degree + 1)
         ]
         rows.append(np.concatenate(parts, axis=1) / h[:, None])

@@ -12,7 +12,7 @@ import numpy as np
 
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.certificate import dyadic, rigorous
-from nlsid_core.certificate.arithmetic import SLACK, U, Arithmetic, Ball, Exact, Number
+from nlsid_core.certificate.arithmetic import SLACK, Arithmetic, Ball, Exact, Number, U
 from nlsid_core.certificate.closed_loop import closed_loop_polynomial
 from nlsid_core.certificate.graded import elevate, monomials_of, positions
 from nlsid_core.certificate.identity import Mode
@@ -30,7 +30,7 @@ CELLS = 6_000_000  # Gram entries held at once
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """basis: (k, n) exponents of v. Per piece: interval, vertex of w, and the part index/2^level of it.
+    """basis: (k, n) exponents of v. Per piece: interval, vertex of w, part index/2^level of it.
 
     T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
     2 less than twice the basis'. gram: (B, 2, k(k+1)/2) upper triangles, row by row, of Q there.
@@ -79,8 +79,8 @@ def decide_pieces(
         where = f"{funnel.t[k]:g} to {funnel.t[k + 1]:g} s"
         if np.isneginf(margins[i]):
             raise CertificateRejected(
-                f"piece {i} (interval {k}, {where}): the stated Gram matrices do not represent this "
-                "funnel's polynomial"
+                f"piece {i} (interval {k}, {where}): the stated Gram matrices do not represent "
+                "this funnel's polynomial"
             )
         refusal = Undecided if mode == "rigorous" else CertificateRejected
         raise refusal(
@@ -92,7 +92,7 @@ def decide_pieces(
 def piece_margins(
     field: VectorField, policy: Policy, funnel: Funnel, pieces: Pieces, mode: Mode
 ) -> FloatArray:
-    """Each piece's margin in 1/s; nan where positive definiteness fails, -inf where Q does not fit."""
+    """Each piece's margin in 1/s; nan where nothing is proved, -inf where Q does not fit."""
     arithmetic: Arithmetic = Exact if mode == "exact" else Ball
     margins = np.full(len(pieces), np.nan)
     for chosen in _batches(field, funnel, pieces):
@@ -161,7 +161,9 @@ def _lowest(Q: FloatArray, shift: float, arithmetic: Arithmetic) -> float:
     if arithmetic is Ball:
         proved = rigorous.is_positive_definite(Q, (shift + guess) * SLACK)
     else:
-        lowered = Exact.of(Q) - Exact.of(np.eye(len(Q)) * float(np.nextafter(shift + guess, np.inf)))
+        lowered = Exact.of(Q) - Exact.of(
+            np.eye(len(Q)) * float(np.nextafter(shift + guess, np.inf))
+        )
         proved = dyadic.is_positive_definite([[int(e) for e in row] for row in lowered.values])
     return guess if proved else float("nan")
 
@@ -202,6 +204,7 @@ class _Home:
         if isinstance(coefficients, Exact):
             total = self._exact_residual(coefficients, grams, unit)
         else:
+            assert isinstance(coefficients, Ball)
             sums, sizes = self.sums(grams), self.sums(np.abs(grams))
             error = (self.count + 1) * U * sizes * SLACK
             difference = coefficients - Ball(sums, error)
@@ -236,7 +239,7 @@ def _together(c: dict[int, Number], arithmetic: Arithmetic, n: int) -> tuple[Num
         size = len(monomials_of(n, q))
         if q in c:
             index = (slice(None), slice(None), slice(start, start + size))
-            result.accumulate(index, elevate(c[q], N))  # type: ignore[arg-type]
+            result.accumulate(index, elevate(c[q], N))
         start += size
     return result, rows
 

@@ -119,7 +119,7 @@ def positions(rows: IntArray, among: IntArray) -> IntArray:
 def _restriction(S: int, level: int, index: int) -> FloatArray:
     """(S+1, S+1) row k: s^k r^(S-k) written in σ^j τ^(S-j); dyadic, so exact for S·level ≤ 53."""
     whole = 2**level
-    # s = (iτ + (i+1)σ)/2^level, r = ((2^level - i)τ + (2^level - i - 1)σ)/2^level; lowest power first.
+    # s = (iτ + (i+1)σ)/2^level, r = ((2^level - i)τ + (2^level - i - 1)σ)/2^level; σ⁰ first.
     s, r = [index, index + 1], [whole - index, whole - index - 1]
     rows = []
     for k in range(S + 1):

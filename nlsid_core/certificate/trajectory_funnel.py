@@ -58,7 +58,9 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     pieces = read_pieces(proof, field.n)
     refuse_gaps(pieces, field, funnel)
     margin = decide_pieces(field, policy, funnel, pieces, mode)
-    bounds = ", ".join(f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain))
+    bounds = ", ".join(
+        f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain)
+    )
     return Decision(
         statement=(
             f"funnel: every solution in it at a time in [{funnel.t0:g}, {funnel.tf:g}] s stays in "
@@ -125,21 +127,25 @@ def refuse_gaps(pieces: Pieces, field: VectorField, funnel: Funnel) -> None:
     covered: dict[tuple[int, int], Fraction] = {}
     table = zip(pieces.interval.tolist(), pieces.vertex.tolist(), pieces.level.tolist(),
                 pieces.index.tolist(), strict=True)  # fmt: skip
-    for k, v, level, index in sorted(table, key=lambda e: (e[0], e[1], Fraction(e[3], 2 ** min(e[2], 16)))):
+    for k, v, level, index in sorted(
+        table, key=lambda e: (e[0], e[1], Fraction(e[3], 2 ** min(e[2], 16)))
+    ):
         if not (0 <= k < intervals and 0 <= v < vertices):
             raise CertificateRejected(f"a piece is about interval {k}, vertex {v}, which is none")
         if not (0 <= level <= 16 and 0 <= index < 2**level):
             raise CertificateRejected(f"part {index} of 2^{level} is none of an interval's parts")
         start, end = covered.get((k, v), Fraction(0)), Fraction(index + 1, 2**level)
         if Fraction(index, 2**level) > start:
-            raise CertificateRejected(f"a piece is missing in interval {k} (vertex {v}): from s = {start}")
+            raise CertificateRejected(
+                f"a piece is missing in interval {k} (vertex {v}): from s = {start}"
+            )
         covered[k, v] = max(start, end)
     for k in range(intervals):
         for v in range(vertices):
             if covered.get((k, v), Fraction(0)) < 1:
                 raise CertificateRejected(
-                    f"a piece is missing: interval {k} from {funnel.t[k]:g} to {funnel.t[k + 1]:g} s "
-                    f"(vertex {v}) is not covered"
+                    f"a piece is missing: interval {k} from {funnel.t[k]:g} to "
+                    f"{funnel.t[k + 1]:g} s (vertex {v}) is not covered"
                 )
 
 
@@ -154,7 +160,9 @@ def _refuse_strangers(
     ):
         if stated != digests[role]:
             raise CertificateMismatch(f"the {owner} was made for another {role}: {stated[:23]}...")
-    if not (funnel.n == field.n == policy.x.control.shape[2] and policy.u.control.shape[2] == field.m):
+    if not (
+        funnel.n == field.n == policy.x.control.shape[2] and policy.u.control.shape[2] == field.m
+    ):
         raise CertificateRejected("dynamics, policy and funnel differ in size")
     same = np.array_equal(funnel.t, policy.t) and np.array_equal(funnel.x.control, policy.x.control)
     if not same:
@@ -175,5 +183,3 @@ def document_pieces(pieces: Pieces) -> list[Any]:
         }
         for i in range(len(pieces))
     ]
-
-

@@ -17,7 +17,7 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Funnel:
-    """x: nominal states (n,), continuous, cubic pieces at most. P: (K, n, n), rho: (K,) at its knots.
+    """x: nominal states (n,), continuous, cubic at most. P: (K, n, n) and rho: (K,) at its knots.
 
     P and ρ are linear between knots. vector_field and policy are digests of what it was made for.
     A funnel by itself claims nothing: its proof does.
@@ -39,7 +39,7 @@ class Funnel:
             raise ShapeError(
                 f"P should be {(knots, n, n)} and rho {(knots,)}, are {P.shape} and {rho.shape}"
             )
-        if not (np.isfinite(P).all() and (P == P.transpose(0, 2, 1)).all()):
+        if not (np.isfinite(P).all() and (P.transpose(0, 2, 1) == P).all()):
             raise DataError("P should be finite and symmetric at every knot")
         if not (np.isfinite(rho).all() and (rho > 0).all()):
             raise DataError(f"rho should be positive at every knot, its least is {rho.min():g}")
@@ -75,7 +75,7 @@ class Funnel:
 
     def nominal(self, t: float) -> FloatArray:
         """(n,) x₀(t)."""
-        return self.x(self._inside(t))
+        return np.asarray(self.x(self._inside(t)))
 
     def shape(self, t: float) -> FloatArray:
         """(n, n) P(t)/ρ(t): the ellipsoid is |x - x₀|² ≤ 1 in this norm."""
@@ -85,7 +85,7 @@ class Funnel:
     def value(self, t: float, X: ArrayLike) -> FloatArray:
         """V(t, x) at states X (N, n), (N,); at most 1 inside."""
         x_bar = self._states(X) - self.nominal(t)
-        return np.einsum("ni,ij,nj->n", x_bar, self.shape(t), x_bar)
+        return np.asarray(np.einsum("ni,ij,nj->n", x_bar, self.shape(t), x_bar))
 
     def gradient(self, t: float, X: ArrayLike) -> FloatArray:
         """∂V/∂x at states X (N, n), (N, n)."""
@@ -198,7 +198,9 @@ def ellipsoid_inside(
 
     def least(multiplier: float) -> float:
         corner = 1 - multiplier - d @ B @ d
-        M = np.block([[multiplier * A - B, -(B @ d)[:, None]], [-(B @ d)[None], np.array([[corner]])]])
+        M = np.block(
+            [[multiplier * A - B, -(B @ d)[:, None]], [-(B @ d)[None], np.array([[corner]])]]
+        )
         return float(np.linalg.eigvalsh(M)[0])
 
     low, high = lower, upper

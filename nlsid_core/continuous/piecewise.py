@@ -52,10 +52,10 @@ class PiecewisePolynomial:
     @property
     def degree(self) -> int:
         """The degree d of the pieces."""
-        return self.control.shape[1] - 1
+        return int(self.control.shape[1]) - 1
 
     def __call__(self, t: ArrayLike) -> FloatArray:
-        """Values (..., *shape) at times t (...) in s; at a knot, those of the piece that begins there.
+        """Values (..., *shape) at times t (...) in s; at a knot, of the piece that begins there.
 
         Times outside the knots take the nearest piece's polynomial.
         """

@@ -18,8 +18,8 @@ VERSION = 1
 class Policy:
     """x: nominal states (n,), u: nominal inputs (m,), K: gains (m, n), on the same knots.
 
-    K may be constant, linear or cubic on each piece. x has to be continuous. vector_field: digest of
-    the dynamics the policy was made for. Units are those of the dynamics, SI.
+    K may be constant, linear or cubic on each piece. x has to be continuous. vector_field: digest
+    of the dynamics the policy was made for. Units are those of the dynamics, SI.
 
     Raises ShapeError or DataError on parts that do not fit.
     """

@@ -48,7 +48,9 @@ class VectorField:
         bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
         breaks = np.array(self.breaks, dtype=np.float64)
         if not (np.isfinite(bounds).all() and (bounds[:, 0] <= bounds[:, 1]).all()):
-            raise DataError(f"bounds of the uncertain w should be finite pairs low <= high: {bounds}")
+            raise DataError(
+                f"bounds of the uncertain w should be finite pairs low <= high: {bounds}"
+            )
         if len(bounds) > MAX_UNCERTAIN:
             raise DataError(f"{len(bounds)} uncertain entries; at most {MAX_UNCERTAIN} are decided")
         if breaks.ndim != 1 or not np.isfinite(breaks).all() or (np.diff(breaks) <= 0).any():
@@ -136,7 +138,9 @@ class VectorField:
 
     def vertices(self) -> FloatArray:
         """(2^n_w, n_w) corners of the box of w; one empty row without uncertainty."""
-        return np.array(list(product(*self.uncertain.tolist()))).reshape(2 ** len(self.uncertain), -1)
+        return np.array(list(product(*self.uncertain.tolist()))).reshape(
+            2 ** len(self.uncertain), -1
+        )
 
     def span(self, t: float) -> int:
         """The index of the equations that hold from time t on."""
@@ -258,7 +262,9 @@ class _Plan:
 def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:
     """x0.., u0.., w0.."""
     return tuple(
-        f"{letter}{i}" for letter, size in (("x", n), ("u", m), ("w", uncertain)) for i in range(size)
+        f"{letter}{i}"
+        for letter, size in (("x", n), ("u", m), ("w", uncertain))
+        for i in range(size)
     )
 
 
@@ -274,9 +280,7 @@ def joined(fields: Sequence[VectorField], breaks: ArrayLike) -> VectorField:
     )
 
 
-def _table(
-    equations: Sequence[Polynomial], names: Sequence[str]
-) -> tuple[IntArray, FloatArray]:
+def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntArray, FloatArray]:
     if not any(len(p) for p in equations):
         empty = np.zeros((1, len(names)), dtype=np.int64)
         return empty, np.zeros((1, len(equations)))

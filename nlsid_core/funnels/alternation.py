@@ -1,4 +1,4 @@
-"""The thesis's alternation (Sections 6.2, 6.3): L-steps find multipliers, V-steps enlarge the funnel.
+"""The thesis's alternation (Sections 6.2, 6.3): L-steps find multipliers, V-steps enlarge.
 
 `alternate_rho` enlarges ρ(t), `alternate_shape` P(t). Both start from a funnel that holds at its
 knots and stop when the volume grows by less than 2.5 %. What holds at knots alone is a sampled
@@ -29,14 +29,14 @@ HIGHEST_DECAY = 40.0  # of the exponential start
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """A funnel that holds at its knots, which is no proof, and ∫ volume dt after every iteration."""
+    """A funnel that holds at its knots, which is no proof, and ∫ volume dt of every iterate."""
 
     funnel: Funnel
     volumes: tuple[float, ...]
 
 
-def exponential_start(steps: LSteps, policy: Policy, P: FloatArray, *, vector_field: str) -> Funnel:
-    """ρ(t) = exp(-c (t_f - t)/(t_f - t₀)) with the least whole c that holds at the knots (Prop 6.2).
+def exponential_start(steps: LSteps, policy: Policy, P: FloatArray) -> Funnel:
+    """ρ(t) = exp(-c (t_f - t)/(t_f - t₀)), c the least whole number that holds (Prop 6.2).
 
     Raises Infeasible if none up to 40 does.
     """
@@ -44,13 +44,13 @@ def exponential_start(steps: LSteps, policy: Policy, P: FloatArray, *, vector_fi
     decay = 0.0
     while decay <= HIGHEST_DECAY:
         rho = np.exp(-decay * (t[-1] - t) / (t[-1] - t[0]))
-        funnel = Funnel(policy.x, P, rho, vector_field, "")
+        funnel = Funnel(policy.x, P, rho, policy.vector_field, "")
         if least_margin(funnel, solve_ends(steps, policy, funnel)) > 0:
             return funnel
         decay += 1.0
     raise Infeasible(
-        f"no exponential start up to c = {HIGHEST_DECAY:g} holds: try a smaller goal, more knots, or "
-        "other weights of the LQR"
+        f"no exponential start up to c = {HIGHEST_DECAY:g} holds: try a smaller goal, more "
+        "knots, or other weights of the LQR"
     )
 
 
@@ -75,9 +75,7 @@ def least_margin(funnel: Funnel, ends: Sequence[Ends]) -> float:
     return float(min(margins))
 
 
-def alternate_rho(
-    steps: LSteps, policy: Policy, funnel: Funnel, *, stop: float = STOP
-) -> Sampled:
+def alternate_rho(steps: LSteps, policy: Policy, funnel: Funnel, *, stop: float = STOP) -> Sampled:
     """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f).
 
     With the multipliers fixed, each V-step takes the largest ρ at a knot after the one behind it:

@@ -4,11 +4,10 @@ import numpy as np
 
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.certificate.closed_loop import error_at_end
-from nlsid_core.certificate.funnel_pieces import Pieces
 from nlsid_core.certificate.graded import monomials_of
 from nlsid_core.continuous import Funnel, Policy
 from nlsid_core.funnels.lstep import LSteps, coordinates
-from nlsid_core.funnels.pieces import end_proof
+from nlsid_core.funnels.pieces import Part, draft, end_proof
 from nlsid_core.funnels.sweep import Ends
 from nlsid_core.funnels.vstep import Affine, Sample, affine_form
 
@@ -42,8 +41,9 @@ class KnotForms:
         intervals = len(self.h)
         for end in (0, 1):
             T = np.array([self.frames[k + end] for k in range(intervals)])
-            draft = _draft(intervals, v, self.basis, T)
-            errors = error_at_end(steps.field, policy, funnel, draft, end)
+            parts = [Part(k, 0, 0) for k in range(intervals)]
+            blank = draft(steps.program, parts, np.repeat(T, v, axis=0), v)
+            errors = error_at_end(steps.field, policy, funnel, blank, end)
             for row in range(intervals * v):
                 k, vertex = divmod(row, v)
                 solution = (ends[k].start, ends[k].end)[end][vertex]
@@ -61,12 +61,14 @@ class KnotForms:
                 m = solution.m + growth
                 _, mu = end_proof(steps.program, solution, _by_degree(target, n), 1.0, m,
                                   constant=CONSTANT)  # fmt: skip
-                self.samples.append(affine_form(Sample(own, other, 1 / self.h[k], sign, y, mu, across)))
+                self.samples.append(
+                    affine_form(Sample(own, other, 1 / self.h[k], sign, y, mu, across))
+                )
                 self.pairs.append((own, other))
                 self.margins.append(min(margin, KEEP * m))
 
     def levels(self, k: int, after: float) -> list[tuple[FloatArray, FloatArray]]:
-        """(constant, slope) of c/ρ as functions of ρ_k at both ends of interval k, for ρ_{k+1} = after.
+        """c/ρ = constant + slope·ρ_k at both ends of interval k, for ρ_{k+1} = after.
 
         In the frames of the present funnel W = ρ°|z|², ρ° the present ρ at that end: the sample's
         constant is -Ẇ/ρ° + μ(1 - |z|²), so c/ρ° = it + ρ̇/ρ° + μ(ρ/ρ° - 1).
@@ -89,22 +91,6 @@ class KnotForms:
                     constant[:size] += mu * (after / present - 1)
                 result.append((constant, slope))
         return result
-
-
-def _draft(intervals: int, vertices: int, basis: IntArray, T: FloatArray) -> Pieces:
-    """Pieces that state frames only: whole intervals, every vertex."""
-    count = intervals * vertices
-    none = np.zeros(count, dtype=np.int64)
-    return Pieces(
-        basis,
-        interval=np.repeat(np.arange(intervals), vertices),
-        vertex=np.tile(np.arange(vertices), intervals),
-        level=none,
-        index=none,
-        T=np.repeat(T, vertices, axis=0),
-        mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
-        gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
-    )
 
 
 def _count(n: int, degree: int) -> int:

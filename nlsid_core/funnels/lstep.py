@@ -21,7 +21,8 @@ MAX_DEGREE = 3  # of f: then Ẇ has degree 4, as much as the sphere program's s
 class Section:
     """One side of one knot: what c(s, z) is made of at that instant, except ρ.
 
-    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), x̄ = √ρ·base·z.
+    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
+    x̄ = √ρ·base·z.
     span: which of the field's pieces holds.
     """
 
@@ -37,7 +38,7 @@ class Section:
 
 
 def section_at(field: VectorField, policy: Policy, P: FloatArray, k: int, s: float) -> Section:
-    """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) linear between knots."""
+    """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) is linear there."""
     t = policy.t
     h = t[k + 1] - t[k]
     here = (1 - s) * P[k] + s * P[k + 1]

@@ -5,7 +5,7 @@ m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)¾(1 + ½|z_nl|²), so that in between t
 decides; a piece it does not prove is halved, with a new L-step in its middle.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -117,19 +117,8 @@ def _pieces(
 ) -> Pieces:
     """The pieces of the proof for these parts, part by part, vertex by vertex."""
     n, program, vertices = funnel.n, steps.program, len(steps.vertices)
-    basis = np.vstack([np.zeros((1, n), dtype=np.int64), program.basis])
-    columns = {
-        "interval": np.array([p.interval for p in parts for _ in range(vertices)]),
-        "vertex": np.array([v for _ in parts for v in range(vertices)]),
-        "level": np.array([p.level for p in parts for _ in range(vertices)]),
-        "index": np.array([p.index for p in parts for _ in range(vertices)]),
-    }
-    k = len(basis)
-    triangle = np.triu_indices(k)
-    empty = {
-        "mu": np.zeros((len(columns["vertex"]), 2, Pieces.multiplier_size(basis))),
-        "gram": np.zeros((len(columns["vertex"]), 2, len(triangle[0]))),
-    }
+    basis = with_one(program)
+    triangle = np.triu_indices(len(basis))
     frames, mus, grams = [], [], []
     for end in (0, 1):
         T, rho, rows = [], [], []
@@ -141,12 +130,12 @@ def _pieces(
             T += [np.sqrt(rho_here) * section.base] * vertices
             rho += [rho_here] * vertices
             rows += known[i, s]
-        draft = Pieces(basis, **columns, T=np.array(T), **empty)
-        c, _ = closed_loop_polynomial(steps.field, policy, funnel, draft, Ball)
+        blank = draft(program, parts, np.array(T), vertices)
+        c, _ = closed_loop_polynomial(steps.field, policy, funnel, blank, Ball)
         at_end = {q: part.approximate()[:, -end] for q, part in c.items()}
         mu, gram = [], []
         for b, solution in enumerate(rows):
-            i = int(columns["interval"][b])
+            i = int(blank.interval[b])
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
@@ -164,12 +153,33 @@ def _pieces(
         full = monomials(n, [0, 1, 2])
         mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
     stacked = np.stack(grams, axis=1)
-    return Pieces(
-        basis,
-        **columns,
+    return replace(
+        blank,
         T=frames[0],
         mu=np.stack(mus, axis=1),
         gram=stacked[..., triangle[0], triangle[1]],
+    )
+
+
+def with_one(program: SphereProgram) -> IntArray:
+    """The program's basis with 1 in front."""
+    return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
+
+
+def draft(program: SphereProgram, parts: list[Part], T: FloatArray, vertices: int) -> Pieces:
+    """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
+    basis, count = with_one(program), len(parts) * vertices
+    whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
+    repeated = np.repeat(whole, vertices, axis=0)
+    return Pieces(
+        basis,
+        interval=repeated[:, 0],
+        vertex=np.tile(np.arange(vertices), len(parts)),
+        level=repeated[:, 1],
+        index=repeated[:, 2],
+        T=T,
+        mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
+        gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
     )
 
 
@@ -187,7 +197,7 @@ def end_proof(
     constant: the share of m that stays a constant; the rest makes Q positive definite.
     """
     n = program.n
-    basis = np.vstack([np.zeros((1, n), dtype=np.int64), program.basis])
+    basis = with_one(program)
     Q = np.zeros((len(basis), len(basis)))
     Q[1:, 1:] = program.gram(solution) * scale
     spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
@@ -234,15 +244,12 @@ def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
     return M
 
 
-def _joined(program: SphereProgram, done: list[tuple[Pieces, FloatArray]]) -> tuple[Pieces, FloatArray]:
+def _joined(
+    program: SphereProgram, done: list[tuple[Pieces, FloatArray]]
+) -> tuple[Pieces, FloatArray]:
     """All proved pieces in the order of time."""
     if not done:
-        n = program.n
-        basis = np.vstack([np.zeros((1, n), dtype=np.int64), program.basis])
-        none = np.zeros(0, dtype=np.int64)
-        k = len(basis) * (len(basis) + 1) // 2
-        return Pieces(basis, none, none, none, none, np.zeros((0, n, n)),
-                      np.zeros((0, 2, Pieces.multiplier_size(basis))), np.zeros((0, 2, k))), np.zeros(0)  # fmt: skip
+        return draft(program, [], np.zeros((0, program.n, program.n)), 1), np.zeros(0)
     whole = {
         key: np.concatenate([getattr(pieces, key) for pieces, _ in done])
         for key in ("interval", "vertex", "level", "index", "T", "mu", "gram")
@@ -259,5 +266,3 @@ def unsolved(policy: Policy, parts: tuple[Part, ...]) -> str:
     start, h = policy.t[part.interval], policy.t[part.interval + 1] - policy.t[part.interval]
     a, b = part.ends()
     return f"{start + a * h:.6g} to {start + b * h:.6g} s"
-
-

@@ -36,7 +36,7 @@ def simulate_boundary(
     scale: float = 1.0,
     substeps: int = SUBSTEPS,
 ) -> Soundness:
-    """Follow `starts` random points of {V = scale²} at a knot to the end; w random within its box."""
+    """Follow `starts` random points of {V = scale²} at a knot to the end; w at random corners."""
     violations, largest = 0, 0.0
     for first in range(0, starts, CHUNK):
         count = min(CHUNK, starts - first)

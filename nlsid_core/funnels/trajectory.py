@@ -1,9 +1,9 @@
 """`design_funnel`: dynamics and a nominal motion in; policy, funnel and its proof out."""
 
+import dataclasses
 import time
 from collections.abc import Callable
-from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ class FunnelDesign:
     goal_multiplier: float
     proved: Proved
     history: tuple[tuple[str, float], ...]
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def certificate(self, names: tuple[str, str, str] = FILES[:3]) -> Json:
         """The proof file's content, about the three files it names."""
@@ -101,17 +101,16 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
-    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
     """The largest funnel around `nominal` that ends in `goal`, proved for every t.
 
     dynamics: a VectorField, or a polynomial function of some of t, x, u, w. goal: an ellipsoid, or
     its matrix around the nominal's end; by default the largest set that the closed loop keeps at
-    the end. policy: default a time-varying LQR with Q and R (identities by default) whose cost-to-go
-    is P(t); for a given policy P(t) solves the Lyapunov equation with Q. shape "rho": P is fixed and
+    the end. policy: default a time-varying LQR with Q and R (default identities), and P(t) its
+    cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. shape "rho": P fixed,
     ρ(t) is swept backward; "P": P(t) itself is searched, alternating, from there. gain: how the
-    LQR's K varies between knots. executor: for the independent programs of shape "P".
+    LQR's K varies between knots.
 
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
@@ -164,8 +163,9 @@ def refuse_nominal(field: VectorField, nominal: Nominal) -> None:
     scale = float(np.abs(nominal.x.derivative().control).max())
     if gap > DEFECT * max(scale, 1e-9):
         raise DataError(
-            f"the nominal does not obey the dynamics: dx{state}/dt is off by {gap:.3g} at t = {t:.6g} s "
-            f"(the largest rate is {scale:.3g}); integrate it with integrate_nominal or use more knots"
+            f"the nominal does not obey the dynamics: dx{state}/dt is off by {gap:.3g} at "
+            f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
+            "or more knots"
         )
 
 
@@ -181,7 +181,9 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
             raise DataError("the goal's matrix should be symmetric positive definite")
         d = nominal.x.ends()[-1] - wanted.centre
         if d @ wanted.P @ d >= 1:
-            raise DataError(f"the nominal ends outside the goal: |x - centre|² = {d @ wanted.P @ d:.3g} > 1")
+            raise DataError(
+                f"the nominal ends outside the goal: |x - centre|² = {d @ wanted.P @ d:.3g} > 1"
+            )
     return wanted
 
 
@@ -205,7 +207,8 @@ def _tracking(
         except (np.linalg.LinAlgError, ValueError) as error:
             raise Infeasible(
                 "the linearisation at the nominal's end cannot be stabilised by any gain "
-                f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal and a policy."
+                f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal "
+                "and a policy."
             ) from error
     if policy is None:
         return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
@@ -217,9 +220,7 @@ def _tracking(
     return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
 
 
-def _final(
-    steps: LSteps, policy: Policy, S: FloatArray, goal: Goal | None
-) -> tuple[float, Goal]:
+def _final(steps: LSteps, policy: Policy, S: FloatArray, goal: Goal | None) -> tuple[float, Goal]:
     """ρ(t_f) and the goal: the largest level inside a given goal, or one the end itself keeps."""
     end = policy.x.ends()[-1]
     if goal is None:
@@ -233,7 +234,9 @@ def _final(
             if low and high / low < 1.05:
                 break
         if low == 0:
-            raise Infeasible("the closed loop keeps no set at the end: give a goal, or another Q and R")
+            raise Infeasible(
+                "the closed loop keeps no set at the end: give a goal, or another Q and R"
+            )
         return low, Goal(end, S[-1] / (GOAL_ROOM * low))
     low, high = 0.0, 1.0
     d = end - goal.centre
@@ -264,6 +267,6 @@ def _swept(
         margin *= 3
     assert proved is not None
     raise Infeasible(
-        f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its knots hold: "
-        "try more knots there"
+        f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
+        "knots hold: try more knots there"
     )

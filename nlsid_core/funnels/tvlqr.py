@@ -3,6 +3,7 @@
 Source: thesis Sections 5.2 and 6.1, (6.2).
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -64,7 +65,9 @@ def tvlqr(
         BS = B.T @ S
         return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q))
 
-    S = _backward(rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?")
+    S = _backward(
+        rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
+    )
 
     def gain_at(k: int, side: float) -> FloatArray:
         return np.asarray(R_inverse @ _linearised(field, nominal, nominal.t[k], side)[1].T @ S[k])
@@ -132,7 +135,7 @@ def integrate_nominal(
 
 
 def nominal_through(t: ArrayLike, x: ArrayLike, u: ArrayLike, field: VectorField) -> Nominal:
-    """Given samples x (K, n), u (K, m) at times t (K,) as piecewise cubics with the field's slopes."""
+    """Samples x (K, n), u (K, m) at times t (K,), as cubics with the field's slopes."""
     t, x, u = (np.asarray(part, dtype=np.float64) for part in (t, x, u))
     inputs = linear_through(t, u)
     rates = np.array([field(s, x[k][None], u[k][None])[0] for k, s in enumerate(t)])
@@ -146,7 +149,7 @@ def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePol
     # Values at the four points from Bernstein control points, inverted.
     to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
                           for s in share])  # fmt: skip
-    for start, end in zip(t[:-1], t[1:], strict=True):
+    for start, end in itertools.pairwise(t):
         values = np.array([np.asarray(u(float(start + s * (end - start))), float) for s in share])
         pieces.append(np.linalg.solve(to_values, values))
     control = np.array(pieces)
@@ -197,10 +200,14 @@ def _backward(
 
 def _definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
     M = np.asarray(M, dtype=np.float64)
-    if M.shape != (n, n) or not np.isfinite(M).all() or np.abs(M - M.T).max() > 1e-12 * np.abs(M).max():
+    if (
+        M.shape != (n, n)
+        or not np.isfinite(M).all()
+        or np.abs(M - M.T).max() > 1e-12 * np.abs(M).max()
+    ):
         raise DataError(f"{name} should be a symmetric {n}x{n} matrix, has shape {M.shape}")
     lowest = float(np.linalg.eigvalsh(M)[0])
     if lowest < 0 or (strict and lowest <= 0):
         kind = "positive definite" if strict else "positive semidefinite"
         raise DataError(f"{name} should be {kind}; its smallest eigenvalue is {lowest:.3g}")
-    return (M + M.T) / 2
+    return np.asarray((M + M.T) / 2)

@@ -37,7 +37,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """c = constant + own·D_own + others·D_other, D by its upper triangle row by row; rows: monomials."""
+    """c = constant + own·D_own + others·D_other over monomials, D by its upper triangle."""
 
     constant: FloatArray
     own: FloatArray
@@ -128,7 +128,7 @@ def improve(
     samples and knots: c at each sample, and (own, other) knot. margins: what c keeps
     above zero at each sample, in 1/s. weights: (free,) of each knot's volume.
     reference: (free, n, n) matrices of the reference ellipsoids in the knots' coordinates: then the
-    objective is Σ weights·r with I + D ⪯ r·reference; else the linearised volume. trust: |D| ≤ trust.
+    objective is Σ weights·r with I + D ⪯ r·reference; else the linearised volume. trust: of |D|.
     """
     n, k = basis.shape[1], len(basis)
     d = n * (n + 1) // 2
@@ -152,7 +152,9 @@ def improve(
     cones = [Cone("zero", count * rows)]
     size = free * d + extra + count * triangle
     # Gram matrices: s = svec(Q) ⪰ 0.
-    A.append(sp.hstack([sp.csc_matrix((count * triangle, free * d + extra)), -sp.eye(count * triangle)]))
+    A.append(
+        sp.hstack([sp.csc_matrix((count * triangle, free * d + extra)), -sp.eye(count * triangle)])
+    )
     b.append(np.zeros(count * triangle))
     cones += [Cone("psd", k)] * count
     a, c = conic.triangle(n)
