@@ -34,9 +34,9 @@ def dynamics(x: Any, u: Any) -> Any:
     """ẋ; x (6,) and u (3,) may hold numbers or polynomials."""
     sigma, omega = x[:3], x[3:]
     H = np.diag(INERTIA)
-    cross = np.array([b for b in _cross(sigma, omega)])
+    cross = np.array(_cross(sigma, omega))
     kinematics = ((1 - sigma @ sigma) * omega + 2 * sigma * (sigma @ omega) + 2 * cross) / 4
-    torque = u - np.array([b for b in _cross(omega, H @ omega)])
+    torque = u - np.array(_cross(omega, H @ omega))
     return np.concatenate([kinematics, torque * (1 / INERTIA)])
 
 
@@ -47,7 +47,7 @@ def nominal_input(t: float) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """At the knots t (49,): x₀ (piecewise cubic between), S (49, 6, 6) of the TVLQR, K (48, 3, 6)."""
+    """At the knots t (49,): x₀ (a cubic between), S (49, 6, 6) of the TVLQR, K (48, 3, 6)."""
 
     t: FloatArray
     x: CubicHermiteSpline
@@ -78,10 +78,13 @@ class LStep:
         """g as a polynomial in z0..z5."""
         names = [f"z{i}" for i in range(6)]
         closed = np.vstack([self.T, -self.K @ self.T])
-        moved = compose_affine(
-            self.field, closed, np.r_[self.offset, self.u], names=names
-        ) - self.x_rate
-        z = np.array([Polynomial(row[None], np.ones(1), tuple(names)) for row in np.eye(6, dtype=int)])
+        moved = (
+            compose_affine(self.field, closed, np.r_[self.offset, self.u], names=names)
+            - self.x_rate
+        )
+        z = np.array(
+            [Polynomial(row[None], np.ones(1), tuple(names)) for row in np.eye(6, dtype=int)]
+        )
         x_bar = self.T @ z
         W_rate = 2 * (self.P @ x_bar) @ moved + x_bar @ (self.P_rate @ x_bar)
         g: Polynomial = (self.rho_rate - W_rate) / self.rho
@@ -126,7 +129,9 @@ def nominal() -> Nominal:
     S = (S + S.transpose(0, 2, 1)) / 2
     x = motion.sol(t).T
     rates = np.array([dynamics(x[k], nominal_input(s)) for k, s in enumerate(t)])
-    return Nominal(t, CubicHermiteSpline(t, x, rates), S, R_INVERSE * np.einsum("ji,kjl->kil", B, S)[:-1])
+    return Nominal(
+        t, CubicHermiteSpline(t, x, rates), S, R_INVERSE * np.einsum("ji,kjl->kil", B, S)[:-1]
+    )
 
 
 def l_steps(motion: Nominal) -> list[LStep]:

@@ -7,6 +7,7 @@ rumour: what is returned is judged by the residuals computed here, and a caller 
 takes the solution to `nlsid_core.certificate`.
 """
 
+import importlib
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -17,7 +18,7 @@ import clarabel
 import numpy as np
 import scipy.sparse as sp
 
-from nlsid_core._types import FloatArray
+from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 
 ConeKind: TypeAlias = Literal["zero", "nonnegative", "second_order", "psd"]
@@ -186,12 +187,12 @@ class _Outcome:
 
 def _attempt(program: ConeProgram, rung: str, tolerance: float) -> _Outcome:
     if rung == "clarabel":
-        return _clarabel(program, tolerance, refine=False)
+        return _clarabel_dual(program, tolerance)
     if rung == "clarabel refined":
         return _clarabel(program, tolerance, refine=True)
     if rung == "clarabel rescaled":
         return _rescaled(program, tolerance)
-    return _through_cvxpy(program, rung, tolerance)
+    return _through_cvxpy(program, rung)
 
 
 def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outcome:
@@ -219,6 +220,75 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
     return _Outcome(status, *(np.array(part) for part in (solution.x, solution.s, solution.z)))
 
 
+def _clarabel_dual(program: ConeProgram, tolerance: float) -> _Outcome:
+    """Solve the dual instead where it is smaller: few equalities, many unknowns.
+
+    Columns V that only mirror a cone block (rows -x_V + s = 0) become slack. With the other rows G
+    and columns F: minimise b_G'z with A_GF'z = -q_F, q_V + A_GV'z ∈ K, and z ∈ K where G has one.
+    """
+    split = _mirrored(program) if not program.P.nnz else None
+    if split is None:
+        return _clarabel(program, tolerance, refine=False)
+    mirrored, columns, order, affine, cones = split
+    others = np.setdiff1d(np.arange(len(program.b)), mirrored)
+    free = np.setdiff1d(np.arange(len(program.q)), columns)
+    G = program.A.tocsr()[others].tocsc()
+    pick = np.searchsorted(others, affine)
+    keep = sp.csc_matrix(
+        (-np.ones(len(pick)), (np.arange(len(pick)), pick)), (len(pick), len(others))
+    )
+    dual = ConeProgram(
+        P=sp.csc_matrix((len(others), len(others))),
+        q=program.b[others],
+        A=sp.vstack([G[:, free].T, -G[:, order].T, keep], format="csc"),
+        b=np.concatenate([-program.q[free], program.q[order], np.zeros(len(pick))]),
+        cones=(Cone("zero", len(free)), *cones),
+    )
+    outcome = _clarabel(dual, tolerance, refine=False)
+    if outcome.x is None or "Infeasible" in outcome.status:
+        swapped = {"PrimalInfeasible": "DualInfeasible", "DualInfeasible": "PrimalInfeasible"}
+        return _Outcome(swapped.get(outcome.status, outcome.status))
+    x, s, z = np.zeros(len(program.q)), np.zeros(len(program.b)), np.zeros(len(program.b))
+    mirror = slice(len(free), len(free) + len(order))
+    x[free], x[order] = -outcome.z[: len(free)], outcome.z[mirror]
+    s[mirrored], s[affine] = x[order], outcome.z[mirror.stop :]
+    z[others], z[mirrored] = outcome.x, outcome.s[mirror]
+    return _Outcome(outcome.status, x, s, z)
+
+
+def _mirrored(program: ConeProgram) -> tuple[Any, Any, Any, Any, list[Cone]] | None:
+    """Rows and columns of cone blocks that are unknowns themselves; None if there are none.
+
+    Returns the rows, the set of columns, the columns in row order, the rows of the other cones, and
+    the cones: mirrored ones first, then the others.
+    """
+    A = program.A.tocsr()
+    single = (np.diff(A.indptr) == 1) & (program.b == 0)
+    single[single] = A.data[A.indptr[:-1][single]] == -1.0
+    rows: list[IntArray] = []
+    affine: list[IntArray] = []
+    first: list[Cone] = []
+    second: list[Cone] = []
+    start = 0
+    for cone in program.cones:
+        block = np.arange(start, start + cone.rows)
+        start += cone.rows
+        if cone.kind == "zero":
+            continue
+        mirrors = bool(single[block].all())
+        (rows if mirrors else affine).append(block)
+        (first if mirrors else second).append(cone)
+    if not rows:
+        return None
+    mirrored = np.concatenate(rows)
+    order = A.indices[A.indptr[:-1][mirrored]]
+    columns = np.unique(order)
+    if len(columns) < len(order):  # one unknown in two cones: leave the program as it is
+        return None
+    other = np.concatenate([np.zeros(0, dtype=np.int64), *affine])
+    return mirrored, columns, order, other, first + second
+
+
 def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     """Columns of A to unit size, then b and q to unit size; undone afterwards."""
     size = np.sqrt(np.asarray(program.A.multiply(program.A).sum(axis=0)).ravel())
@@ -238,9 +308,9 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, outcome.z / dual)
 
 
-def _through_cvxpy(program: ConeProgram, name: str, tolerance: float) -> _Outcome:
+def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     """Any solver cvxpy has, by its name."""
-    import cvxpy as cp
+    cp: Any = importlib.import_module("cvxpy")  # slow to import, and rarely needed
 
     if name.upper() not in cp.installed_solvers():
         raise SolverError(
@@ -296,13 +366,14 @@ def _residual(program: ConeProgram, x: FloatArray, s: FloatArray, z: FloatArray)
     primal = np.abs(program.A @ x + s - program.b).max(initial=0.0)
     dual = np.abs(Px + program.q + program.A.T @ z).max(initial=0.0)
     gap = abs(float(x @ Px + program.q @ x + program.b @ z))
-    return max(
+    worst = max(
         primal / (1 + np.abs(program.b).max(initial=0.0) + np.abs(s).max(initial=0.0)),
         dual / (1 + np.abs(program.q).max(initial=0.0) + np.abs(Px).max(initial=0.0)),
         gap / (1 + abs(float(program.q @ x))),
         -_smallest(program.cones, s) / (1 + np.abs(s).max(initial=0.0)),
         -_smallest(program.cones, z, dual=True) / (1 + np.abs(z).max(initial=0.0)),
     )
+    return float(worst)
 
 
 def _smallest(cones: Sequence[Cone], s: FloatArray, *, dual: bool = False) -> float:
@@ -318,7 +389,7 @@ def _smallest(cones: Sequence[Cone], s: FloatArray, *, dual: bool = False) -> fl
         elif cone.kind == "second_order":
             worst = min(worst, float(block[0] - np.linalg.norm(block[1:])))
         elif cone.kind == "nonnegative":
-            worst = min(worst, float(block.min()))
+            worst = min(worst, float(np.min(block)))
         else:
             worst = min(worst, -float(np.abs(block).max()))
     return worst

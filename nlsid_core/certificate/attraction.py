@@ -36,10 +36,11 @@ def prove_attraction(
     multiplier: Gram | None = None,
     mode: Mode = "exact",
 ) -> float:
-    """Prove that {V ≤ level} (everything, without a level) lies in the origin's region of attraction.
+    """Prove that {V ≤ level} (everything, if level is None) is attracted by the origin.
 
     field: ẋ_j, in the order of the variables. positive, decrease, multiplier: P, Q, S above.
-    Returns the margin; raises CertificateRejected with the reason, Undecided if this mode cannot tell.
+    Returns the margin; raises CertificateRejected with the reason, Undecided if this mode cannot
+    tell.
     """
     names = V.names
     if len(field) != len(names) or any(f.names != names for f in field):

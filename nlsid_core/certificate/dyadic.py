@@ -5,7 +5,7 @@ diagonally dominant is checked in integers, and proves M ≻ 0. Where that fails
 very ill-conditioned matrices) fraction-free elimination decides.
 """
 
-from math import frexp
+from math import frexp, inf, ldexp
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +17,7 @@ Integers: TypeAlias = list[list[int]]
 
 FACTOR_BITS = 60  # of the rounded factor; past the 53 of a float there is nothing left to keep
 SHIFT = 2.0**-46  # taken off a unit diagonal first, so that rounding the factor cannot matter
-ELIMINATION_ORDER = 150  # beyond it fraction-free elimination takes minutes
+ELIMINATION_WORK = 2_000_000  # order² times bits: beyond it elimination takes longer than seconds
 
 
 def is_positive_definite(M: Integers) -> bool:
@@ -47,7 +47,10 @@ def as_floats(M: Integers) -> tuple[FloatArray, list[int]]:
 
 
 def is_dominated(M: Integers) -> bool:
-    """True proves M ≻ 0 (False proves nothing): 2^(2t) S M S - LL' strictly diagonally dominant, S a diagonal of 2^-s_i."""
+    """True proves M ≻ 0, False proves nothing.
+
+    Shown: 2^(2t) S M S - LL' is strictly diagonally dominant, S the diagonal of 2^-s_i.
+    """
     n = len(M)
     scaled, shifts = as_floats(M)
     if not np.isfinite(scaled).all():
@@ -58,7 +61,10 @@ def is_dominated(M: Integers) -> bool:
         return False
     low = 2 * max(shifts, default=0)
     # Integers throughout: multiply by 2^(low + 2t), which makes every scaled entry whole.
-    L = [[round(entry * 2**FACTOR_BITS) for entry in row[: i + 1]] for i, row in enumerate(factor.tolist())]
+    L = [
+        [round(entry * 2**FACTOR_BITS) for entry in row[: i + 1]]
+        for i, row in enumerate(factor.tolist())
+    ]
     rest = [[0] * n for _ in range(n)]
     for i in range(n):
         for j in range(i + 1):
@@ -71,8 +77,12 @@ def is_dominated(M: Integers) -> bool:
 def _eliminate(M: Integers) -> int | None:
     """The rank of M if M ⪰ 0, else None, by fraction-free symmetric elimination (Bareiss)."""
     n = len(M)
-    if n > ELIMINATION_ORDER:
-        raise Undecided(f"a {n}x{n} matrix too close to singular for the fast exact test")
+    bits = max((abs(entry).bit_length() for row in M for entry in row), default=0)
+    if n * n * bits > ELIMINATION_WORK:
+        raise Undecided(
+            f"a {n}x{n} matrix with {bits} bits is too close to singular for the fast exact test, "
+            "and too large to eliminate"
+        )
     rows, previous = [row[:] for row in M], 1
     for rank in range(n):
         size = len(rows)
@@ -83,11 +93,7 @@ def _eliminate(M: Integers) -> int | None:
             return rank if not any(map(any, rows)) else None
         head, top = rows[pivot], rows[pivot][pivot]
         rows = [
-            [
-                (top * row[j] - row[pivot] * head[j]) // previous
-                for j in range(size)
-                if j != pivot
-            ]
+            [(top * row[j] - row[pivot] * head[j]) // previous for j in range(size) if j != pivot]
             for i, row in enumerate(rows)
             if i != pivot
         ]
@@ -96,8 +102,10 @@ def _eliminate(M: Integers) -> int | None:
 
 
 def _ldexp(value: int, power: int) -> float:
-    """value · 2^power, rounded; never overflows on the way."""
+    """value · 2^power, rounded; ±inf and 0 beyond what a float64 holds."""
     excess = max(0, value.bit_length() - 64)
     mantissa, exponent = frexp(float(value >> excess))
     total = exponent + excess + power
-    return float(np.ldexp(mantissa, min(total, 1100))) if total > -1100 else 0.0
+    if total > 1000:
+        return inf if value > 0 else -inf
+    return ldexp(mantissa, total)

@@ -8,7 +8,11 @@ from numpy.typing import NDArray
 
 from nlsid_core._types import IntArray
 from nlsid_core.certificate import dyadic
-from nlsid_core.certificate.rigorous import NotRepresentable
+from nlsid_core.certificate.rigorous import (
+    RESIDUAL_RATIO,
+    RESIDUAL_TOO_LARGE,
+    NotRepresentable,
+)
 from nlsid_core.errors import CertificateRejected, Undecided
 
 if TYPE_CHECKING:
@@ -36,10 +40,13 @@ def decide(
         residual[k] -= D * entry
     n = len(Q)
     M = [[2 * D * entry for entry in entries[i * n : (i + 1) * n]] for i in range(n)]
+    largest = max((abs(entry) for row in M for entry in row), default=0)
     for k, r in enumerate(residual):
         if r:
             if home[k] < 0:
                 raise NotRepresentable(k)
+            if abs(r) * RESIDUAL_RATIO > largest:
+                raise CertificateRejected(RESIDUAL_TOO_LARGE)
             i, j = divmod(int(home[k]), n)
             M[i][j] += r
             M[j][i] += r

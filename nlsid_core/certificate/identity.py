@@ -22,8 +22,10 @@ from nlsid_core.polynomial import Gram, Polynomial
 Mode: TypeAlias = Literal["exact", "rigorous"]
 Factor: TypeAlias = Polynomial | Gram
 
-MAX_ORDER = 500  # of a Gram matrix: beyond it deciding takes minutes, and so would a denial of service
-MAX_TERMS = 4_000_000  # products of coefficients to expand; a large real proof has 1e5
+MAX_ORDER = (
+    500  # of a Gram matrix: beyond it deciding takes minutes, and so would a denial of service
+)
+MAX_ENTRIES = 40_000_000  # exponents of the products to expand (320 MB); real proofs have 1e6
 MAX_DEGREE = 2**15  # keeps sums of exponents and their weights within 64-bit integers
 
 
@@ -63,9 +65,9 @@ def decide_identity(
     of_terms, of_pairs = position[: len(terms.exponents)], position[len(terms.exponents) :]
     home = np.full(len(keys), -1, dtype=np.int64)
     home[of_pairs[::-1]] = np.arange(len(pairs))[::-1]
-    engine = exact_numbers if mode == "exact" else rigorous
+    decide = exact_numbers.decide if mode == "exact" else rigorous.decide
     try:
-        return engine.decide(terms, of_terms, gram.Q, of_pairs, home, strict=strict)
+        return decide(terms, of_terms, gram.Q, of_pairs, home, strict=strict)
     except rigorous.NotRepresentable as error:
         monomial = Polynomial(keys[[error.index]], np.ones(1), gram.names)
         raise CertificateRejected(
@@ -77,8 +79,8 @@ def decide_identity(
 def decide_gram(gram: Gram, *, strict: bool, mode: Mode = "exact") -> None:
     """Prove gram.Q ≻ 0 (strict) or ⪰ 0 as it stands; raises as `decide_identity`."""
     _refuse_order(gram)
-    engine = exact_numbers if mode == "exact" else rigorous
-    engine.decide_matrix(gram.Q, strict=strict)
+    decide = exact_numbers.decide_matrix if mode == "exact" else rigorous.decide_matrix
+    decide(gram.Q, strict=strict)
 
 
 def vanishes_only_at_zero(gram: Gram) -> bool:
@@ -101,8 +103,10 @@ def group(exponents: IntArray) -> tuple[IntArray, IntArray]:
 
 def one(names: Sequence[str], value: int | float | Fraction = 1) -> Polynomial:
     """The constant `value`, exactly, as a factor in these variables."""
-    coefficients = np.array([value], dtype=object if isinstance(value, Fraction) else np.float64)
-    return Polynomial(np.zeros((1, len(names)), dtype=np.int64), coefficients, tuple(names))
+    exactly = Fraction(value)
+    is_float = isinstance(value, float) or (exactly.denominator == 1 and abs(exactly) <= 2**53)
+    coefficient = np.array([float(value)]) if is_float else np.array([exactly], dtype=object)
+    return Polynomial(np.zeros((1, len(names)), dtype=np.int64), coefficient, tuple(names))
 
 
 def _expand(target: Sequence[Product], gram: Gram) -> Terms:
@@ -117,8 +121,8 @@ def _expand(target: Sequence[Product], gram: Gram) -> Terms:
                 _refuse_order(factor)
         (e, a, w), (f, b, v) = _raw(product.left, product.derivative), _raw(product.right, None)
         size += len(a) * len(b)
-        if size > MAX_TERMS:
-            raise CertificateRejected(f"more than {MAX_TERMS} products to expand: not decided")
+        if size * n > MAX_ENTRIES:
+            raise Undecided(f"{size} products in {n} variables are too many to expand")
         parts.append(
             Terms(
                 (e[:, None] + f[None]).reshape(-1, n),
@@ -131,8 +135,8 @@ def _expand(target: Sequence[Product], gram: Gram) -> Terms:
         return Terms(np.zeros((0, n), np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.int64))
     return Terms(
         np.concatenate([part.exponents for part in parts]),
-        np.concatenate([part.left for part in parts]),
-        np.concatenate([part.right for part in parts]),
+        _joined([part.left for part in parts]),
+        _joined([part.right for part in parts]),
         np.concatenate([part.weight for part in parts]),
     )
 
@@ -144,8 +148,8 @@ def _raw(factor: Factor, derivative: int | None) -> tuple[IntArray, NDArray[Any]
         coefficients = factor.Q.ravel()
     else:
         exponents, coefficients = factor.exponents, factor.coefficients
-    if exponents.max(initial=0) > MAX_DEGREE:
-        raise CertificateRejected(f"degree {exponents.max()} is more than {MAX_DEGREE}")
+    if np.max(exponents, initial=0) > MAX_DEGREE:
+        raise CertificateRejected(f"degree {np.max(exponents)} is more than {MAX_DEGREE}")
     weights = np.ones(len(coefficients), dtype=np.int64)
     if derivative is not None:
         keep = exponents[:, derivative] > 0
@@ -155,8 +159,16 @@ def _raw(factor: Factor, derivative: int | None) -> tuple[IntArray, NDArray[Any]
     return exponents, coefficients, weights
 
 
+def _joined(arrays: list[NDArray[Any]]) -> NDArray[Any]:
+    """One array; rationals throughout if there is one among them."""
+    joined = np.concatenate(arrays)
+    if joined.dtype == object:
+        joined[:] = [Fraction(value) for value in joined]
+    return joined
+
+
 def _refuse_order(gram: Gram) -> None:
     if len(gram) > MAX_ORDER:
         raise Undecided(f"a Gram matrix of order {len(gram)}; this checker decides {MAX_ORDER}")
-    if gram.basis.max(initial=0) > MAX_DEGREE:
-        raise CertificateRejected(f"degree {gram.basis.max()} is more than {MAX_DEGREE}")
+    if np.max(gram.basis, initial=0) > MAX_DEGREE:
+        raise CertificateRejected(f"degree {np.max(gram.basis)} is more than {MAX_DEGREE}")

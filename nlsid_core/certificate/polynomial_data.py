@@ -67,6 +67,9 @@ def read_polynomial(document: Any, names: Sequence[str], *, source: str) -> Poly
     values = _json.member(document, "coefficients", list, source=source)
     if len(values) != len(exponents):
         raise DocumentError(f"{source}: {len(exponents)} exponents, {len(values)} coefficients")
+    if len({tuple(row) for row in exponents.tolist()}) < len(exponents):
+        # Adding its coefficients would round, and the claim be about another polynomial.
+        raise DocumentError(f"{source}: a monomial occurs twice")
     return Polynomial(exponents, _numbers(values, source), tuple(names))
 
 
@@ -111,7 +114,9 @@ def _exponents(document: Json, key: str, n: int, source: str) -> IntArray:
     rows = _json.member(document, key, list, source=source)
     for row in rows:
         if not isinstance(row, list) or len(row) != n or not all(type(e) is int for e in row):
-            raise DocumentError(f"{source}: a row of '{key}' should be {n} integers, is {row!r:.80}")
+            raise DocumentError(
+                f"{source}: a row of '{key}' should be {n} integers, is {row!r:.80}"
+            )
         if min(row) < 0:
             raise DocumentError(f"{source}: '{key}' holds a negative exponent: {row}")
     return np.array(rows, dtype=np.int64).reshape(-1, n)

@@ -30,4 +30,5 @@ class Verdict:
     seconds: float
 
     def __str__(self) -> str:
-        return f"PROVED {self.statement} margin {self.margin:.3g} in {self.seconds:.3f} s"
+        how = f"in {self.seconds:.3f} s ({self.mode})"
+        return f"PROVED {self.statement} margin {self.margin:.3g} {how}"

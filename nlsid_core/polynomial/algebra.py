@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
+from nlsid_core.polynomial.operations import OPERATORS, REFUSED
+from nlsid_core.polynomial.values import monomial_values
 
 Coefficients: TypeAlias = NDArray[Any]
 Number: TypeAlias = int | float | Fraction
@@ -71,7 +73,7 @@ class Polynomial:
     @property
     def degree(self) -> int:
         """Total degree; 0 for constants and for the zero polynomial."""
-        return int(self.exponents.sum(axis=1).max(initial=0))
+        return int(np.max(self.exponents.sum(axis=1), initial=0))
 
     @property
     def is_exact(self) -> bool:
@@ -150,21 +152,33 @@ class Polynomial:
         missing = [name for name in values if name not in self.names]
         if missing:
             raise DataError(f"no variable {', '.join(missing)}; it has {', '.join(self.names)}")
-        given = {name: as_polynomial(values[name]) for name in self.names if name in values}
-        constants = {name: value for name, value in given.items() if not value.degree}
-        rest = [(name, value) for name, value in given.items() if value.degree]
+        constants: dict[str, Any] = {}
+        rest: list[tuple[str, Polynomial]] = []
+        for name in (name for name in self.names if name in values):
+            value = values[name]
+            if isinstance(value, (float, Fraction)):
+                constants[name] = value
+                continue
+            inner = as_polynomial(value)
+            if inner.degree:
+                rest.append((name, inner))
+            else:
+                constants[name] = inner.coefficient([0] * len(inner.names))
         return self._at(constants)._horner(rest)
 
-    def _at(self, constants: Mapping[str, "Polynomial"]) -> "Polynomial":
-        """Constants in the place of variables, all at once."""
+    def _at(self, constants: Mapping[str, Any]) -> "Polynomial":
+        """Numbers in the place of variables, all at once."""
         if not constants:
             return self
-        exact = self.is_exact or any(value.is_exact for value in constants.values())
+        exact = self.is_exact or any(isinstance(value, Fraction) for value in constants.values())
         p = self.exact() if exact else self
-        coefficients = p.coefficients
-        for name, value in constants.items():
-            c = (value.exact() if exact else value).coefficients.sum()
-            coefficients = coefficients * c ** p.exponents[:, p.names.index(name)]
+        numbers = [Fraction(c) if exact else float(c) for c in constants.values()]
+        values = np.array(numbers, dtype=object if exact else np.float64)
+        column = {name: j for j, name in enumerate(p.names)}
+        powers = p.exponents[:, [column[name] for name in constants]]
+        term, which = np.nonzero(powers)
+        coefficients = p.coefficients.copy()
+        np.multiply.at(coefficients, term, values[which] ** powers[term, which])
         kept = [j for j, name in enumerate(p.names) if name not in constants]
         return Polynomial(p.exponents[:, kept], coefficients, tuple(p.names[j] for j in kept))
 
@@ -177,7 +191,7 @@ class Polynomial:
         kept = self.names[:j] + self.names[j + 1 :]
         reduced = np.delete(self.exponents, j, axis=1)
         result = constant(0, names=kept)
-        for power in range(int(powers.max(initial=0)), -1, -1):
+        for power in range(int(np.max(powers, initial=0)), -1, -1):
             part = Polynomial(
                 reduced[powers == power], self.coefficients[powers == power], kept
             )._horner(rest)
@@ -244,7 +258,7 @@ class Polynomial:
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **_: Any) -> Any:
         """NumPy's protocol: `array * polynomial` and `np.sqrt(polynomial)` arrive here."""
-        names = _OPERATORS.get(ufunc.__name__)
+        names = OPERATORS.get(ufunc.__name__)
         if method != "__call__" or names is None or len(inputs) > 2:
             raise NotPolynomial(f"{ufunc.__name__} of {_short(self)} is not a polynomial")
         if isinstance(inputs[0], Polynomial):
@@ -280,17 +294,6 @@ class Polynomial:
         return text or "0"
 
 
-_OPERATORS = {
-    "add": ("__add__", "__radd__"),
-    "subtract": ("__sub__", "__rsub__"),
-    "multiply": ("__mul__", "__rmul__"),
-    "divide": ("__truediv__", "__rtruediv__"),
-    "power": ("__pow__", "__rpow__"),
-    "negative": ("__neg__", "__neg__"),
-    "positive": ("__pos__", "__pos__"),
-}
-
-
 def variables(names: str | Sequence[str]) -> tuple[Polynomial, ...]:
     """One polynomial per name (a sequence, or one string split at spaces), in one common space."""
     names = tuple(names.split()) if isinstance(names, str) else tuple(names)
@@ -314,22 +317,9 @@ def as_polynomial(value: Any) -> Polynomial:
         return as_polynomial(value.item())
     if isinstance(value, (Rational, float, np.floating)):
         if isinstance(value, Integral):
-            return constant(int(value) if abs(value) <= 2**53 else Fraction(int(value)))
+            return constant(int(value) if abs(int(value)) <= 2**53 else Fraction(int(value)))
         return constant(Fraction(value) if isinstance(value, Rational) else float(value))
     raise NotPolynomial(f"{value!r} ({type(value).__name__}) is not a real number or a polynomial")
-
-
-def monomial_values(exponents: IntArray, points: FloatArray) -> FloatArray:
-    """(N, m) values of m monomials (m, n) at N points (N, n)."""
-    values = np.ones((len(points), len(exponents)))
-    for j in range(exponents.shape[1]):
-        top = int(exponents[:, j].max(initial=0))
-        if top:
-            powers = np.ones((top + 1, len(points)))
-            for k in range(1, top + 1):
-                powers[k] = powers[k - 1] * points[:, j]
-            values *= powers[exponents[:, j]].T
-    return values
 
 
 def _merge(exponents: IntArray, coefficients: Coefficients) -> tuple[IntArray, Coefficients]:
@@ -404,24 +394,5 @@ def _refusal(operation: str) -> Callable[..., Polynomial]:
     return refuse
 
 
-# NumPy calls these by name on the entries of an object array (np.sin -> .sin()); Python calls the
-# others. Without them the message would not say which operation was to blame.
-for _name in (
-    *"sin cos tan arcsin arccos arctan sinh cosh tanh arcsinh arccosh arctanh".split(),
-    *"exp exp2 expm1 log log2 log10 log1p sqrt cbrt floor ceil trunc rint hypot arctan2".split(),
-):
-    setattr(Polynomial, _name, _refusal(_name))
-for _name, _operation in {
-    "abs": "abs",
-    "mod": "remainder",
-    "rmod": "remainder",
-    "floordiv": "floor division",
-    "rfloordiv": "floor division",
-    "rpow": "exponentiation with an exponent",
-    "lt": "comparison <",
-    "le": "comparison <=",
-    "gt": "comparison >",
-    "ge": "comparison >=",
-    "bool": "the truth value",
-}.items():
-    setattr(Polynomial, f"__{_name}__", _refusal(_operation))
+for _name, _operation in REFUSED.items():
+    setattr(Polynomial, _name, _refusal(_operation))

@@ -13,9 +13,9 @@ from nlsid_core.errors import NotPolynomial, ShapeError
 from nlsid_core.polynomial.algebra import (
     Polynomial,
     as_polynomial,
-    monomial_values,
     variables,
 )
+from nlsid_core.polynomial.values import monomial_values
 
 
 def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray[Any]:
@@ -56,7 +56,7 @@ def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
 
     All are in the same variables; monomials they share are evaluated once.
     """
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     points = np.asarray(points, dtype=np.float64)
     exponents, table = coefficient_table(array.ravel().tolist())
     if points.shape[-1:] != (exponents.shape[1],):
@@ -67,7 +67,7 @@ def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
 
 def jacobian(polynomials: ArrayLike, names: Sequence[str]) -> NDArray[Any]:
     """∂p_i/∂names_j as an object array (..., len(names))."""
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     result = np.empty((*array.shape, len(names)), dtype=object)
     for index in np.ndindex(array.shape):
         for j, name in enumerate(names):
@@ -83,11 +83,13 @@ def compose_affine(
     A: (n, k) and b: (n,) of floats or Fractions, n the variables of the p_i in their order.
     Returns an object array of the shape of `polynomials`. Exact if A and b are Fractions.
     """
-    array = np.asarray(polynomials, dtype=object)
+    array: Any = np.asarray(polynomials, dtype=object)
     A, b = np.asarray(A), np.asarray(b)
     n = len(array.flat[0].names) if array.size else 0
     if A.shape != (n, len(names)) or b.shape != (n,):
-        raise ShapeError(f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}")
+        raise ShapeError(
+            f"A should have shape {(n, len(names))} and b {(n,)}: {A.shape}, {b.shape}"
+        )
     z = _object_array(variables(names))
     rational = A.dtype == object or b.dtype == object
     inner = [
@@ -109,8 +111,11 @@ def monomials(n: int, degrees: Sequence[int]) -> IntArray:
     rows = []
     for degree in sorted(set(degrees)):
         for chosen in combinations_with_replacement(range(n), degree):
-            rows.append(np.bincount(np.array(chosen, dtype=np.int64), minlength=n))
-    return np.array(rows, dtype=np.int64).reshape(-1, n)
+            row = [0] * n
+            for j in chosen:
+                row[j] += 1
+            rows.append(row)
+    return np.array(rows, dtype=np.int64).reshape(len(rows), n)
 
 
 def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, FloatArray]:

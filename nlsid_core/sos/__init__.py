@@ -1,11 +1,12 @@
 """Sums of squares: programs as data, compiled to cones, and a fast path on the sphere."""
 
-from nlsid_core.sos.compiled import Compiled, Solution, compile_program, solve
+from nlsid_core.sos.compiled import Compiled, compile_program, solve
 from nlsid_core.sos.program import (
     Identity,
     NonNegative,
     NormBound,
     Program,
+    Solution,
     SumOfSquares,
     Zero,
     forms_of,

@@ -14,13 +14,13 @@ def gram_basis(support: IntArray) -> IntArray:
 
     Starts from the monomials within half the degree bounds, then repeatedly drops b while b² is
     neither in the support nor a product of two other candidates. What is left lies in half the
-    Newton polytope: a vertex b of the hull of the candidates is only b·b, so it stays only if b² is in
-    the support.
+    Newton polytope: for a vertex b of the hull of the candidates b² is b·b only, so b stays only if
+    b² is in the support.
     """
     if not len(support):
         return np.zeros((0, support.shape[1]), dtype=np.int64)
     degrees = support.sum(axis=1)
-    low, high = int(degrees.min() + 1) // 2, int(degrees.max()) // 2
+    low, high = int(np.min(degrees) + 1) // 2, int(np.max(degrees)) // 2
     candidates = monomials(support.shape[1], range(low, high + 1))
     within = (candidates >= (support.min(axis=0) + 1) // 2) & (
         candidates <= support.max(axis=0) // 2

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.conic import ConeSolution
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial import Gram, Polynomial
 
@@ -24,6 +25,7 @@ class SumOfSquares:
     multipliers. degree: of each summand, in the indeterminates; default: the least even degree
     that fits p and the domain. modulo: one polynomial h; the identity then holds modulo h, without
     a multiplier (the sphere form). basis: (k, n) monomials v; default: chosen from the support.
+    lowest: the least degree of the multipliers σ_i, for a p that vanishes at 0 to that order.
     forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
     """
 
@@ -33,6 +35,7 @@ class SumOfSquares:
     degree: int | None = None
     modulo: Polynomial | None = None
     basis: IntArray | None = None
+    lowest: int = 0
     forms: tuple[str, ...] = ()
     name: str = ""
 
@@ -87,7 +90,9 @@ class Program:
             raise DataError("state one objective: maximise or minimise")
         for name, size in self.scale.items():
             if name not in self.indeterminates or not (np.isfinite(size) and size > 0):
-                raise DataError(f"scale {name}: {size}; expected a positive size of an indeterminate")
+                raise DataError(
+                    f"scale {name}: {size}; expected a positive size of an indeterminate"
+                )
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +107,30 @@ class Identity:
     multipliers: tuple[Gram, ...]
     equality_multipliers: tuple[Polynomial, ...]
     name: str
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Values of the decisions, the identities found, and how the solver got there."""
+
+    values: dict[str, float]
+    identities: tuple[Identity, ...]
+    objective: float
+    cone: ConeSolution
+
+    def value(self, p: Polynomial) -> Polynomial:
+        """`p` with the decisions replaced by their values."""
+        known = {name: self.values[name] for name in p.names if name in self.values}
+        return p.substitute(known)
+
+    def __getitem__(self, name: str) -> Identity:
+        found = [identity for identity in self.identities if identity.name == name]
+        if not found:
+            raise KeyError(f"no identity '{name}'; named: {[i.name for i in self.identities]}")
+        return found[0]
+
+    def __str__(self) -> str:
+        return str(self.cone)
 
 
 def template(name: str, basis: ArrayLike, names: Sequence[str]) -> Polynomial:

@@ -4,11 +4,11 @@ One polynomial is a Gröbner basis of the ideal it generates, so division by it 
 remainder: p ≡ q on {g = 0} follows from equal remainders.
 """
 
+import numpy as np
+
 from nlsid_core._types import IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.polynomial import Polynomial
-
-import numpy as np
 
 
 class Quotient:
@@ -22,7 +22,10 @@ class Quotient:
         self.lead = generator.exponents[-1]
         # lead ≡ Σ tail_k · monomial_k
         self._tail = [
-            (generator.exponents[k] - self.lead, -generator.coefficients[k] / generator.coefficients[-1])
+            (
+                generator.exponents[k] - self.lead,
+                -generator.coefficients[k] / generator.coefficients[-1],
+            )
             for k in range(len(generator) - 1)
         ]
         self._known: dict[tuple[int, ...], dict[tuple[int, ...], float]] = {}
@@ -43,7 +46,7 @@ class Quotient:
 
     def standard(self, basis: IntArray) -> IntArray:
         """The rows of `basis` that are their own remainder; with the others they are dependent."""
-        return basis[(basis < self.lead).any(axis=1)]
+        return np.asarray(basis[(basis < self.lead).any(axis=1)])
 
 
 def divide(p: Polynomial, g: Polynomial) -> tuple[Polynomial, Polynomial]:

@@ -16,18 +16,21 @@ Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Tod
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.linalg import blas, lapack, qr
 
+from nlsid_core import conic
 from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials
-from nlsid_core.polynomial.algebra import monomial_values
+from nlsid_core.polynomial.values import monomial_values
 
 CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
 RANK_TOLERANCE = 1e-10  # of the QR diagonal: degree-4 monomials on a sphere keep 12 digits
 MAX_ITERATIONS = 60  # 8 to 12 are usual
-STEP_TO_BOUNDARY = 0.97  # of the way to where X or Z would stop being positive definite
-REGULARISATIONS = (1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
+STEP_TO_BOUNDARY = 0.95  # of the way to where X or Z would be singular; 0.99 loses the centre
+REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
 REFINEMENTS = 1  # a second one was never seen to change the number of iterations
 CENTRING_POWER = 2  # of Mehrotra's ratio of complementarities
 CERTIFY_FROM = 1e-6  # of the spread; from here rounding may undo what an iteration gains
@@ -119,9 +122,9 @@ class SphereProgram:
     ) -> SphereSolution:
         """Maximise m for g (N,), the values at `points`, until `gap` ≤ tolerance.
 
-        start: the solution of a similar problem. Raises ShapeError or DataError on bad values,
-        SolverError if no progress is made. Rounding may stop a large program at a gap above the
-        tolerance (1e-6 at n = 12); `gap` says what was reached.
+        start: the solution of a similar problem. Clarabel is the fallback, and `iterations` then 0.
+        Raises ShapeError or DataError on bad values, SolverError if nothing works. Rounding may
+        stop a large program at a gap above the tolerance (1e-6 at n = 12): `gap` says so.
         """
         values = np.asarray(g, dtype=np.float64)
         if values.shape != (len(self.points),):
@@ -134,7 +137,7 @@ class SphereProgram:
             return SphereSolution(
                 middle, middle, 0 * self._unit, self._centre, 0.0, 0, middle_point
             )
-        found = _interior_point(self, (values - middle) / spread, tolerance, start)
+        found = _solved(self, (values - middle) / spread, tolerance, start)
         return SphereSolution(
             m=middle + spread * found.m,
             upper=middle + spread * found.upper,
@@ -151,6 +154,40 @@ class SphereProgram:
         return np.asarray((Q + Q.T) / 2)
 
 
+def _solved(
+    program: SphereProgram, g: FloatArray, tolerance: float, start: SphereSolution | None
+) -> SphereSolution:
+    """Warm; cold if that fails; Clarabel if that fails too."""
+    for first in (start, None) if start is not None else (None,):
+        try:
+            return _interior_point(program, g, tolerance, first)
+        except SolverError:
+            continue
+    return _through_conic(program, g, tolerance)
+
+
+def _through_conic(program: SphereProgram, g: FloatArray, tolerance: float) -> SphereSolution:
+    """The same program as cone data, x = [m, svec X]."""
+    k = program._V.shape[1]
+    i, j = conic.triangle(k)
+    rows = program._V[:, i] * program._V[:, j] * np.where(i == j, 1.0, conic.SQRT2)
+    size = 1 + len(i)
+    found = conic.solve(
+        ConeProgram(
+            P=sp.csc_matrix((size, size)),
+            q=np.r_[-1.0, np.zeros(len(i))],
+            A=sp.vstack([np.c_[np.ones(len(g)), rows], -sp.eye(size, format="csr")[1:]], "csc"),
+            b=np.r_[g, np.zeros(len(i))],
+            cones=(Cone("zero", len(g)), Cone("psd", k)),
+        ),
+        tolerance=tolerance,
+    )
+    centred = _first_iterate(program, g, None)
+    y, m = found.z[: len(g)] / found.z[: len(g)].sum(), float(found.x[0])
+    X, upper = conic.smat(found.x[1:]), float(g @ y)
+    return _certified(program, g, SphereSolution(m, upper, X, y, upper - m, 0, centred))
+
+
 def _interior_point(
     program: SphereProgram, g: FloatArray, tolerance: float, start: SphereSolution | None
 ) -> SphereSolution:
@@ -159,6 +196,7 @@ def _interior_point(
     k = V.shape[1]
     X, y, m = _first_iterate(program, g, start)
     best: SphereSolution | None = None
+    M, work = (np.zeros((len(g), len(g)), order="F") for _ in range(2))  # lower triangles, reused
     for iteration in range(MAX_ITERATIONS + 1):
         Z = (V.T * y) @ V
         upper, mu = float(g @ y), float(np.vdot(X, Z)) / k
@@ -167,17 +205,20 @@ def _interior_point(
         if upper - m <= max(tolerance, CERTIFY_FROM):
             found = SphereSolution(m, upper, X, y, upper - m, iteration, centred)
             found = _certified(program, g, found)
-            worse = best is not None and found.gap >= best.gap
-            best = best if worse else found
-            if worse or upper - m <= tolerance:
+            if best is not None and found.gap >= best.gap:
+                return best
+            best = found
+            if upper - m <= tolerance:
                 return best
         Lx, Lz = _factor(X), _factor(Z)
         if Lx is None or Lz is None:
             break
         inverse, _ = lapack.dtrtri(Lz, lower=1)
         across, dual = V @ Lx, V @ inverse.T
-        M = blas.dsyrk(1.0, across, lower=1) * blas.dsyrk(1.0, dual, lower=1)
-        factor = _factor_or_regularise(M)
+        M = blas.dsyrk(1.0, across, beta=0.0, c=M, overwrite_c=1, lower=1)
+        work = blas.dsyrk(1.0, dual, beta=0.0, c=work, overwrite_c=1, lower=1)
+        np.multiply(M, work, out=M)
+        factor = _factor_or_regularise(M, work)
         if factor is None:
             break
         # M y = diag(VXV'), so dy = shift - y + dm·unit: only small right-hand sides are solved for.
@@ -211,9 +252,9 @@ def _interior_point(
 def _first_iterate(
     program: SphereProgram, g: FloatArray, start: SphereSolution | None
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Strictly feasible X, y, m: least-norm X for the equalities, shifted until positive definite."""
+    """Strictly feasible X, y, m: the least-norm X that meets the equalities, shifted."""
     if start is None:
-        X, y, m = 0 * program._unit, program._centre, float(g.min())
+        X, y, m = 0 * program._unit, program._centre, float(np.min(g))
         clearance = 1.0
     else:
         # The dual constraints do not depend on g, so y stays feasible; X is corrected and shifted.
@@ -224,9 +265,7 @@ def _first_iterate(
     return X + shift * program._unit, y, m - shift
 
 
-def _certified(
-    program: SphereProgram, g: FloatArray, found: SphereSolution
-) -> SphereSolution:
+def _certified(program: SphereProgram, g: FloatArray, found: SphereSolution) -> SphereSolution:
     """Meet the equalities to rounding, and give up as much of m as keeps X positive definite."""
     X = _corrected(program, found.X, g - found.m)
     shift = max(0.0, -_lowest(program, X)) * (1 + 1e-6)
@@ -254,17 +293,17 @@ def _factor(A: FloatArray) -> FloatArray | None:
     return None if info else np.asarray(L)
 
 
-def _factor_or_regularise(M: FloatArray) -> FloatArray | None:
-    """Cholesky factor of M, with the least regularisation that lets it complete."""
-    diagonal = np.diag(M)
-    factor, info = lapack.dpotrf(M, lower=1)
+def _factor_or_regularise(M: FloatArray, work: FloatArray) -> FloatArray | None:
+    """Cholesky factor of M, in `work`, with the least regularisation that lets it complete."""
+    diagonal = np.diag_indices(len(M))
     for regularisation in REGULARISATIONS:
+        np.copyto(work, M)
+        if regularisation:
+            work[diagonal] *= 1 + regularisation
+        factor, info = lapack.dpotrf(work, lower=1, clean=0, overwrite_a=1)
         if not info:
             return np.asarray(factor)
-        shifted = M.copy(order="F")
-        shifted[np.diag_indices(len(M))] += regularisation * diagonal
-        factor, info = lapack.dpotrf(shifted, lower=1, overwrite_a=1)
-    return None if info else np.asarray(factor)
+    return None
 
 
 def _solve(M: FloatArray, factor: FloatArray, rhs: FloatArray) -> FloatArray:

@@ -51,7 +51,7 @@ def sphere_proof(program: SphereProgram, solution: SphereSolution, g: Polynomial
     slack = constant(1.0, names=names) + Polynomial(
         squares.exponents, 0.5 * inside[squares.exponents.argmax(axis=1)], names
     )
-    # By degree, d_k = μ_k - |z|²μ_(k-2). Degrees 3 and 4 of d leave room for nonlinear variables only.
+    # By degree, d_k = μ_k - |z|²μ_(k-2). Degrees 3 and 4 leave room for nonlinear variables only.
     low = d.homogeneous(0)
     multiplier = low + _in_only(d.homogeneous(1), inside)
     multiplier = multiplier + _in_only(d.homogeneous(2) + squares * low, inside)
@@ -64,6 +64,6 @@ def sphere_proof(program: SphereProgram, solution: SphereSolution, g: Polynomial
 
 
 def _in_only(p: Polynomial, inside: NDArray[np.bool_]) -> Polynomial:
-    """The terms in the variables `inside`; the others are rounding, and the Gram matrix takes them."""
+    """The terms in the variables `inside`; the others are rounding, left to the Gram matrix."""
     keep = ~p.exponents[:, ~inside].any(axis=1)
     return Polynomial(p.exponents[keep], p.coefficients[keep], p.names)

@@ -43,7 +43,8 @@ def free_candidates(
 ) -> IntArray:
     """Monomials of a free multiplier, quadratic in the forms, that the sign symmetry keeps."""
     basis = _with_forms(names, forms, degree, 2)
-    return basis[((basis @ parity_kernel(symmetry % 2).T) % 2 == 0).all(axis=1)]
+    odd = (basis @ parity_kernel(symmetry % 2).T) % 2
+    return np.asarray(basis[(odd == 0).all(axis=1)])
 
 
 def _with_forms(names: Sequence[str], forms: Sequence[str], degree: int, power: int) -> IntArray:
@@ -60,7 +61,7 @@ def _with_forms(names: Sequence[str], forms: Sequence[str], degree: int, power: 
 
 def inner_degree(exponents: IntArray, inner: FloatArray | IntArray) -> int:
     """The largest degree in the variables that are not forms."""
-    return int(exponents[:, inner].sum(axis=1).max(initial=0))
+    return int(np.max(exponents[:, inner].sum(axis=1), initial=0))
 
 
 def gram_terms(block: Block, g: Polynomial) -> TermColumns:

@@ -1,1 +1,0 @@
-"""Short, complete programs."""

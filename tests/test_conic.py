@@ -1,0 +1,126 @@
+"""Cone programs with known answers, by every solver there is, and the ladder."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from nlsid_core import conic
+from nlsid_core.conic import Cone, ConeProgram, smat, solve, solve_all, svec
+from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
+
+
+def smallest_eigenvalue(C: np.ndarray) -> ConeProgram:
+    """minimise tr(CX) with tr X = 1, X ⪰ 0."""
+    n, m = len(C), len(svec(C))
+    A = sp.csc_matrix(np.vstack([svec(np.eye(n))[None], -np.eye(m)]))
+    b = np.r_[1.0, np.zeros(m)]
+    return ConeProgram(sp.csc_matrix((m, m)), svec(C), A, b, (Cone("zero", 1), Cone("psd", n)))
+
+
+def random_symmetric(seed: int, n: int = 5) -> np.ndarray:
+    C = np.random.default_rng(seed).normal(size=(n, n))
+    return np.asarray(C + C.T)
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "SCS", "CLARABEL"])
+def test_the_smallest_eigenvalue_is_found_by_every_solver(solver: str) -> None:
+    C = random_symmetric(0)
+    found = solve(smallest_eigenvalue(C), solver)
+    assert found.objective == pytest.approx(np.linalg.eigvalsh(C)[0], abs=1e-5)
+
+
+@pytest.mark.parametrize("rung", conic._LADDER)
+def test_every_rung_of_the_ladder_meets_the_optimality_conditions(rung: str) -> None:
+    program = smallest_eigenvalue(random_symmetric(1))
+    outcome = conic._attempt(program, rung, conic.TOLERANCE)
+    assert conic._residual(program, outcome.x, outcome.s, outcome.z) < 1e-5
+
+
+def test_a_second_order_cone_gives_the_distance_to_a_plane() -> None:
+    """minimise t with |x| ≤ t, 3x + 4y = 10: t = 2."""
+    A = sp.csc_matrix(np.array([[0, 3, 4], [-1, 0, 0], [0, -1, 0], [0, 0, -1.0]]))
+    program = ConeProgram(
+        sp.csc_matrix((3, 3)),
+        np.array([1.0, 0, 0]),
+        A,
+        np.array([10.0, 0, 0, 0]),
+        (Cone("zero", 1), Cone("second_order", 3)),
+    )
+    for solver in ("clarabel", "SCS"):
+        assert solve(program, solver).objective == pytest.approx(2.0, abs=1e-5)
+
+
+def test_a_quadratic_objective_is_minimised() -> None:
+    """minimise ½(x-3)² with x ≤ 1, up to a constant."""
+    program = ConeProgram(
+        sp.csc_matrix([[1.0]]),
+        np.array([-3.0]),
+        sp.csc_matrix([[1.0]]),
+        np.array([1.0]),
+        (Cone("nonnegative", 1),),
+    )
+    for solver in ("clarabel", "SCS"):
+        assert solve(program, solver).x == pytest.approx([1.0], abs=1e-5)
+
+
+def test_an_infeasible_program_says_what_was_tried() -> None:
+    program = smallest_eigenvalue(random_symmetric(0))
+    contradiction = ConeProgram(program.P, program.q, program.A, -program.b, program.cones)
+    with pytest.raises(Infeasible, match="clarabel"):
+        solve(contradiction)
+
+
+def test_the_result_says_which_rung_succeeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    honest = conic._attempt
+
+    def first_two_give_up(program: ConeProgram, rung: str, tolerance: float) -> conic._Outcome:
+        if rung in conic._LADDER[:2]:
+            return conic._Outcome("NumericalError")
+        return honest(program, rung, tolerance)
+
+    monkeypatch.setattr(conic, "_attempt", first_two_give_up)
+    found = solve(smallest_eigenvalue(random_symmetric(2)))
+    assert found.attempts == (
+        "clarabel: NumericalError",
+        "clarabel refined: NumericalError",
+        "clarabel rescaled: Solved",
+    )
+
+
+def test_a_wrong_answer_with_a_good_status_is_not_believed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def liar(program: ConeProgram, rung: str, tolerance: float) -> conic._Outcome:
+        del rung, tolerance
+        zero = np.zeros(len(program.b))
+        return conic._Outcome("Solved", np.ones(len(program.q)), zero, zero)
+
+    monkeypatch.setattr(conic, "_attempt", liar)
+    with pytest.raises(SolverError, match="Solved"):
+        solve(smallest_eigenvalue(random_symmetric(2)))
+
+
+def test_a_batch_is_solved_in_order_with_and_without_an_executor() -> None:
+    programs = [smallest_eigenvalue(random_symmetric(seed)) for seed in range(4)]
+    expected = [np.linalg.eigvalsh(random_symmetric(seed))[0] for seed in range(4)]
+    with ThreadPoolExecutor(2) as executor:
+        for found in (solve_all(programs), solve_all(programs, executor=executor)):
+            assert [one.objective for one in found] == pytest.approx(expected, abs=1e-6)
+
+
+def test_svec_keeps_inner_products() -> None:
+    A, B = random_symmetric(3), random_symmetric(4)
+    assert svec(A) @ svec(B) == pytest.approx(np.trace(A @ B))
+    assert smat(svec(A)) == pytest.approx(A)
+
+
+def test_sizes_and_numbers_are_checked_before_solving() -> None:
+    program = smallest_eigenvalue(random_symmetric(0))
+    with pytest.raises(ShapeError, match="do not fit"):
+        ConeProgram(program.P, program.q, program.A, program.b, (Cone("zero", 1),))
+    with pytest.raises(DataError, match="finite"):
+        ConeProgram(program.P, program.q * np.nan, program.A, program.b, program.cones)
+    with pytest.raises(SolverError, match="not installed"):
+        solve(program, "no such solver")

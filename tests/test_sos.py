@@ -1,0 +1,228 @@
+"""Sums of squares: bases, symmetry, multipliers, quotients, parameters, exact decompositions."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.polynomial import Polynomial, constant, monomials, variables
+from nlsid_core.sos import (
+    NonNegative,
+    NormBound,
+    Program,
+    SumOfSquares,
+    Zero,
+    compile_program,
+    forms_of,
+    matrix_sum_of_squares,
+    solve,
+    symmetric_template,
+    template,
+)
+from nlsid_core.sos.basis import gram_basis, sign_blocks
+from nlsid_core.sos.exact import exact_gram
+from nlsid_core.sos.quotient import Quotient, divide
+from nlsid_core.sos.search import lower_bound, lyapunov
+
+x, y = variables("x y")
+(t,) = variables("t")
+CAMEL = 4 * x**2 - 2.1 * x**4 + x**6 / 3 + x * y - 4 * y**2 + 4 * y**4
+
+
+def residual(identity: object) -> float:
+    """The largest coefficient of p - v'Qv - Σσg - Σμh left by the solver, without multipliers."""
+    from nlsid_core.sos import Identity
+
+    assert isinstance(identity, Identity)
+    difference = identity.p - identity.gram.polynomial()
+    return float(np.abs(difference.coefficients).max(initial=0.0))
+
+
+def test_the_basis_of_motzkins_polynomial_is_its_half_newton_polytope() -> None:
+    motzkin = x**4 * y**2 + x**2 * y**4 - 3 * x**2 * y**2 + 1
+    assert {tuple(b) for b in gram_basis(motzkin.exponents).tolist()} == {
+        (0, 0),
+        (1, 1),
+        (2, 1),
+        (1, 2),
+    }
+
+
+def test_the_basis_of_a_form_is_homogeneous() -> None:
+    assert gram_basis((x**4 + y**4).exponents).sum(axis=1).tolist() == [2, 2, 2]
+
+
+def test_even_polynomials_split_by_sign_symmetry() -> None:
+    support = (x**4 + y**4 + x**2 * y**2 + 1).exponents
+    blocks = sign_blocks(monomials(2, range(3)), support)
+    assert sorted(len(block) for block in blocks) == [1, 1, 1, 3]
+    together = sign_blocks(monomials(2, range(3)), np.vstack([support, [[1, 1]]]))
+    assert sorted(len(block) for block in together) == [2, 4]
+
+
+def test_the_camel_minimum_is_found_and_the_identity_holds() -> None:
+    found = solve(Program(("x", "y"), (SumOfSquares(CAMEL - t, name="p"),), maximise=t))
+    assert found.objective == pytest.approx(-1.0316284535, abs=1e-6)
+    assert residual(found["p"]) < 1e-6
+
+
+def test_scaling_changes_nothing_but_the_conditioning() -> None:
+    in_millimetres = CAMEL.substitute({"x": x / 1000, "y": y / 1000})
+    program = Program(
+        ("x", "y"),
+        (SumOfSquares(in_millimetres - t, name="p"),),
+        maximise=t,
+        scale={"x": 1000.0, "y": 1000.0},
+    )
+    found = solve(program)
+    assert found.objective == pytest.approx(-1.0316284535, abs=1e-6)
+    difference = found["p"].p - found["p"].gram.polynomial()
+    assert np.abs(difference([[500.0, -700.0], [0.0, 0.0]])).max() < 1e-6
+
+
+def test_a_disc_domain_uses_a_sum_of_squares_multiplier() -> None:
+    program = Program(
+        ("x", "y"), (SumOfSquares(x - t, domain=(1 - x**2 - y**2,), name="p"),), maximise=t
+    )
+    found = solve(program)
+    assert found.objective == pytest.approx(-1.0, abs=1e-6)
+    assert np.linalg.eigvalsh(found["p"].multipliers[0].Q)[0] > -1e-8
+
+
+def test_an_equation_takes_a_free_multiplier_and_its_quotient_none() -> None:
+    circle = 1 - x**2 - y**2
+    p = x**3 + x * y - y**4
+    full = Program(("x", "y"), (SumOfSquares(p - t, equalities=(circle,), name="p"),), maximise=t)
+    quotient = Program(("x", "y"), (SumOfSquares(p - t, modulo=circle, name="p"),), maximise=t)
+    a, b = solve(full), solve(quotient)
+    angle = np.linspace(0, 2 * np.pi, 100_001)
+    least = p(np.c_[np.cos(angle), np.sin(angle)]).min()
+    assert a.objective == pytest.approx(least, abs=1e-6)
+    assert b.objective == pytest.approx(least, abs=1e-6)
+    assert len(b["p"].gram) < len(a["p"].gram)
+
+
+def test_division_by_one_polynomial_leaves_the_normal_form() -> None:
+    circle = 1 - x**2 - y**2
+    p = x**4 * y + 3 * x**2 - y
+    mu, r = divide(p.exact(), circle.exact())
+    assert mu * circle + r == p
+    quotient = Quotient(circle)
+    assert all(quotient.remainder(e) == {e: 1.0} for e, _ in r.terms())
+
+
+def test_parameters_change_and_the_pattern_is_compiled_once() -> None:
+    (r,) = variables("r")
+    program = Program(("x", "y"), (SumOfSquares(CAMEL + r * x - t),), maximise=t, parameters=("r",))
+    compiled = compile_program(program)
+    for value in (0.0, 1.0, -2.0):
+        fresh = Program(("x", "y"), (SumOfSquares(CAMEL + value * x - t),), maximise=t)
+        again = compiled.solve({"r": value}).objective
+        assert again == pytest.approx(solve(fresh).objective, abs=1e-6)
+    both = compiled.solve_all([{"r": 0.0}, {"r": 1.0}])
+    assert both[0].objective > both[1].objective
+    with pytest.raises(DataError, match="no value for the parameter r"):
+        compiled.solve()
+
+
+def test_a_template_finds_the_lyapunov_function_of_a_linear_system() -> None:
+    """P - I ⪰ 0, -(A'P + PA) - I ⪰ 0, minimise tr P, as constant matrix inequalities."""
+    A = np.array([[-1.0, 2.0], [0.0, -3.0]])
+    P = symmetric_template("P", 2)
+    lyapunov_matrix = -(A.T @ P + P @ A)
+    one = constant(1.0)
+    identity = np.array([[one, 0 * one], [0 * one, one]], dtype=object)
+    program = Program(
+        forms_of(2),
+        (
+            matrix_sum_of_squares(P - identity, name="P"),
+            matrix_sum_of_squares(lyapunov_matrix - identity, name="decrease"),
+        ),
+        minimise=P[0, 0] + P[1, 1],
+    )
+    found = solve(program)
+    value = np.array([[float(found.value(P[i, j])) for j in range(2)] for i in range(2)])
+    assert np.linalg.eigvalsh(value - np.eye(2))[0] > -1e-6
+    assert np.linalg.eigvalsh(-(A.T @ value + value @ A) - np.eye(2))[0] > -1e-6
+
+
+def test_coefficients_can_be_forced_to_zero_and_norms_bounded() -> None:
+    """Maximise the slope of a line through the origin inside a cone: |(a, b)| ≤ 1, a = b."""
+    a, b = variables("a b")
+    program = Program(
+        ("x", "y"),
+        (
+            Zero((a - b) * x),
+            NormBound((a, b), constant(1.0)),
+            NonNegative(a),
+        ),
+        maximise=a + b,
+    )
+    assert solve(program).objective == pytest.approx(2**0.5, abs=1e-6)
+
+
+def test_free_polynomials_and_sum_of_squares_multipliers_can_be_written_out() -> None:
+    sigma = template("s", monomials(2, [0, 2]), ("x", "y"))
+    program = Program(
+        ("x", "y"),
+        (SumOfSquares(sigma), SumOfSquares(x**4 + 1 - t - sigma * (x**2 - 1))),
+        maximise=t,
+    )
+    assert solve(program).objective == pytest.approx(2.0, abs=1e-5)
+
+
+def test_products_of_unknowns_are_refused() -> None:
+    a, b = variables("a b")
+    with pytest.raises(DataError, match="linearly"):
+        compile_program(Program(("x", "y"), (SumOfSquares(a * b * x**2),)))
+
+
+def test_a_polynomial_that_is_negative_somewhere_is_infeasible() -> None:
+    with pytest.raises(Infeasible):
+        solve(Program(("x", "y"), (SumOfSquares(x**2 - 0.1 * y**2 * x**2 - 1),)))
+
+
+def test_an_exact_gram_matrix_is_rational_and_meets_the_identity_exactly() -> None:
+    p = (x - y / 3) ** 2 * (x + 1) ** 2 + (x * y - Fraction(1, 7)) ** 2 + 1
+    third = exact_gram(p)
+    assert third.polynomial() == p
+    assert third.Q.dtype == object
+
+
+def test_a_bound_with_a_zero_needs_the_zero() -> None:
+    p = (x**2 - 2 * x * y + y**2).exact()
+    gram = exact_gram(p, zeros=[(1, 1)])
+    assert gram.polynomial() == p
+    with pytest.raises(Infeasible):
+        exact_gram(p - Fraction(1, 10**6), zeros=[])
+
+
+def test_a_linear_system_has_a_quadratic_lyapunov_function_and_an_unstable_one_none() -> None:
+    assert lyapunov((-x + 2 * y, -3 * y)).level is None
+    with pytest.raises(Infeasible):
+        lyapunov((x + 2 * y, -3 * y))
+
+
+def test_a_proved_bound_is_below_the_minimum() -> None:
+    found = lower_bound(CAMEL)
+    assert found.value < found.optimum + 1e-9
+    assert found.value == pytest.approx(-1.0316284535, abs=1e-7)
+
+
+def test_solvers_through_cvxpy_agree_with_clarabel() -> None:
+    program = Program(("x", "y"), (SumOfSquares(x**4 + y**4 - x * y - t),), maximise=t)
+    assert solve(program, solver="SCS").objective == pytest.approx(
+        solve(program).objective, abs=1e-4
+    )
+
+
+def test_univariate_minima_are_exact() -> None:
+    (z,) = variables("z")
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        p: Polynomial = z**6 + sum(float(c) * z**k for k, c in enumerate(rng.normal(size=6)))
+        roots = np.roots([float(p.derivative("z").coefficient([k])) for k in range(5, -1, -1)])
+        least = np.min(p(roots[np.abs(roots.imag) < 1e-9].real[:, None]))
+        found = solve(Program(("z",), (SumOfSquares(p - t),), maximise=t))
+        assert found.objective == pytest.approx(least, abs=1e-6)
