@@ -19,7 +19,7 @@ from examples.satellite import FINAL_TIME
 from examples.satellite_funnel import goal_matrix, initial_funnel, problem
 from nlsid_core.certificate import check
 from nlsid_core.funnels import FunnelDesign, design_funnel
-from nlsid_core.funnels.alternation import alternate_rho
+from nlsid_core.funnels.alternation import alternate_rho, exponential_start
 from nlsid_core.funnels.lstep import LSteps
 from nlsid_core.funnels.soundness import simulate_boundary, smallest_escape
 
@@ -43,13 +43,14 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "pieces_proved": int(np.isfinite(design.proved.margins).sum()),
         "volumes": {f"{t:g}": design.funnel.volume(t) for t in TIMES},
         "policy_seconds": design.seconds["policy"],
-        "margin": float(design.proved.margins.min()),
+        "margin": float(np.min(design.proved.margins)),
     }
     for key, mode in (("check_seconds", "rigorous"), ("exact_seconds", "exact")):
         result[key] = check(proof, mode=mode).seconds  # type: ignore[arg-type]
     result |= _attacks(design, goal, arguments.starts)
-    start = initial_funnel(design)
-    result["initial_volume"] = start.volume_integral()
+    start = exponential_start(LSteps(field), design.policy, design.funnel.P)
+    result["initial_volume"] = initial_funnel(design).volume_integral()
+    result["start_volume"] = start.volume_integral()
     started = time.perf_counter()
     alternated = alternate_rho(LSteps(field), design.policy, start)
     result["alternation_seconds"] = time.perf_counter() - started

@@ -56,7 +56,7 @@ class Pieces:
     @staticmethod
     def multiplier_degrees(basis: IntArray) -> range:
         """The degrees of the multiplier's monomials."""
-        return range(max(2 * int(basis.sum(axis=1).max()) - 1, 1))
+        return range(max(2 * int(np.max(basis.sum(axis=1))) - 1, 1))
 
     def select(self, chosen: slice | IntArray) -> "Pieces":
         """Some of the pieces."""
@@ -86,7 +86,7 @@ def decide_pieces(
         raise refusal(
             f"piece {i} (interval {k}, {where}): V is not proved to decrease on the boundary"
         )
-    return float(margins.min())
+    return float(np.min(margins))
 
 
 def piece_margins(
@@ -139,7 +139,7 @@ def _margins(
         bounds = [_lowest(grams[i, k], float(shift[i, k]), arithmetic) for k in range(N + 1)]
         # c ≥ min_k λ_k/binomial_k · |v|² ≥ that, since 1 is among v and the weights add to 1.
         if min(bounds) > 0:
-            result[i] = float((bounds / scale).min() / (h[i] * largest[i])) / SLACK
+            result[i] = float(np.min(bounds / scale) / (h[i] * largest[i])) / SLACK
     return result
 
 

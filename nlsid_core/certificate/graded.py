@@ -88,7 +88,7 @@ def multiply(p: Mapping[int, Number], q: Mapping[int, Number], n: int) -> Graded
 def _multiply_parts(p: Number, q: Number, table: IntArray) -> Number:
     batch = max(p.shape[0], q.shape[0])
     S = q.shape[1]
-    result = type(p).zeros((batch, p.shape[1] + S - 1, int(table.max()) + 1))
+    result = type(p).zeros((batch, p.shape[1] + S - 1, int(np.max(table)) + 1))
     for k in range(p.shape[1]):
         for j in range(p.shape[2]):
             index = (slice(None), slice(k, k + S), table[j])

@@ -89,7 +89,7 @@ def refuse_goal(funnel: Funnel, centre: FloatArray, P: FloatArray, multiplier: f
 def read_pieces(proof: Json, n: int) -> Pieces:
     """The pieces of a proof as arrays; DocumentError if they are not what they should be."""
     basis = _json.array(proof, "basis", (None, n), source="proof")
-    if not ((basis >= 0).all() and (basis == np.round(basis)).all() and basis.max(initial=0) <= 8):
+    if not ((basis >= 0).all() and (basis == np.round(basis)).all() and (basis <= 8).all()):
         raise CertificateRejected("the Gram basis should hold small nonnegative exponents")
     exponents = basis.astype(np.int64)
     if len(np.unique(exponents, axis=0)) != len(exponents) or len(exponents) > 500:

@@ -42,10 +42,10 @@ class Funnel:
         if not (np.isfinite(P).all() and (P.transpose(0, 2, 1) == P).all()):
             raise DataError("P should be finite and symmetric at every knot")
         if not (np.isfinite(rho).all() and (rho > 0).all()):
-            raise DataError(f"rho should be positive at every knot, its least is {rho.min():g}")
+            raise DataError(f"rho should be positive at every knot, its least is {np.min(rho):g}")
         lowest = np.linalg.eigvalsh(P)[:, 0]
         if not (lowest > 0).all():
-            k = int(lowest.argmin())
+            k = int(np.argmin(lowest))
             raise DataError(f"P is not positive definite at knot {k} (eigenvalue {lowest[k]:.3g})")
         if not self.x.is_continuous():
             raise DataError("the nominal states of a funnel should be continuous")

@@ -69,7 +69,10 @@ class Policy:
         t = _json.array(document, "t", (None,), source=source)
         x = _json.array(document, "x", (None, None, None), source=source)
         u = _json.array(document, "u", (None, None, None), source=source)
-        K = _json.array(document, "K", (None, None, None, None), source=source)
+        if u.shape[2]:
+            K = _json.array(document, "K", (None, None, None, None), source=source)
+        else:  # an autonomous system: JSON cannot tell the shape of nothing
+            K = np.zeros((len(x), 1, 0, x.shape[2]))
         return cls(
             PiecewisePolynomial(t, x),
             PiecewisePolynomial(t, u),

@@ -14,8 +14,8 @@ from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.certificate import polynomial_data as data
 from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
 from nlsid_core.polynomial import Polynomial, trace
-from nlsid_core.polynomial.algebra import monomial_values
 from nlsid_core.polynomial.maps import coefficient_table
+from nlsid_core.polynomial.values import monomial_values
 
 FORMAT = "nlsid/vector_field"
 VERSION = 1
@@ -119,7 +119,7 @@ class VectorField:
         """Largest total degree in x and u."""
         columns = slice(1, 1 + self.n + self.m)
         return max(
-            int(p.exponents[:, columns].sum(axis=1).max(initial=0))
+            int(np.max(p.exponents[:, columns].sum(axis=1), initial=0))
             for equations in self.pieces
             for p in equations
         )

@@ -12,6 +12,7 @@ from nlsid_core._types import FloatArray
 from nlsid_core.continuous import Policy, VectorField
 from nlsid_core.continuous.piecewise import bernstein
 from nlsid_core.errors import DataError
+from nlsid_core.funnels.line import LineProgram
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
 MAX_DEGREE = 3  # of f: then Ẇ has degree 4, as much as the sphere program's squares
@@ -117,9 +118,11 @@ class LSteps:
         return min(bounds)
 
 
-def sphere_program(field: VectorField) -> SphereProgram:
+def sphere_program(field: VectorField) -> SphereProgram | LineProgram:
     """The program for this field: nonlinear states last, degree 2 only where they occur."""
     n, count = field.n, len(field.nonlinear_states)
+    if n == 1:
+        return LineProgram()
     if count in (0, n):
         return SphereProgram(n)
     return SphereProgram(n, tuple(range(n - count, n)))

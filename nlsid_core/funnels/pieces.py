@@ -16,6 +16,7 @@ from nlsid_core.certificate.funnel_pieces import Pieces, piece_margins
 from nlsid_core.certificate.graded import monomials_of, positions, product_table
 from nlsid_core.continuous import Funnel, Policy
 from nlsid_core.errors import SolverError
+from nlsid_core.funnels.line import LineProgram
 from nlsid_core.funnels.lstep import LSteps, section_at
 from nlsid_core.funnels.sweep import Ends
 from nlsid_core.polynomial.maps import monomials
@@ -161,12 +162,12 @@ def _pieces(
     )
 
 
-def with_one(program: SphereProgram) -> IntArray:
+def with_one(program: SphereProgram | LineProgram) -> IntArray:
     """The program's basis with 1 in front."""
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
-def draft(program: SphereProgram, parts: list[Part], T: FloatArray, vertices: int) -> Pieces:
+def draft(program: SphereProgram | LineProgram, parts: list[Part], T: FloatArray, vertices: int) -> Pieces:
     """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
     basis, count = with_one(program), len(parts) * vertices
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
@@ -184,7 +185,7 @@ def draft(program: SphereProgram, parts: list[Part], T: FloatArray, vertices: in
 
 
 def end_proof(
-    program: SphereProgram,
+    program: SphereProgram | LineProgram,
     solution: SphereSolution,
     target: dict[int, FloatArray],
     scale: float,
@@ -245,7 +246,7 @@ def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
 
 
 def _joined(
-    program: SphereProgram, done: list[tuple[Pieces, FloatArray]]
+    program: SphereProgram | LineProgram, done: list[tuple[Pieces, FloatArray]]
 ) -> tuple[Pieces, FloatArray]:
     """All proved pieces in the order of time."""
     if not done:

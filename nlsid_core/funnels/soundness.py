@@ -46,7 +46,7 @@ def simulate_boundary(
             X, V = follow(field, policy, funnel, k, X, rng, substeps)
             worst = np.maximum(worst, V)
         violations += int((worst > 1 + TOLERANCE).sum())
-        largest = max(largest, float(worst.max()))
+        largest = max(largest, float(np.max(worst)))
     return Soundness(starts, violations, largest)
 
 

@@ -85,7 +85,8 @@ class FunnelDesign:
     def __str__(self) -> str:
         return (
             f"funnel from {self.funnel.t0:g} to {self.funnel.tf:g} s, "
-            f"{len(self.proved.pieces)} pieces proved, margin {self.proved.margins.min():.3g} 1/s, "
+            f"{len(self.proved.pieces)} pieces proved, "
+            f"margin {np.min(self.proved.margins):.3g} 1/s, "
             f"volume integral {self.funnel.volume_integral():.4g}, "
             f"{sum(self.seconds.values()):.2f} s"
         )

@@ -203,10 +203,10 @@ def _definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
     if (
         M.shape != (n, n)
         or not np.isfinite(M).all()
-        or np.abs(M - M.T).max() > 1e-12 * np.abs(M).max()
+        or not np.allclose(M, M.T, rtol=1e-12, atol=0.0)
     ):
         raise DataError(f"{name} should be a symmetric {n}x{n} matrix, has shape {M.shape}")
-    lowest = float(np.linalg.eigvalsh(M)[0])
+    lowest = float(np.linalg.eigvalsh(M)[0]) if n else 1.0
     if lowest < 0 or (strict and lowest <= 0):
         kind = "positive definite" if strict else "positive semidefinite"
         raise DataError(f"{name} should be {kind}; its smallest eigenvalue is {lowest:.3g}")
