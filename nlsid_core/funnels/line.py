@@ -16,6 +16,7 @@ class LineProgram:
     """What `SphereProgram` is for two and more variables; v = (z, z²), points z = 1 and z = -1."""
 
     n: int = 1
+    chosen: tuple[int, ...] = (0,)
     basis: IntArray = field(default_factory=lambda: np.array([[1], [2]]))
     weight: FloatArray = field(default_factory=lambda: np.sqrt(np.array([0.5, 0.5])))
     points: FloatArray = field(default_factory=lambda: np.array([[1.0], [-1.0]]))

@@ -71,7 +71,7 @@ def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
     order = [j for j in range(n) if j not in nonlinear] + list(nonlinear)
     L = np.linalg.cholesky(P[np.ix_(order, order)])
     T = np.zeros((n, n))
-    T[order] = np.linalg.inv(L).T
+    T[order] = np.triu(np.linalg.inv(L).T)  # exactly triangular, not up to rounding
     return T
 
 

@@ -147,7 +147,7 @@ def _pieces(
         mus.append(np.array(mu))
         grams.append(np.array(gram))
     # Everything in the frame of the start: z_end = A z.
-    A = np.linalg.solve(frames[1], frames[0])
+    A = np.triu(np.linalg.solve(frames[1], frames[0]))
     for b in range(len(A)):
         M = substitution(basis, A[b])
         grams[1][b] = M.T @ grams[1][b] @ M
@@ -213,6 +213,11 @@ def end_proof(
     squares = positions(2 * np.eye(n, dtype=np.int64), monomials_of(n, 2))
     mu = [difference[starts[q] : starts[q + 1]] for q in range(3)]
     mu[2] = mu[2] + mu[0][0] * np.isin(np.arange(len(mu[2])), squares)
+    # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
+    # with |z|² would put where the Gram matrix has no place for it.
+    linear = np.array([j not in program.chosen for j in range(n)])
+    for q in (1, 2):
+        mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
     return Q, np.concatenate(mu)
 
 
