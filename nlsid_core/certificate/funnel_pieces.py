@@ -95,13 +95,13 @@ def piece_margins(
     """Each piece's margin in 1/s; nan where nothing is proved, -inf where Q does not fit."""
     arithmetic: Arithmetic = Exact if mode == "exact" else Ball
     margins = np.full(len(pieces), np.nan)
-    for chosen in _batches(field, funnel, pieces):
+    for chosen in batches(field, funnel, pieces):
         part = pieces.select(chosen)
         margins[chosen] = _margins(field, policy, funnel, part, arithmetic)
     return margins
 
 
-def _batches(field: VectorField, funnel: Funnel, pieces: Pieces) -> Iterator[IntArray]:
+def batches(field: VectorField, funnel: Funnel, pieces: Pieces) -> Iterator[IntArray]:
     """Indices of pieces that obey the same equations, as many as fit at once."""
     size = max(1, CELLS // (len(pieces.basis) ** 2 * 16))
     span = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]

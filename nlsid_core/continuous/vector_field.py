@@ -126,7 +126,12 @@ class VectorField:
 
     @property
     def nonlinear_states(self) -> tuple[int, ...]:
-        """States in terms of degree 2 or more in x and u, with u a function of every state."""
+        """States in terms of degree 2 or more in x and u, with u a function of every state.
+
+        All of them if there is uncertainty: a push is a term of degree 1 in Ẇ.
+        """
+        if len(self.uncertain):
+            return tuple(range(self.n))
         found: set[int] = set()
         for equations in self.pieces:
             for p in equations:

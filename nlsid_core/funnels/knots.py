@@ -4,6 +4,7 @@ import numpy as np
 
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.certificate.closed_loop import error_at_end
+from nlsid_core.certificate.funnel_pieces import batches
 from nlsid_core.certificate.graded import monomials_of
 from nlsid_core.continuous import Funnel, Policy
 from nlsid_core.funnels.lstep import LSteps, coordinates
@@ -43,7 +44,10 @@ class KnotForms:
             T = np.array([self.frames[k + end] for k in range(intervals)])
             parts = [Part(k, 0, 0) for k in range(intervals)]
             blank = draft(steps.program, parts, np.repeat(T, v, axis=0), v)
-            errors = error_at_end(steps.field, policy, funnel, blank, end)
+            errors = np.empty((len(blank), n, _count(n, steps.field.degree)))
+            for chosen in batches(steps.field, funnel, blank):
+                alike = blank.select(chosen)
+                errors[chosen] = error_at_end(steps.field, policy, funnel, alike, end)
             for row in range(intervals * v):
                 k, vertex = divmod(row, v)
                 solution = (ends[k].start, ends[k].end)[end][vertex]

@@ -5,7 +5,9 @@ m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)¾(1 + ½|z_nl|²), so that in between t
 decides; a piece it does not prove is halved, with a new L-step in its middle.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from nlsid_core.funnels.sweep import Ends
 from nlsid_core.polynomial.maps import monomials
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
-MAX_LEVEL = 6  # halvings of an interval: what still fails then fails for lack of margin
+MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,11 @@ def prove_pieces(
         unproved += [part for part in waiting if part not in solvable]
         if not solvable:
             break
-        pieces = _pieces(steps, policy, funnel, solvable, known)
+        solvable.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
+        alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
+        pieces = stacked(
+            [_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike]
+        )
         margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
         by_part = np.isfinite(margins).reshape(len(solvable), -1).all(axis=1)
         keep = np.repeat(by_part, len(steps.vertices))
@@ -153,12 +159,12 @@ def _pieces(
         grams[1][b] = M.T @ grams[1][b] @ M
         full = monomials(n, [0, 1, 2])
         mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
-    stacked = np.stack(grams, axis=1)
+    both = np.stack(grams, axis=1)
     return replace(
         blank,
         T=frames[0],
         mu=np.stack(mus, axis=1),
-        gram=stacked[..., triangle[0], triangle[1]],
+        gram=both[..., triangle[0], triangle[1]],
     )
 
 
@@ -204,6 +210,11 @@ def end_proof(
     spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
     spread[0] += constant
     Q[np.diag_indices(len(basis))] += scale * m * spread
+    linear = np.array([j not in program.chosen for j in range(n)])
+    first = target.get(1, np.zeros(n))
+    for j in np.flatnonzero(linear).tolist():
+        place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
+        Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
     # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below.
     offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in range(5)])
     rows = np.concatenate([monomials_of(n, q) for q in range(5)])
@@ -215,7 +226,6 @@ def end_proof(
     mu[2] = mu[2] + mu[0][0] * np.isin(np.arange(len(mu[2])), squares)
     # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
     # with |z|² would put where the Gram matrix has no place for it.
-    linear = np.array([j not in program.chosen for j in range(n)])
     for q in (1, 2):
         mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
     return Q, np.concatenate(mu)
@@ -256,14 +266,17 @@ def _joined(
     """All proved pieces in the order of time."""
     if not done:
         return draft(program, [], np.zeros((0, program.n, program.n)), 1), np.zeros(0)
-    whole = {
-        key: np.concatenate([getattr(pieces, key) for pieces, _ in done])
-        for key in ("interval", "vertex", "level", "index", "T", "mu", "gram")
-    }
-    pieces = Pieces(done[0][0].basis, **whole)
+    pieces = stacked([part for part, _ in done])
     margins = np.concatenate([m for _, m in done])
     order = np.lexsort((pieces.vertex, pieces.index / 2.0**pieces.level, pieces.interval))
     return pieces.select(order), margins[order]
+
+
+def stacked(parts: Sequence[Pieces]) -> Pieces:
+    """All pieces in one; they have the same basis."""
+    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram")
+    whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+    return replace(parts[0], **whole)
 
 
 def unsolved(policy: Policy, parts: tuple[Part, ...]) -> str:

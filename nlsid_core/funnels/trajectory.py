@@ -26,7 +26,7 @@ from nlsid_core.funnels.tvlqr import Tracking, lyapunov, tvlqr
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 MARGIN = 5e-4  # of the L-steps' rate scale, in the sweep; tripled while some piece is not proved
-RETRIES = 4
+RETRIES = 3
 FILES = ("vector_field.json", "policy.json", "funnel.json", "funnel.proof.json")
 
 
