@@ -1,4 +1,4 @@
-"""The one-dimensional example of thesis Chapter 7: ẋ = x - x²/2 + 2t - 2.4t³, goal [0, 1] at t = 1."""
+"""The example of thesis Section 7.1: ẋ = x - x²/2 + 2t - 2.4t³, goal [0, 1] at t = 1."""
 
 from typing import Any
 
@@ -47,7 +47,9 @@ def true_sets(t: FloatArray) -> tuple[FloatArray, FloatArray]:
         outward = max(f(s, middle + r) - f(s, middle), f(s, middle) - f(s, middle - r))
         return [f(s, low), f(s, middle), f(s, high), outward]
 
-    found = solve_ivp(rate, (1.0, -1.0), [0.0, 0.5, 1.0, 0.5], t_eval=t[::-1], rtol=1e-10, atol=1e-12)
+    found = solve_ivp(
+        rate, (1.0, -1.0), [0, 0.5, 1, 0.5], t_eval=t[::-1], rtol=1e-10, atol=1e-12
+    )
     states = found.y[:, ::-1]
     return states[2] - states[0], states[3]
 

@@ -6,9 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from bags.cli import app
+from bags.problems import FunnelProblem
 from examples import one_dimensional
 from examples.satellite_funnel import goal_matrix, problem
+from nlsid_core import _json
 from nlsid_core.certificate import check
 from nlsid_core.certificate.containment import ellipsoid_inside as decide_inside
 from nlsid_core.continuous import (
@@ -91,7 +95,7 @@ def test_alternation_ends_where_the_sweep_does() -> None:
 def test_every_kind_of_gain_is_proved(gain: str) -> None:
     field, nominal = hanging()
     design = design_funnel(field, nominal, goal=20 * np.eye(2), gain=gain)
-    assert design.proved.margins.min() > 0
+    assert np.min(design.proved.margins) > 0
 
 
 def test_p_grows_beyond_rho_and_is_proved() -> None:
@@ -99,13 +103,13 @@ def test_p_grows_beyond_rho_and_is_proved() -> None:
     rho = design_funnel(field, nominal, goal=20 * np.eye(2))
     P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P")
     assert P.funnel.volume_integral() > rho.funnel.volume_integral()
-    assert P.proved.margins.min() > 0
+    assert np.min(P.proved.margins) > 0
 
 
 def test_only_dynamics_nominal_and_weights_are_needed() -> None:
     field, nominal = hanging(9)
     design = design_funnel(damped, nominal, Q=np.eye(2), R=np.eye(1))
-    assert design.proved.margins.min() > 0
+    assert np.min(design.proved.margins) > 0
     assert design.field.document() == field.document()
 
 
@@ -149,7 +153,7 @@ def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
     second = VectorField.from_function(heavier, 2, 1)
     field = VectorField(plain.pieces + second.pieces, 2, 1, np.array([1.0]))
     nominal = integrate_nominal(field, lambda _: np.zeros(1), t=np.linspace(0, 2, 21), start=[0, 0])
-    assert design_funnel(field, nominal, goal=20 * np.eye(2)).proved.margins.min() > 0
+    assert np.min(design_funnel(field, nominal, goal=20 * np.eye(2)).proved.margins) > 0
 
 
 # -- lemmas ----------------------------------------------------------------------------------
@@ -177,7 +181,9 @@ def test_example_5_1_2_by_lemma_5_2(last: float, proved: bool) -> None:
     )
     t = np.linspace(0, 4 * np.pi, 9)
     still = constant_on(t, np.zeros((8, 1)))
-    policy = Policy(still, constant_on(t, np.zeros((8, 0))), constant_on(t, np.zeros((8, 0, 1))), "")
+    policy = Policy(
+        still, constant_on(t, np.zeros((8, 0))), constant_on(t, np.zeros((8, 0, 1))), ""
+    )
     rho = 2.65 + (last - 2.65) * t / t[-1]
     funnel = Funnel(still, np.ones((9, 1, 1)), rho, "", "")
     assert (not prove_pieces(LSteps(field), policy, funnel).unproved) is proved
@@ -200,7 +206,7 @@ def test_containment_is_decided_at_the_touching_ellipsoid() -> None:
 def test_a_funnel_may_end_in_a_goal_around_another_point() -> None:
     field, nominal = hanging(9)
     goal = Goal(np.array([0.05, 0.0]), 20 * np.eye(2))
-    assert design_funnel(field, nominal, goal=goal).proved.margins.min() > 0
+    assert np.min(design_funnel(field, nominal, goal=goal).proved.margins) > 0
     with pytest.raises(DataError, match="ends outside the goal"):
         design_funnel(field, nominal, goal=Goal(np.array([0.5, 0.0]), 20 * np.eye(2)))
 
@@ -228,7 +234,7 @@ def test_value_gradient_volume_and_outline_agree() -> None:
     assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
     assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
     step = 1e-6
-    moved = (funnel.value(0.5, points + [step, 0]) - funnel.value(0.5, points)) / step
+    moved = (funnel.value(0.5, [*points, step, 0]) - funnel.value(0.5, points)) / step
     assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
     assert funnel.contains_ellipsoid(1.0, [1, 2], np.eye(2))
     assert not funnel.inside_ellipsoid(1.0, [1, 2], np.eye(2))
@@ -275,3 +281,24 @@ def test_no_feasible_start_says_what_to_try() -> None:
     nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0])
     with pytest.raises(Infeasible, match="Try"):
         design_funnel(field, nominal, goal=np.eye(1), Q=np.zeros((1, 1)))
+
+
+# -- command line ----------------------------------------------------------------------------
+
+
+def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> None:
+    field, nominal = hanging(9)
+    goal = Goal(np.zeros(2), 20 * np.eye(2))
+    problem_file = tmp_path / "problem.json"
+    asked = FunnelProblem(field, nominal, np.eye(2), np.eye(1), goal)
+    _json.write_document(problem_file, asked.document())
+    runner = CliRunner()
+    made = runner.invoke(app, ["funnel", "--problem", str(problem_file), "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert "pieces proved" in made.output
+    assert Funnel.load(tmp_path / "funnel.json").tf == 2.0
+    checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
+    assert checked.exit_code == 0
+    assert "PROVED funnel" in checked.output
+    neither = runner.invoke(app, ["funnel", "--out", str(tmp_path)])
+    assert neither.exit_code != 0

@@ -126,9 +126,10 @@ class VectorField:
 
     @property
     def nonlinear_states(self) -> tuple[int, ...]:
-        """States in terms of degree 2 or more in x and u, with u a function of every state.
+        """States such that every term of degree d ≥ 2 in x and u has at least d - 1 of them.
 
-        All of them if there is uncertainty: a push is a term of degree 1 in Ẇ.
+        Those in terms of degree 2 or more, if inputs do not spoil it; else all of them. All, too,
+        if there is uncertainty: a push is a term of degree 1 in Ẇ.
         """
         if len(self.uncertain):
             return tuple(range(self.n))
@@ -136,8 +137,9 @@ class VectorField:
         for equations in self.pieces:
             for p in equations:
                 high = p.exponents[p.exponents[:, 1 : 1 + self.n + self.m].sum(axis=1) > 1]
-                if high[:, 1 + self.n : 1 + self.n + self.m].any():
-                    return tuple(range(self.n))  # feedback brings every state in
+                inputs = high[:, 1 + self.n : 1 + self.n + self.m].sum(axis=1)
+                if (inputs > 1).any():
+                    return tuple(range(self.n))
                 found |= set(np.flatnonzero(high[:, 1 : 1 + self.n].any(axis=0)).tolist())
         return tuple(sorted(found))
 

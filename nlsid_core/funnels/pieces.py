@@ -76,9 +76,7 @@ def prove_pieces(
             break
         solvable.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
         alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
-        pieces = stacked(
-            [_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike]
-        )
+        pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
         margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
         by_part = np.isfinite(margins).reshape(len(solvable), -1).all(axis=1)
         keep = np.repeat(by_part, len(steps.vertices))
@@ -173,7 +171,9 @@ def with_one(program: SphereProgram | LineProgram) -> IntArray:
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
-def draft(program: SphereProgram | LineProgram, parts: list[Part], T: FloatArray, vertices: int) -> Pieces:
+def draft(
+    program: SphereProgram | LineProgram, parts: list[Part], T: FloatArray, vertices: int
+) -> Pieces:
     """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
     basis, count = with_one(program), len(parts) * vertices
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
