@@ -66,9 +66,7 @@ def funnel(
     config: Annotated[Path | None, typer.Option(help="The robot's YAML configuration.")] = None,
     problem: Annotated[
         Path | None,
-        typer.Option(
-            help="Dynamics, nominal and goal in a file; instead of model and config."
-        ),
+        typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
     ] = None,
 ) -> None:
     """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.

@@ -47,9 +47,7 @@ def true_sets(t: FloatArray) -> tuple[FloatArray, FloatArray]:
         outward = max(f(s, middle + r) - f(s, middle), f(s, middle) - f(s, middle - r))
         return [f(s, low), f(s, middle), f(s, high), outward]
 
-    found = solve_ivp(
-        rate, (1.0, -1.0), [0, 0.5, 1, 0.5], t_eval=t[::-1], rtol=1e-10, atol=1e-12
-    )
+    found = solve_ivp(rate, (1.0, -1.0), [0, 0.5, 1, 0.5], t_eval=t[::-1], rtol=1e-10, atol=1e-12)
     states = found.y[:, ::-1]
     return states[2] - states[0], states[3]
 

@@ -86,7 +86,8 @@ class VectorField:
     ) -> "VectorField":
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
-        Raises NotPolynomial naming the operation; a Taylor model is then the way (`taylor`).
+        Raises NotPolynomial naming the operation; a Taylor polynomial is then the way, with its
+        remainder as an uncertain w.
         """
         bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
         given = tuple(inspect.signature(function).parameters)
@@ -103,7 +104,8 @@ class VectorField:
             traced = trace(called, {name: sizes[name] for name in given})
         except NotPolynomial as error:
             raise NotPolynomial(
-                f"{error}. Expand it: nlsid_core.continuous.taylor bounds the remainder on a box"
+                f"{error}. Give its Taylor polynomial instead, and what it leaves out on "
+                "the states of interest as an uncertain w with bounds"
             ) from error
         if traced.shape != (n,):
             raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")

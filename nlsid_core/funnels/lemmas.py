@@ -77,7 +77,5 @@ def derivative(V: Polynomial, field: Sequence[Polynomial], states: Sequence[str]
 
 def _positive(margin: float, proof: Json, what: str) -> Lemma:
     if margin <= 0:
-        raise Infeasible(
-            f"{what} is not proved: the best bound found is {margin:.3g}"
-        )
+        raise Infeasible(f"{what} is not proved: the best bound found is {margin:.3g}")
     return Lemma(margin, proof)

@@ -82,7 +82,7 @@ class LSteps:
         if field.degree > MAX_DEGREE:
             raise DataError(
                 f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
-                "expand them with nlsid_core.continuous.taylor"
+                "take a Taylor polynomial, and its remainder as an uncertain w"
             )
         self.field = field
         self.tolerance = tolerance
