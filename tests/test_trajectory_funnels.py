@@ -15,6 +15,7 @@ from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import _json
 from nlsid_core.certificate import check
 from nlsid_core.certificate.containment import ellipsoid_inside as decide_inside
+from nlsid_core.certificate.trajectory_funnel import refuse_invalid, refuse_kappa
 from nlsid_core.continuous import (
     Funnel,
     Nominal,
@@ -26,7 +27,7 @@ from nlsid_core.continuous import (
     linear_through,
 )
 from nlsid_core.continuous.funnel import ellipsoid_inside
-from nlsid_core.errors import DataError, Infeasible, NotPolynomial
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, NotPolynomial
 from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.funnels.alternation import alternate_rho, exponential_start
 from nlsid_core.funnels.lemmas import lemma_decay, lemma_invariance
@@ -156,6 +157,33 @@ def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
     assert np.min(design_funnel(field, nominal, goal=20 * np.eye(2)).proved.margins) > 0
 
 
+def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_valid(
+    tmp_path: Path,
+) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
+
+    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
+    valid = [[0, -0.2, 0.2], [2, -9, 9]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
+    _, nominal = hanging()
+    design = design_funnel(field, nominal, goal=30 * np.eye(2))
+    assert design.proved.pieces.kappa is not None
+    assert not design.proved.pieces.vertex.any()
+    proof = design.save(tmp_path)[-1]
+    assert check(proof, mode="rigorous").margin > 0
+    assert check(proof).margin > 0
+    for t in design.funnel.t:
+        assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
+    rng = np.random.default_rng(4)
+    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    assert run.violations == 0
+    with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
+        refuse_invalid(replace(field, valid=[[0, -0.1, 0.1]]), design.policy, design.funnel)
+    with pytest.raises(CertificateRejected, match="power of two"):
+        refuse_kappa(np.array([1.0, 3.0, 1.0]), field)
+
+
 # -- lemmas ----------------------------------------------------------------------------------
 
 
@@ -234,7 +262,7 @@ def test_value_gradient_volume_and_outline_agree() -> None:
     assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
     assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
     step = 1e-6
-    moved = (funnel.value(0.5, [*points, step, 0]) - funnel.value(0.5, points)) / step
+    moved = (funnel.value(0.5, points + np.array([step, 0])) - funnel.value(0.5, points)) / step
     assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
     assert funnel.contains_ellipsoid(1.0, [1, 2], np.eye(2))
     assert not funnel.inside_ellipsoid(1.0, [1, 2], np.eye(2))

@@ -47,6 +47,8 @@ def closed_loop_polynomial(
         error = add(rates[i], {0: -(unit * x_rate[:, :, i])[:, :, None]})
         twice = {1: arithmetic.of(np.array(2.0)) * PT[:, :, i]}
         growth = add(growth, multiply(twice, error, n))
+    for term in loop.bounded_pushes(PT):
+        growth = add(growth, {q: unit * part for q, part in term.items()})
     W: Graded = {}
     bend: Graded = {}
     start, end = (arithmetic.of(part) for part in (P[:, 0], P[:, 1]))
@@ -130,6 +132,35 @@ class _Loop:
                 rates[i] = add(rates[i], term)
         return rates
 
+    def bounded_pushes(self, PT: Number) -> list[Graded]:
+        """h·r(κ(x̄'Pg)² + 1/κ) for each w, r half its range: at least 2|x̄'Pg|·h·|w - centre|."""
+        kappa, pushes = self.pieces.kappa, self.field.pushes(self.span)
+        if kappa is None or pushes is None:
+            return []
+        t, k = self.funnel.t, self.pieces.interval
+        h = self.arithmetic.of(t[k + 1]) - self.arithmetic.of(t[k])
+        radius = self._half_sum(-1.0)
+        terms = []
+        for j, scale in enumerate(kappa.tolist()):
+            along: Graded = {}
+            for i in np.flatnonzero(pushes[:, j]).tolist():
+                weight = self.arithmetic.of(np.array(pushes[i, j]))
+                along = add(along, {1: weight * PT[:, :, i]})
+            factor = (h * radius[:, j])[:, None, None]
+            square = multiply(along, along, self.field.n)
+            scaled = {q: self.arithmetic.of(np.array(scale)) * part for q, part in square.items()}
+            inverse = self.arithmetic.of(np.full((1, 1, 1), 1 / scale))
+            total = add(scaled, {0: inverse})
+            terms.append({q: factor * part for q, part in total.items()})
+        return terms
+
+    def _half_sum(self, sign: float) -> Number:
+        """(B, n_w): half of high + sign·low, for every piece."""
+        low, high = (self.arithmetic.of(part) for part in self.field.uncertain.T)
+        half = (high + self.arithmetic.of(np.array(sign)) * low) * self.arithmetic.of(np.array(0.5))
+        zeros = self.arithmetic.zeros((len(self.pieces), len(self.field.uncertain)))
+        return zeros + half
+
     def _monomial(self, exponent: tuple[int, ...]) -> Graded:
         if exponent not in self._known:
             last = max((j for j, e in enumerate(exponent) if e), default=-1)
@@ -152,6 +183,8 @@ class _Loop:
         time = self.restricted(_linear(self.funnel.t)[k])
         KT = self.product(K, T)
         w = self.arithmetic.of(self.field.vertices()[self.pieces.vertex])
+        if self.pieces.kappa is not None:
+            w = self._half_sum(1.0)
         forms: list[Graded] = [{0: time[:, :, None]}]
         forms += [{0: x[:, :, i][:, :, None], 1: T[:, None, i]} for i in range(self.field.n)]
         forms += [{0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)]

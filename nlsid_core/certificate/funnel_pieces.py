@@ -25,6 +25,7 @@ from nlsid_core.polynomial.maps import monomials
 # The stated Gram matrices have to represent c at the ends of a piece to this, relative to their
 # largest entry: a proof is about these very objects. Designs leave 1e-12.
 FIT = 1e-9
+SHARED = ("basis", "kappa")  # by all pieces of a proof
 CELLS = 6_000_000  # Gram entries held at once
 
 
@@ -34,6 +35,7 @@ class Pieces:
 
     T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
     2 less than twice the basis'. gram: (B, 2, k(k+1)/2) upper triangles, row by row, of Q there.
+    kappa: (n_w,) powers of two; then what w adds to ẋ is bounded with them and `vertex` is 0.
     """
 
     basis: IntArray
@@ -44,6 +46,7 @@ class Pieces:
     T: FloatArray
     mu: FloatArray
     gram: FloatArray
+    kappa: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.interval)
@@ -60,7 +63,7 @@ class Pieces:
 
     def select(self, chosen: slice | IntArray) -> "Pieces":
         """Some of the pieces."""
-        kept = {f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "basis"}
+        kept = {f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name not in SHARED}
         return replace(self, **kept)
 
 

@@ -36,7 +36,7 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     if set(about) != set(ABOUT):
         raise CertificateRejected(f"a {KIND} claim is about {', '.join(ABOUT)}")
     data.only(claim, {"kind", "about", "goal"}, source="claim")
-    data.only(proof, {"goal_multiplier", "basis", "pieces"}, source="proof")
+    data.only(proof, {"goal_multiplier", "basis", "pieces", "kappa"}, source="proof")
     field = VectorField.from_document(about["vector_field"], source="vector field")
     policy = Policy.from_document(about["policy"], source="policy")
     funnel = Funnel.from_document(about["funnel"], source="funnel")
@@ -55,7 +55,10 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
             _json.number(proof, "goal_multiplier", source="proof"),
         )
         goal_text = ", and ends in the goal"
+    refuse_invalid(field, policy, funnel)
     pieces = read_pieces(proof, field.n)
+    if pieces.kappa is not None:
+        refuse_kappa(pieces.kappa, field)
     refuse_gaps(pieces, field, funnel)
     margin = decide_pieces(field, policy, funnel, pieces, mode)
     bounds = ", ".join(
@@ -114,12 +117,57 @@ def read_pieces(proof: Json, n: int) -> Pieces:
         mu.append(_json.array(entry, "mu", (2, terms), source=source))
         gram.append(_json.array(entry, "gram", (2, size), source=source))
     columns = {key: np.array(values, dtype=np.int64) for key, values in whole.items()}
-    return Pieces(exponents, **columns, T=np.array(T), mu=np.array(mu), gram=np.array(gram))
+    kappa = _json.array(proof, "kappa", (None,), source="proof") if "kappa" in proof else None
+    return Pieces(
+        exponents, **columns, T=np.array(T), mu=np.array(mu), gram=np.array(gram), kappa=kappa
+    )
+
+
+def refuse_kappa(kappa: FloatArray, field: VectorField) -> None:
+    """Raise CertificateRejected unless w only pushes and each κ is a power of two."""
+    if any(field.pushes(span) is None for span in range(len(field.pieces))):
+        raise CertificateRejected("w does more than add constants: kappa does not bound it")
+    if len(kappa) != len(field.uncertain) or not (np.frexp(kappa)[0] == 0.5).all():
+        raise CertificateRejected("kappa should hold one power of two for every w")
+    if np.abs(np.log2(kappa)).max(initial=0.0) > 100:
+        raise CertificateRejected("kappa is out of range")
+
+
+def refuse_invalid(field: VectorField, policy: Policy, funnel: Funnel) -> None:
+    """Raise CertificateRejected unless x and u stay where the dynamics are valid, exactly.
+
+    |g'x̄| ≤ d wherever W ≤ ρ if d²P - ρgg' ⪰ 0, which holds between knots if it does at them.
+    Centres and gains between knots are convex combinations of their control points.
+    """
+    n = field.n
+    for j, low, high in field.valid.tolist():
+        entry = int(j)
+        for k in range(len(funnel.t) - 1):
+            if entry < n:
+                centre, rows = policy.x.control[k, :, entry], np.eye(n)[[entry]]
+            else:
+                centre, rows = policy.u.control[k, :, entry - n], policy.K.control[k, :, entry - n]
+            middle = [Fraction(c) for c in centre.tolist()]
+            room = min(Fraction(high) - max(middle), min(middle) - Fraction(low))
+            for row in rows.tolist():
+                g = [Fraction(e) for e in row]
+                for knot in (k, k + 1):
+                    rho = Fraction(float(funnel.rho[knot]))
+                    slack = [
+                        [room**2 * Fraction(p) - rho * a * b for p, b in zip(line, g, strict=True)]
+                        for line, a in zip(funnel.P[knot].tolist(), g, strict=True)
+                    ]
+                    if room <= 0 or not containment.is_positive_semidefinite(slack):
+                        raise CertificateRejected(
+                            f"the funnel leaves where its dynamics are valid: entry {entry} of "
+                            f"(x, u) is not within [{low:g}, {high:g}] at {funnel.t[knot]:g} s"
+                        )
 
 
 def refuse_gaps(pieces: Pieces, field: VectorField, funnel: Funnel) -> None:
     """Raise CertificateRejected unless the pieces cover all time for every vertex of w."""
-    intervals, vertices = len(funnel.t) - 1, len(field.vertices())
+    intervals = len(funnel.t) - 1
+    vertices = len(field.vertices()) if pieces.kappa is None else 1
     missing = np.setdiff1d(field.breaks[(field.breaks > funnel.t0) & (field.breaks < funnel.tf)],
                            funnel.t)  # fmt: skip
     if len(missing):

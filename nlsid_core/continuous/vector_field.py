@@ -19,6 +19,7 @@ from nlsid_core.polynomial.values import monomial_values
 
 FORMAT = "nlsid/vector_field"
 VERSION = 1
+MANY_PUSHES = 3
 MAX_UNCERTAIN = 10  # their box has 2^10 vertices, each checked
 ARGUMENTS = ("t", "x", "u", "w")
 
@@ -30,7 +31,9 @@ class VectorField:
     pieces: exact polynomials in `names` = t, x0.., u0.., w0... n, m: numbers of states and inputs.
     breaks: (J-1,) s, increasing, where the equations change. uncertain: (n_w, 2) lower and upper
     bounds of w, which may vary arbitrarily in time within its box: bounded disturbances and
-    uncertain parameters; w has to enter with degree at most one in each entry.
+    uncertain parameters; w has to enter with degree at most one in each entry. valid: (D, 3) rows
+    (j, low, high): the equations describe the system only where entry j of (x, u) is within; a
+    proved funnel stays there.
 
     Raises ShapeError or DataError on equations that do not fit.
     """
@@ -40,6 +43,7 @@ class VectorField:
     m: int
     breaks: FloatArray = field(default_factory=lambda: np.zeros(0))
     uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     names: tuple[str, ...] = field(init=False)
     _tables: tuple[tuple[IntArray, FloatArray], ...] = field(init=False)
     _plans: tuple["_Plan", ...] = field(init=False)
@@ -57,6 +61,9 @@ class VectorField:
             raise DataError(f"breaks should be increasing times, are {breaks}")
         names = ("t", *variable_names(self.n, self.m, len(bounds)))
         object.__setattr__(self, "names", names)
+        valid = np.array(self.valid, dtype=np.float64).reshape(-1, 3)
+        if not (np.isfinite(valid).all() and np.isin(valid[:, 0], range(self.n + self.m)).all()):
+            raise DataError(f"rows of valid should be (entry of (x, u), low, high), are {valid}")
         if not self.pieces or len(self.pieces) != len(breaks) + 1:
             raise ShapeError(f"{len(self.pieces)} sets of equations for {len(breaks)} breaks")
         pieces = []
@@ -67,7 +74,7 @@ class VectorField:
             for i, p in enumerate(pieces[-1]):
                 if (p.exponents[:, 1 + self.n + self.m :] > 1).any():
                     raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
-        for key, value in (("breaks", breaks), ("uncertain", bounds)):
+        for key, value in (("breaks", breaks), ("uncertain", bounds), ("valid", valid)):
             value.setflags(write=False)
             object.__setattr__(self, key, value)
         object.__setattr__(self, "pieces", tuple(pieces))
@@ -83,6 +90,7 @@ class VectorField:
         m: int,
         *,
         uncertain: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
     ) -> "VectorField":
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
@@ -114,7 +122,9 @@ class VectorField:
             renamed = tuple("t" if name == "t0" else name for name in p.names)
             equations.append(Polynomial(p.exponents, p.coefficients, renamed))
         names = ("t", *variable_names(n, m, len(bounds)))
-        return cls((tuple(p.over(names) for p in equations),), n, m, uncertain=bounds)
+        within = np.zeros((0, 3)) if valid is None else np.asarray(valid, dtype=np.float64)
+        pieces = (tuple(p.over(names) for p in equations),)
+        return cls(pieces, n, m, uncertain=bounds, valid=within)
 
     @property
     def degree(self) -> int:
@@ -131,9 +141,9 @@ class VectorField:
         """States such that every term of degree d ≥ 2 in x and u has at least d - 1 of them.
 
         Those in terms of degree 2 or more, if inputs do not spoil it; else all of them. All, too,
-        if there is uncertainty: a push is a term of degree 1 in Ẇ.
+        if w is taken at its corners: a push is a term of degree 1 in Ẇ.
         """
-        if len(self.uncertain):
+        if len(self.uncertain) and not self.is_pushed:
             return tuple(range(self.n))
         found: set[int] = set()
         for equations in self.pieces:
@@ -144,6 +154,29 @@ class VectorField:
                     return tuple(range(self.n))
                 found |= set(np.flatnonzero(high[:, 1 : 1 + self.n].any(axis=0)).tolist())
         return tuple(sorted(found))
+
+    @property
+    def is_pushed(self) -> bool:
+        """True if w only adds constants to ẋ, and has so many entries that corners are too many.
+
+        Then 2|x̄'Pg|r ≤ r(κ(x̄'Pg)² + 1/κ) bounds what each does, and no corner is needed.
+        """
+        return len(self.uncertain) >= MANY_PUSHES and all(
+            self.pushes(span) is not None for span in range(len(self.pieces))
+        )
+
+    def pushes(self, span: int) -> FloatArray | None:
+        """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""
+        count = len(self.uncertain)
+        result = np.zeros((self.n, count))
+        for i, p in enumerate(self.pieces[span]):
+            for exponent, coefficient in p.terms():
+                used = [j for j in range(count) if exponent[1 + self.n + self.m + j]]
+                if used:
+                    if sum(exponent) > 1 or Fraction(float(coefficient)) != coefficient:
+                        return None
+                    result[i, used[0]] = float(coefficient)
+        return result
 
     def vertices(self) -> FloatArray:
         """(2^n_w, n_w) corners of the box of w; one empty row without uncertainty."""
@@ -202,6 +235,7 @@ class VectorField:
             "low": self.uncertain[:, 0].tolist(),
             "high": self.uncertain[:, 1].tolist(),
             "breaks": self.breaks.tolist(),
+            "valid": self.valid.tolist(),
             "pieces": [[data.write_polynomial(p) for p in part] for part in self.pieces],
         }
 
@@ -224,7 +258,9 @@ class VectorField:
             read = [data.read_polynomial(p, names, source=f"{source} equation") for p in part]
             pieces.append(tuple(read))
         breaks = _json.array(document, "breaks", (None,), source=source)
-        return cls(tuple(pieces), n, m, breaks, bounds)
+        rows = _json.member(document, "valid", list, source=source)
+        valid = _json.array(document, "valid", (len(rows), 3), source=source)
+        return cls(tuple(pieces), n, m, breaks, bounds, valid)
 
 
 @dataclass(frozen=True, eq=False)

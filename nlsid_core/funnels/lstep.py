@@ -87,8 +87,20 @@ class LSteps:
         self.field = field
         self.tolerance = tolerance
         self.program = sphere_program(field)
+        self.kappa: FloatArray | None = None
         self.vertices = field.vertices()
         self.solved = 0
+
+    def bound_pushes(self, P: FloatArray) -> None:
+        """If w only pushes, bound what it does on ellipsoids like {x̄'Px̄ ≤ 1}, not at corners.
+
+        κ near 1/max|x̄'Pg| makes the bound tight where the push hurts most.
+        """
+        pushes = self.field.pushes(0)
+        if self.field.is_pushed and pushes is not None:
+            largest = np.sqrt(np.einsum("ij,ik,kj->j", pushes, P, pushes))
+            self.kappa = np.exp2(np.round(-np.log2(largest)))
+            self.vertices = self.field.uncertain.mean(axis=1)[None]
 
     def values(self, section: Section, rho: float, vertex: int) -> FloatArray:
         """-Ẇ/ρ at the program's points, straight from the vector field."""
@@ -98,6 +110,11 @@ class LSteps:
         rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
+        pushes = self.field.pushes(section.span)
+        if self.kappa is not None and pushes is not None:
+            radius = np.ptp(self.field.uncertain, axis=1) / 2
+            along = x_bar @ section.P @ pushes
+            W_rate += (self.kappa * along**2 + 1 / self.kappa) @ radius
         return np.asarray(-W_rate / rho - self._from_defect(section, rho))
 
     def _from_defect(self, section: Section, rho: float) -> FloatArray:

@@ -135,7 +135,7 @@ def _pieces(
             T += [np.sqrt(rho_here) * section.base] * vertices
             rho += [rho_here] * vertices
             rows += known[i, s]
-        blank = draft(program, parts, np.array(T), vertices)
+        blank = draft(program, parts, np.array(T), vertices, steps.kappa)
         c, _ = closed_loop_polynomial(steps.field, policy, funnel, blank, Ball)
         at_end = {q: part.approximate()[:, -end] for q, part in c.items()}
         mu, gram = [], []
@@ -172,7 +172,11 @@ def with_one(program: SphereProgram | LineProgram) -> IntArray:
 
 
 def draft(
-    program: SphereProgram | LineProgram, parts: list[Part], T: FloatArray, vertices: int
+    program: SphereProgram | LineProgram,
+    parts: list[Part],
+    T: FloatArray,
+    vertices: int,
+    kappa: FloatArray | None = None,
 ) -> Pieces:
     """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
     basis, count = with_one(program), len(parts) * vertices
@@ -187,6 +191,7 @@ def draft(
         T=T,
         mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
         gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
+        kappa=kappa,
     )
 
 

@@ -35,11 +35,13 @@ def sweep_rho(
     *,
     margin: float,
     rho_final: float = 1.0,
+    caps: FloatArray | None = None,
     progress: Progress | None = None,
 ) -> tuple[FloatArray, list[Ends]]:
     """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
 
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the time.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below.
+    Raises Infeasible naming the time.
     """
     rho = np.empty(len(pairs) + 1)
     rho[-1] = rho_final
@@ -51,6 +53,8 @@ def sweep_rho(
         at_end = steps.solve(end, rho[k + 1], duals)
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))
+        if caps is not None:
+            cap = min(cap, float(caps[k]))
         rho[k], at_start = _largest(steps, start, rho[k + 1], h, cap, margin, at_end)
         ends.append(Ends(at_start, at_end))
         duals = at_start

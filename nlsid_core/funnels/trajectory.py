@@ -13,7 +13,11 @@ from scipy.linalg import solve_continuous_are
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, Json
 from nlsid_core.certificate.check import proof_document
-from nlsid_core.certificate.trajectory_funnel import document_pieces, refuse_goal
+from nlsid_core.certificate.trajectory_funnel import (
+    document_pieces,
+    refuse_goal,
+    refuse_invalid,
+)
 from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
 from nlsid_core.continuous.funnel import ellipsoid_inside
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
@@ -27,6 +31,7 @@ GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly insi
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 MARGIN = 5e-4  # of the L-steps' rate scale, in the sweep; tripled while some piece is not proved
 RETRIES = 3
+CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 FILES = ("vector_field.json", "policy.json", "funnel.json", "funnel.proof.json")
 
 
@@ -70,6 +75,8 @@ class FunnelDesign:
             "basis": self.proved.pieces.basis.tolist(),
             "pieces": document_pieces(self.proved.pieces),
         }
+        if self.proved.pieces.kappa is not None:
+            proof["kappa"] = self.proved.pieces.kappa.tolist()
         return proof_document(claim, proof)
 
     def save(self, folder: Path | str) -> tuple[Path, ...]:
@@ -130,10 +137,13 @@ def design_funnel(
     policy, S = tracking.policy, tracking.S
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
+    steps.bound_pushes(S[-1])
     rho_final, target = _final(steps, policy, S, wanted)
     funnel, proved, margin = _swept(steps, policy, S, rho_final, progress)
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
+    if shape == "P" and steps.kappa is not None:
+        raise DataError("shape P takes w at its corners: it is for fewer than three pushes")
     if shape == "P":
         started = time.perf_counter()
         funnel, proved, steps_taken = alternate_shape(
@@ -146,9 +156,10 @@ def design_funnel(
     if multiplier is None:
         raise Infeasible("the funnel's end is not inside the goal")
     try:
+        refuse_invalid(field, policy, funnel)
         refuse_goal(funnel, target.centre, target.P, multiplier)
     except CertificateRejected as refusal:
-        raise Infeasible(f"{refusal}: choose a larger goal") from refusal
+        raise Infeasible(f"{refusal}: choose another goal") from refusal
     return FunnelDesign(field, policy, funnel, target, multiplier, proved, tuple(history), seconds)
 
 
@@ -250,17 +261,46 @@ def _final(steps: LSteps, policy: Policy, S: FloatArray, goal: Goal | None) -> t
     return low * (1 - 1e-6), goal
 
 
+def validity_caps(field: VectorField, policy: Policy, P: FloatArray) -> FloatArray:
+    """(K,) the largest ρ at each knot with which x and u stay where the dynamics are valid.
+
+    Raises DataError if the nominal itself does not.
+    """
+    caps = np.full(len(P), np.inf)
+    for j, low, high in field.valid.tolist():
+        entry = int(j)
+        for k in range(len(P) - 1):
+            if entry < field.n:
+                centre, rows = policy.x.control[k, :, entry], np.eye(field.n)[[entry]]
+            else:
+                centre = policy.u.control[k, :, entry - field.n]
+                rows = policy.K.control[k, :, entry - field.n]
+            room = min(high - centre.max(), centre.min() - low)
+            if room <= 0:
+                raise DataError(
+                    f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
+                    f"{centre[0]:.4g} at {policy.t[k]:g} s, not well within [{low:g}, {high:g}]"
+                )
+            for knot in (k, k + 1):
+                reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(P[knot]), rows).max()
+                caps[knot] = min(caps[knot], CAP_ROOM * room**2 / reach)
+    return caps
+
+
 def _swept(
     steps: LSteps, policy: Policy, S: FloatArray, rho_final: float, progress: Progress | None
 ) -> tuple[Funnel, Proved, float]:
     """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
     digest = _json.digest(policy.document())
     pairs = sections(steps.field, policy, S)
+    caps = validity_caps(steps.field, policy, S)
+    rho_final = min(rho_final, float(caps[-1]))
     spread = steps.values(pairs[-1][1], rho_final, 0)
     margin = MARGIN * float(np.abs(spread).mean())
     proved: Proved | None = None
     for _ in range(RETRIES):
-        rho, ends = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, progress=progress)
+        rho, ends = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
+                              progress=progress)  # fmt: skip
         funnel = Funnel(policy.x, S, rho, policy.vector_field, digest)
         proved = prove_pieces(steps, policy, funnel, ends)
         if not proved.unproved:
