@@ -172,14 +172,19 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     assert not design.proved.pieces.vertex.any()
     proof = design.save(tmp_path)[-1]
     assert check(proof, mode="rigorous").margin > 0
-    assert check(proof).margin > 0
+    verdict = check(proof)
+    assert verdict.margin > 0
+    assert "u0 within [-9, 9]" in verdict.statement
+    assert "saturation" not in " ".join(verdict.assumptions)
     for t in design.funnel.t:
         assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
     rng = np.random.default_rng(4)
     run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
     assert run.violations == 0
     with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
-        refuse_invalid(replace(field, valid=[[0, -0.1, 0.1]]), design.policy, design.funnel)
+        refuse_invalid(
+            replace(field, valid=np.array([[0, -0.1, 0.1]])), design.policy, design.funnel
+        )
     with pytest.raises(CertificateRejected, match="power of two"):
         refuse_kappa(np.array([1.0, 3.0, 1.0]), field)
 

@@ -61,19 +61,24 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
         refuse_kappa(pieces.kappa, field)
     refuse_gaps(pieces, field, funnel)
     margin = decide_pieces(field, policy, funnel, pieces, mode)
+    names = field.names[1:]
+    valid_text = "".join(
+        f", {names[int(j)]} within [{low:g}, {high:g}]" for j, low, high in field.valid.tolist()
+    )
     bounds = ", ".join(
         f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain)
     )
+    limited = set(range(field.n, field.n + field.m)) <= set(field.valid[:, 0].astype(int).tolist())
     return Decision(
         statement=(
             f"funnel: every solution in it at a time in [{funnel.t0:g}, {funnel.tf:g}] s stays in "
-            f"it for all later times{goal_text}; {len(pieces)} pieces of time, "
+            f"it for all later times{goal_text}{valid_text}; {len(pieces)} pieces of time, "
             f"V decreases on the boundary by at least the margin, in 1/s,"
         ),
         margin=margin,
         assumptions=(
-            "the state obeys the stored dynamics with the stored policy, applied continuously in "
-            "time and without saturation",
+            "the state obeys the stored dynamics with the stored policy, applied continuously"
+            + ("" if limited else " and without saturation"),
             *((f"at every time {bounds}",) if bounds else ()),
         ),
     )
@@ -139,14 +144,10 @@ def refuse_invalid(field: VectorField, policy: Policy, funnel: Funnel) -> None:
     |g'x̄| ≤ d wherever W ≤ ρ if d²P - ρgg' ⪰ 0, which holds between knots if it does at them.
     Centres and gains between knots are convex combinations of their control points.
     """
-    n = field.n
     for j, low, high in field.valid.tolist():
         entry = int(j)
         for k in range(len(funnel.t) - 1):
-            if entry < n:
-                centre, rows = policy.x.control[k, :, entry], np.eye(n)[[entry]]
-            else:
-                centre, rows = policy.u.control[k, :, entry - n], policy.K.control[k, :, entry - n]
+            centre, rows = policy.entry(entry, k)
             middle = [Fraction(c) for c in centre.tolist()]
             room = min(Fraction(high) - max(middle), min(middle) - Fraction(low))
             for row in rows.tolist():

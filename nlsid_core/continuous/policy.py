@@ -49,6 +49,16 @@ class Policy:
         X = np.asarray(X, dtype=np.float64)
         return np.asarray(self.u(t) - (X - self.x(t)) @ self.K(t).T)
 
+    def entry(self, j: int, k: int) -> tuple[FloatArray, FloatArray]:
+        """Entry j of (x, u) on piece k: control points of its nominal, and rows g (r, n).
+
+        It differs from the nominal by g'x̄ for a convex combination of the rows.
+        """
+        n = self.x.control.shape[2]
+        if j < n:
+            return self.x.control[k, :, j], np.eye(n)[[j]]
+        return self.u.control[k, :, j - n], self.K.control[k, :, j - n]
+
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {

@@ -270,12 +270,8 @@ def validity_caps(field: VectorField, policy: Policy, P: FloatArray) -> FloatArr
     for j, low, high in field.valid.tolist():
         entry = int(j)
         for k in range(len(P) - 1):
-            if entry < field.n:
-                centre, rows = policy.x.control[k, :, entry], np.eye(field.n)[[entry]]
-            else:
-                centre = policy.u.control[k, :, entry - field.n]
-                rows = policy.K.control[k, :, entry - field.n]
-            room = min(high - centre.max(), centre.min() - low)
+            centre, rows = policy.entry(entry, k)
+            room = min(high - float(np.max(centre)), float(np.min(centre)) - low)
             if room <= 0:
                 raise DataError(
                     f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
