@@ -14,6 +14,8 @@ from examples import one_dimensional
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import _json
 from nlsid_core.certificate import check
+from nlsid_core.certificate.arithmetic import Exact
+from nlsid_core.certificate.closed_loop import closed_loop_polynomial
 from nlsid_core.certificate.containment import ellipsoid_inside as decide_inside
 from nlsid_core.certificate.trajectory_funnel import refuse_invalid, refuse_kappa
 from nlsid_core.continuous import (
@@ -35,6 +37,7 @@ from nlsid_core.funnels.lstep import LSteps
 from nlsid_core.funnels.pieces import prove_pieces
 from nlsid_core.funnels.soundness import simulate_boundary, smallest_escape
 from nlsid_core.polynomial import variables
+from nlsid_core.sos import Program, SumOfSquares, solve
 
 
 @pytest.fixture(scope="module")
@@ -121,6 +124,31 @@ def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
         found = one_dimensional.radius(one_dimensional.design(knots).funnel, t)
         assert (found < best + 1e-9).all()
         assert (found / best).mean() >= ratio
+
+
+@pytest.mark.parametrize("piece", [0, 17, 38])
+def test_the_literal_formulation_with_time_in_the_program_agrees(piece: int) -> None:
+    """Thesis (6.4): (ρ̇ - Ẇ) ≥ margin on W = ρ, 0 ≤ s ≤ 1, with multipliers in s and z."""
+    design = one_dimensional.design()
+    chosen = design.proved.pieces.select(np.array([piece]))
+    blank = replace(chosen, mu=0 * chosen.mu)
+    c, unit = closed_loop_polynomial(design.field, design.policy, design.funnel, blank, Exact)
+    s, z = variables("s z")
+    p = 0 * s
+    for q, part in c.items():
+        S = part.shape[1] - 1
+        for k, value in enumerate((part.approximate()[0, :, 0] / unit).tolist()):
+            p = p + value * s**k * (1 - s) ** (S - k) * z**q
+    k = int(chosen.interval[0])
+    T = float(chosen.T[0, 0, 0])
+    rho, P = design.funnel.rho[k : k + 2], design.funnel.P[k : k + 2, 0, 0] * T**2
+    boundary = (1 - s) * rho[0] + s * rho[1] - ((1 - s) * P[0] + s * P[1]) * z**2
+    (gamma,) = variables("gamma")
+    squares = SumOfSquares(p - gamma, (s * (1 - s),), (boundary,), degree=8)
+    best = solve(Program(("s", "z"), (squares,), maximise=gamma)).objective
+    h = float(design.funnel.t[k + 1] - design.funnel.t[k])
+    # The sweep leaves little: the literal optimum is above what is proved, and not by much.
+    assert design.proved.margins[piece] <= best / (h * rho.min()) <= 1e-2
 
 
 def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path) -> None:
