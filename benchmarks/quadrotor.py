@@ -10,7 +10,6 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,29 +17,9 @@ import numpy as np
 
 from benchmarks.machine import describe
 from examples import quadrotor
-from nlsid_core._types import FloatArray
 from nlsid_core.certificate import check
 from nlsid_core.funnels import design_funnel
-from nlsid_core.funnels.soundness import simulate_boundary
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The true dynamics, where a simulation expects a vector field."""
-
-    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-
-    def span(self, t: float) -> int:
-        """There is one set of equations."""
-        del t
-        return 0
-
-    def __call__(
-        self, t: float, X: FloatArray, U: FloatArray, W: FloatArray, *, span: int
-    ) -> FloatArray:
-        """ẋ (N, 12)."""
-        del t, W, span
-        return quadrotor.truth(X.T, U.T).T
+from nlsid_core.funnels.soundness import TrueDynamics, simulate_boundary
 
 
 def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
@@ -59,7 +38,7 @@ def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     verdict = check(proof, mode="rigorous")
     model = (design.policy, design.funnel)
     rng = np.random.default_rng(12)
-    truth: Any = Truth()
+    truth = TrueDynamics(lambda X, U: quadrotor.truth(X.T, U.T).T)
     run = simulate_boundary(truth, *model, starts=arguments.starts, rng=rng)
     shape = np.linalg.inv(design.funnel.shape(0.0))
     return {

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from bags.cli import app
 from bags.problems import FunnelProblem
-from examples import one_dimensional
+from examples import one_dimensional, pendulum
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import _json
 from nlsid_core.certificate import check
@@ -35,7 +35,7 @@ from nlsid_core.funnels.alternation import alternate_rho, exponential_start
 from nlsid_core.funnels.lemmas import lemma_decay, lemma_invariance
 from nlsid_core.funnels.lstep import LSteps
 from nlsid_core.funnels.pieces import prove_pieces
-from nlsid_core.funnels.soundness import simulate_boundary, smallest_escape
+from nlsid_core.funnels.soundness import TrueDynamics, simulate_boundary, smallest_escape
 from nlsid_core.polynomial import variables
 from nlsid_core.sos import Program, SumOfSquares, solve
 
@@ -148,7 +148,7 @@ def test_the_literal_formulation_with_time_in_the_program_agrees(piece: int) -> 
     best = solve(Program(("s", "z"), (squares,), maximise=gamma)).objective
     h = float(design.funnel.t[k + 1] - design.funnel.t[k])
     # The sweep leaves little: the literal optimum is above what is proved, and not by much.
-    assert design.proved.margins[piece] <= best / (h * rho.min()) <= 1e-2
+    assert design.proved.margins[piece] <= best / (h * float(np.min(rho))) <= 1e-2
 
 
 def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path) -> None:
@@ -215,6 +215,17 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
         )
     with pytest.raises(CertificateRejected, match="power of two"):
         refuse_kappa(np.array([1.0, 3.0, 1.0]), field)
+
+
+def test_a_pendulum_with_its_true_sine_stays_within_its_torque_limits() -> None:
+    found = pendulum.design()
+    for t in found.funnel.t:
+        inputs = found.policy(float(t), found.funnel.outline(float(t), (0, 1)))
+        assert np.abs(inputs).max() <= pendulum.TORQUE
+    truth = TrueDynamics(pendulum.truth)
+    rng = np.random.default_rng(6)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=3000, rng=rng)
+    assert run.violations == 0
 
 
 # -- lemmas ----------------------------------------------------------------------------------

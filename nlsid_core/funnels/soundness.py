@@ -3,17 +3,56 @@
 A simulation proves nothing; one start that leaves would show that the proof or the code is wrong.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Funnel, Policy, VectorField
+from nlsid_core._types import ArrayLike, FloatArray
+from nlsid_core.continuous import Funnel, Policy
 from nlsid_core.continuous.piecewise import bernstein
 
 SUBSTEPS = 5  # Runge-Kutta steps of order four per interval: errors of 1e-8 on the satellite
 TOLERANCE = 1e-6  # of V above 1, for the integration's error
 CHUNK = 4096  # trajectories integrated together: their monomials fit the cache
+
+
+class Dynamics(Protocol):
+    """What is simulated: a `VectorField`, or what it stands for."""
+
+    @property
+    def uncertain(self) -> FloatArray:
+        """(n_w, 2) bounds of w."""
+
+    def span(self, t: float) -> int:
+        """The index of the equations that hold from time t on."""
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None
+    ) -> FloatArray:
+        """ẋ (N, n)."""
+
+
+@dataclass(frozen=True)
+class TrueDynamics:
+    """rate(X, U) -> ẋ (N, n): what a Taylor model stands for, without uncertainty."""
+
+    rate: Callable[[FloatArray, FloatArray], FloatArray]
+    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def span(self, t: float) -> int:
+        """There is one set of equations."""
+        del t
+        return 0
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None
+    ) -> FloatArray:
+        """ẋ (N, n)."""
+        del t, W, span
+        X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
+        return self.rate(X, U)
 
 
 @dataclass(frozen=True)
@@ -26,7 +65,7 @@ class Soundness:
 
 
 def simulate_boundary(
-    field: VectorField,
+    dynamics: Dynamics,
     policy: Policy,
     funnel: Funnel,
     *,
@@ -43,7 +82,7 @@ def simulate_boundary(
         X = _boundary(funnel, knot, count, rng, scale)
         worst = np.zeros(count)
         for k in range(knot, len(funnel.t) - 1):
-            X, V = follow(field, policy, funnel, k, X, rng, substeps)
+            X, V = follow(dynamics, policy, funnel, k, X, rng, substeps)
             worst = np.maximum(worst, V)
         violations += int((worst > 1 + TOLERANCE).sum())
         largest = max(largest, float(np.max(worst)))
@@ -51,7 +90,7 @@ def simulate_boundary(
 
 
 def smallest_escape(
-    field: VectorField,
+    dynamics: Dynamics,
     policy: Policy,
     funnel: Funnel,
     goal: FloatArray,
@@ -70,7 +109,7 @@ def smallest_escape(
         X = _boundary(funnel, 0, starts, rng, middle)
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(len(funnel.t) - 1):
-                X, _ = follow(field, policy, funnel, k, X, rng, 2 * SUBSTEPS)
+                X, _ = follow(dynamics, policy, funnel, k, X, rng, 2 * SUBSTEPS)
             d = X - funnel.x.ends()[-1]
             missed = not (np.einsum("ni,ij,nj->n", d, goal, d) <= 1).all()
         low, high = (low, middle) if missed else (middle, high)
@@ -78,7 +117,7 @@ def smallest_escape(
 
 
 def follow(
-    field: VectorField,
+    dynamics: Dynamics,
     policy: Policy,
     funnel: Funnel,
     k: int,
@@ -88,15 +127,15 @@ def follow(
 ) -> tuple[FloatArray, FloatArray]:
     """States at the end of interval k from X (N, n) at its start, and the largest V on the way."""
     t, h = funnel.t[k], (funnel.t[k + 1] - funnel.t[k]) / substeps
-    span = field.span(float(t))
+    span = dynamics.span(float(t))
     x, u, K = (part.control[k] for part in (policy.x, policy.u, policy.K))
-    low, high = field.uncertain.T
+    low, high = dynamics.uncertain.T
     worst = np.zeros(len(X))
 
     def rate(s: float, states: FloatArray, w: FloatArray) -> FloatArray:
         inputs = bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T
         when = float(t + s * (funnel.t[k + 1] - t))
-        return field(when, states, inputs, w, span=span)
+        return dynamics(when, states, inputs, w, span=span)
 
     for j in range(substeps):
         s, half, end = j / substeps, (j + 0.5) / substeps, (j + 1) / substeps

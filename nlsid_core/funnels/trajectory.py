@@ -29,8 +29,9 @@ from nlsid_core.funnels.tvlqr import Tracking, lyapunov, tvlqr
 
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
-MARGIN = 5e-4  # of the L-steps' rate scale, in the sweep; tripled while some piece is not proved
-RETRIES = 3
+MARGIN = 5e-4  # of the L-steps' rate scale, in the sweep, at first
+RETRIES = 6
+GROWTH = 4.0  # of the margin, where some piece is not proved
 CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 FILES = ("vector_field.json", "policy.json", "funnel.json", "funnel.proof.json")
 
@@ -301,7 +302,7 @@ def _swept(
         proved = prove_pieces(steps, policy, funnel, ends)
         if not proved.unproved:
             return funnel, proved, margin
-        margin *= 3
+        margin *= GROWTH
     assert proved is not None
     raise Infeasible(
         f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
