@@ -1,5 +1,6 @@
 """Funnels around trajectories: nouns, lemmas, proofs for every t, and what is refused."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,8 @@ def test_every_kind_of_gain_is_proved(gain: str) -> None:
 def test_p_grows_beyond_rho_and_is_proved() -> None:
     field, nominal = hanging(9)
     rho = design_funnel(field, nominal, goal=20 * np.eye(2))
-    P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P")
+    with ThreadPoolExecutor(2) as threads:
+        P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P", executor=threads)
     assert P.funnel.volume_integral() > rho.funnel.volume_integral()
     assert np.min(P.proved.margins) > 0
 

@@ -15,7 +15,6 @@ from nlsid_core.certificate import polynomial_data as data
 from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
 from nlsid_core.polynomial import Polynomial, trace
 from nlsid_core.polynomial.maps import coefficient_table
-from nlsid_core.polynomial.values import monomial_values
 
 FORMAT = "nlsid/vector_field"
 VERSION = 1
@@ -45,8 +44,8 @@ class VectorField:
     uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     names: tuple[str, ...] = field(init=False)
-    _tables: tuple[tuple[IntArray, FloatArray], ...] = field(init=False)
     _plans: tuple["_Plan", ...] = field(init=False)
+    _slopes: dict[int, "_Plan"] = field(init=False, default_factory=dict)  # built when first asked
 
     def __post_init__(self) -> None:
         bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
@@ -78,9 +77,7 @@ class VectorField:
             value.setflags(write=False)
             object.__setattr__(self, key, value)
         object.__setattr__(self, "pieces", tuple(pieces))
-        tables = tuple(_table(p, names) for p in pieces)
-        object.__setattr__(self, "_tables", tables)
-        object.__setattr__(self, "_plans", tuple(_Plan.of(*table) for table in tables))
+        object.__setattr__(self, "_plans", tuple(_Plan.of(*_table(p, names)) for p in pieces))
 
     @classmethod
     def from_function(
@@ -213,15 +210,14 @@ class VectorField:
 
     def jacobians(self, t: float, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """A (n, n) = ∂f/∂x and B (n, m) = ∂f/∂u at one point, w in the centre of its box."""
-        exponents, table = self._tables[self.span(t)]
-        point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float),
-                                self.uncertain.mean(axis=1)])  # fmt: skip
-        columns = []
-        for j in range(1, 1 + self.n + self.m):
-            lowered = exponents.copy()
-            lowered[:, j] = np.maximum(lowered[:, j] - 1, 0)
-            columns.append((monomial_values(lowered, point[None])[0] * exponents[:, j]) @ table)
-        J = np.array(columns).T
+        span = self.span(t)
+        if span not in self._slopes:
+            names = self.names[1 : 1 + self.n + self.m]
+            slopes = [p.derivative(name) for p in self.pieces[span] for name in names]
+            self._slopes[span] = _Plan.of(*_table(slopes, self.names))
+        w = self.uncertain.mean(axis=1)
+        point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float), w])
+        J = self._slopes[span](point[:, None]).reshape(self.n, self.n + self.m)
         return J[:, : self.n], J[:, self.n :]
 
     def document(self) -> Json:

@@ -6,7 +6,9 @@ relaxation, thesis (6.7), and proves nothing: only a proof for every t makes a f
 """
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -54,15 +56,19 @@ def exponential_start(steps: LSteps, policy: Policy, P: FloatArray) -> Funnel:
     )
 
 
-def solve_ends(steps: LSteps, policy: Policy, funnel: Funnel) -> list[Ends]:
-    """L-steps at both ends of every interval."""
-    result = []
-    warm = None
-    for k, (start, end) in enumerate(sections(steps.field, policy, funnel.P)):
-        first = steps.solve(start, float(funnel.rho[k]), warm)
-        warm = steps.solve(end, float(funnel.rho[k + 1]), first)
-        result.append(Ends(first, warm))
-    return result
+def solve_ends(
+    steps: LSteps, policy: Policy, funnel: Funnel, *, executor: Executor | None = None
+) -> list[Ends]:
+    """L-steps at both ends of every interval; they are independent, and an executor shares them."""
+    solve = partial(_ends_of, steps, policy, funnel)
+    intervals = range(len(funnel.t) - 1)
+    return list(map(solve, intervals) if executor is None else executor.map(solve, intervals))
+
+
+def _ends_of(steps: LSteps, policy: Policy, funnel: Funnel, k: int) -> Ends:
+    start, end = (section_at(steps.field, policy, funnel.P, k, float(s)) for s in (0, 1))
+    first = steps.solve(start, float(funnel.rho[k]))
+    return Ends(first, steps.solve(end, float(funnel.rho[k + 1]), first))
 
 
 def least_margin(funnel: Funnel, ends: Sequence[Ends]) -> float:
@@ -109,6 +115,7 @@ def alternate_shape(
     margin: float,
     objective: str = "volume",
     iterations: int = MAX_ITERATIONS,
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> tuple[Funnel, Proved, list[tuple[str, float]]]:
     """Enlarge P(t), keeping the end, and prove the last funnel of the alternation that can be.
@@ -123,7 +130,7 @@ def alternate_shape(
     present = replace(funnel, P=(P + P.transpose(0, 2, 1)) / 2, rho=np.ones(len(rho)))
     found = [present]
     for iteration in range(iterations):
-        candidate = _enlarged(steps, policy, present, margin, objective, found[0].P)
+        candidate = _enlarged(steps, policy, present, margin, objective, found[0].P, executor)
         if candidate is None:
             break
         growth = candidate.volume_integral() / present.volume_integral()
@@ -150,9 +157,11 @@ def _enlarged(
     margin: float,
     objective: str,
     reference: FloatArray,
+    executor: Executor | None,
 ) -> Funnel | None:
     """One V-step for all knots but the last; None if none was found or it does not hold."""
-    forms = KnotForms(steps, policy, funnel, solve_ends(steps, policy, funnel), margin=margin)
+    ends = solve_ends(steps, policy, funnel, executor=executor)
+    forms = KnotForms(steps, policy, funnel, ends, margin=margin)
     h = np.diff(funnel.t)
     share = (np.r_[h, 0] + np.r_[0, h])[:-1] / 2
     volumes = np.array([funnel.volume(float(t)) for t in funnel.t[:-1]])

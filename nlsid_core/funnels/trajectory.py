@@ -3,6 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,7 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
+    executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
     """The largest funnel around `nominal` that ends in `goal`, proved for every t.
@@ -119,7 +121,7 @@ def design_funnel(
     the end. policy: default a time-varying LQR with Q and R (default identities), and P(t) its
     cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. shape "rho": P fixed,
     ρ(t) is swept backward; "P": P(t) itself is searched, alternating, from there. gain: how the
-    LQR's K varies between knots.
+    LQR's K varies between knots. executor: shares the independent L-steps of shape "P".
 
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
@@ -148,7 +150,7 @@ def design_funnel(
     if shape == "P":
         started = time.perf_counter()
         funnel, proved, steps_taken = alternate_shape(
-            steps, policy, funnel, margin=margin, progress=progress
+            steps, policy, funnel, margin=margin, executor=executor, progress=progress
         )
         history += steps_taken
         seconds["P"] = time.perf_counter() - started
