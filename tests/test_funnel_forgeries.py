@@ -95,6 +95,17 @@ def other_inertia(files: Files) -> None:
     ]
 
 
+def degree_raised(files: Files) -> None:
+    """To one whose expansion nobody would live to see."""
+    files["vector_field.json"]["pieces"][0][0]["exponents"][0][1] = 400
+
+
+def frame_singular(files: Files) -> None:
+    """z then reaches no more than a plane of states."""
+    T = files["funnel.proof.json"]["proof"]["pieces"][3]["T"]
+    T[0] = T[1]
+
+
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (rho_at_one_knot, "do not represent"),
     (gain_lower, "do not represent"),
@@ -106,6 +117,8 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (shapes_swapped, "do not represent"),
     (nominal_shifted, "do not represent"),
     (other_inertia, "do not represent"),
+    (degree_raised, "degree 4"),
+    (frame_singular, "singular"),
 ]
 
 

@@ -25,9 +25,11 @@ from nlsid_core.certificate.verdict import Decision
 from nlsid_core.continuous.funnel import Funnel
 from nlsid_core.continuous.policy import Policy
 from nlsid_core.continuous.vector_field import VectorField
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, Undecided
 
 KIND = "trajectory_funnel"
+# Larger ones would take this checker hours, and so would a denial of service.
+MAX_STATES, MAX_FIELD_DEGREE, MAX_BASIS_DEGREE = 16, 7, 3
 ABOUT = ("vector_field", "policy", "funnel")
 
 
@@ -40,6 +42,12 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     field = VectorField.from_document(about["vector_field"], source="vector field")
     policy = Policy.from_document(about["policy"], source="policy")
     funnel = Funnel.from_document(about["funnel"], source="funnel")
+    degree = max(int(np.max(p.exponents.sum(axis=1), initial=0)) for e in field.pieces for p in e)
+    if field.n > MAX_STATES or degree > MAX_FIELD_DEGREE:
+        raise Undecided(
+            f"dynamics with {field.n} states and degree {degree}: this checker decides up to "
+            f"{MAX_STATES} and {MAX_FIELD_DEGREE}"
+        )
     _refuse_strangers(about, field, policy, funnel)
     for k, P in enumerate(funnel.P):
         if not containment.is_positive_definite(P):
@@ -97,7 +105,8 @@ def refuse_goal(funnel: Funnel, centre: FloatArray, P: FloatArray, multiplier: f
 def read_pieces(proof: Json, n: int) -> Pieces:
     """The pieces of a proof as arrays; DocumentError if they are not what they should be."""
     basis = _json.array(proof, "basis", (None, n), source="proof")
-    if not ((basis >= 0).all() and (basis == np.round(basis)).all() and (basis <= 8).all()):
+    small = (basis >= 0).all() and (basis.sum(axis=1) <= MAX_BASIS_DEGREE).all()
+    if not (small and (basis == np.round(basis)).all()):
         raise CertificateRejected("the Gram basis should hold small nonnegative exponents")
     exponents = basis.astype(np.int64)
     if len(np.unique(exponents, axis=0)) != len(exponents) or len(exponents) > 500:
