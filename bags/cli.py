@@ -13,6 +13,7 @@ from bags.bag_cli import bag_app
 from bags.config import load_config
 from bags.demo import run_demo
 from bags.folders import expand_bags
+from bags.problems import FunnelProblem
 from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
@@ -78,11 +79,27 @@ def compare(
 
 @app.command()
 def funnel(
-    model: Annotated[Path, typer.Option(help="The model.json that `nlsid identify` wrote.")],
-    config: ConfigOption,
     out_dir: OutOption,
+    model: Annotated[
+        Path | None, typer.Option(help="The model.json that `nlsid identify` wrote.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="The robot's YAML configuration.")] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
+    ] = None,
 ) -> None:
-    """Design a tracking policy and a proved tube: policy.json, funnel.json, funnel.proof.json."""
+    """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.
+
+    Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
+    """
+    if problem is not None:
+        if model is not None or config is not None:
+            raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
+        _funnel_around_trajectory(problem, out_dir)
+        return
+    if model is None or config is None:
+        raise typer.BadParameter("give --model and --config, or --problem")
     settings = load_config(config)
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
@@ -176,6 +193,20 @@ def demo(
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     if not run_demo(out_dir, out):
         raise typer.Exit(1)
+
+
+def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
+    with progress_bar("designing") as progress:
+        design = FunnelProblem.load(problem).design(progress)
+    for path in design.save(out_dir):
+        out.print(f"wrote {path}", soft_wrap=True)
+    if report_available():
+        from bags.funnel_plots import write_funnel_picture
+
+        picture = out_dir / documents.FUNNEL_PLOT
+        write_funnel_picture(picture, design)
+        out.print(f"wrote {picture}", soft_wrap=True)
+    out.print(str(design), soft_wrap=True)
 
 
 def main() -> None:

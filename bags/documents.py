@@ -19,6 +19,7 @@ POLICY = "policy.json"
 FUNNEL = "funnel.json"
 FUNNEL_PROOF = "funnel.proof.json"
 MARGIN_PLOT = "monitor.png"
+FUNNEL_PLOT = "funnel.png"
 
 
 @dataclass(frozen=True, eq=False)

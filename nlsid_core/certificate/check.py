@@ -37,6 +37,13 @@ def _exact_only(decide: Callable[[Json, Json, Mapping[str, Json]], Decision]) ->
     return decided
 
 
+def _trajectory_funnel(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> Decision:
+    # Imported when needed: the nouns it is about read their polynomials with this package.
+    from nlsid_core.certificate import trajectory_funnel
+
+    return trajectory_funnel.decide(claim, proof, about, mode)
+
+
 CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
@@ -49,6 +56,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,
         "implicit_stability": implicit.decide,
+        "trajectory_funnel": _trajectory_funnel,
     }
 )
 

@@ -1,5 +1,24 @@
 """Funnels: a model and a policy in, a funnel with its proof out (thesis Part II)."""
 
 from nlsid_core.funnels.discrete import TubeDesign, design_tube
+from nlsid_core.funnels.trajectory import FunnelDesign, Goal, design_funnel
+from nlsid_core.funnels.tvlqr import (
+    Tracking,
+    integrate_nominal,
+    lyapunov,
+    nominal_through,
+    tvlqr,
+)
 
-__all__ = ["TubeDesign", "design_tube"]
+__all__ = [
+    "FunnelDesign",
+    "Goal",
+    "Tracking",
+    "TubeDesign",
+    "design_funnel",
+    "design_tube",
+    "integrate_nominal",
+    "lyapunov",
+    "nominal_through",
+    "tvlqr",
+]

@@ -1,0 +1,96 @@
+"""How funnels scale with the number of states: a chain of coupled pendulums, 2 to 12 states.
+
+    python -m benchmarks.funnel_scaling [--json] [--most N]
+
+The thesis stopped at 6 states. Every state enters nonlinearly: no reduced basis helps.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import describe
+from nlsid_core.continuous import VectorField
+from nlsid_core.errors import NlsidError
+from nlsid_core.funnels import design_funnel, integrate_nominal
+from nlsid_core.funnels.lstep import LSteps, section_at
+from nlsid_core.funnels.tvlqr import tvlqr
+
+KNOTS, FINAL_TIME = 9, 1.0  # s
+GOAL = 8.0  # P = 8 I: 0.35 rad and rad/s around rest
+
+
+def chain(pendulums: int) -> Callable[[Any, Any], Any]:
+    """ẋ of pendulums to third order with cubic drag, torques on all, springs between neighbours."""
+
+    def dynamics(x: Any, u: Any) -> Any:
+        q, v = x[:pendulums], x[pendulums:]
+        rates = []
+        for i in range(pendulums):
+            torque = u[i] - q[i] + q[i] ** 3 / 6 - v[i] / 5 - v[i] ** 3 / 10
+            if i:
+                torque = torque + (q[i - 1] - q[i]) / 4
+            if i + 1 < pendulums:
+                torque = torque + (q[i + 1] - q[i]) / 4
+            rates.append(torque)
+        return np.concatenate([v, np.array(rates)])
+
+    return dynamics
+
+
+def row(n: int) -> dict[str, Any]:
+    """Times and outcome for n states."""
+    half = n // 2
+    field = VectorField.from_function(chain(half), n, half)
+    t = np.linspace(0, FINAL_TIME, KNOTS)
+    nominal = integrate_nominal(field, lambda _: np.zeros(half), t=t, start=np.zeros(n))
+    goal = GOAL * np.eye(n)
+    steps = LSteps(field)
+    tracking = tvlqr(field, nominal, Q=np.eye(n), R=np.eye(half), S_final=1.01 * goal)
+    section = section_at(field, tracking.policy, tracking.S, KNOTS - 2, 1.0)
+    first = steps.solve(section, 1.0)
+    started = time.perf_counter()
+    steps.solve(section, 0.99, first)
+    l_step = time.perf_counter() - started
+    started = time.perf_counter()
+    try:
+        design = design_funnel(field, nominal, goal=goal, Q=np.eye(n), R=np.eye(half))
+        proved, pieces = True, len(design.proved.pieces)
+    except NlsidError:
+        proved, pieces = False, 0
+    return {
+        "states": n,
+        "l_step_ms": 1e3 * l_step,
+        "total_seconds": time.perf_counter() - started,
+        "pieces": pieces,
+        "proved": proved,
+    }
+
+
+def main() -> None:
+    """Print the table, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--most", type=int, default=12)
+    arguments = parser.parse_args()
+    print(f"chain of pendulums, {KNOTS} knots; {describe()}")
+    print("states   L-step [ms]   total [s]   pieces   proved for every t")
+    rows = []
+    for n in range(2, arguments.most + 1, 2):
+        rows.append(row(n))
+        r = rows[-1]
+        print(
+            f"{n:6d} {r['l_step_ms']:13.1f} {r['total_seconds']:11.2f} {r['pieces']:8d}   "
+            f"{'yes' if r['proved'] else 'no'}",
+            flush=True,
+        )
+    if arguments.json:
+        print(json.dumps({"rows": rows}))
+
+
+if __name__ == "__main__":
+    main()

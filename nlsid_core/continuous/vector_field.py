@@ -1,0 +1,341 @@
+"""`VectorField`: polynomial dynamics ẋ = f(t, x, u, w), exact, piecewise in time if need be."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from nlsid_core import _json
+from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.certificate import polynomial_data as data
+from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
+from nlsid_core.polynomial import Polynomial, trace
+from nlsid_core.polynomial.maps import coefficient_table
+
+FORMAT = "nlsid/vector_field"
+VERSION = 1
+MANY_PUSHES = 3
+MAX_UNCERTAIN = 10  # their box has 2^10 vertices, each checked
+ARGUMENTS = ("t", "x", "u", "w")
+
+
+@dataclass(frozen=True, eq=False)
+class VectorField:
+    """ẋ_i = pieces[j][i](t, x, u, w) on the j-th of the time spans that `breaks` separate.
+
+    pieces: exact polynomials in `names` = t, x0.., u0.., w0... n, m: numbers of states and inputs.
+    breaks: (J-1,) s, increasing, where the equations change. uncertain: (n_w, 2) lower and upper
+    bounds of w, which may vary arbitrarily in time within its box: bounded disturbances and
+    uncertain parameters; w has to enter with degree at most one in each entry. valid: (D, 3) rows
+    (j, low, high): the equations describe the system only where entry j of (x, u) is within; a
+    proved funnel stays there.
+
+    Raises ShapeError or DataError on equations that do not fit.
+    """
+
+    pieces: tuple[tuple[Polynomial, ...], ...]
+    n: int
+    m: int
+    breaks: FloatArray = field(default_factory=lambda: np.zeros(0))
+    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    names: tuple[str, ...] = field(init=False)
+    _plans: tuple["_Plan", ...] = field(init=False)
+    _slopes: dict[int, "_Plan"] = field(init=False, default_factory=dict)  # built when first asked
+
+    def __post_init__(self) -> None:
+        bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
+        breaks = np.array(self.breaks, dtype=np.float64)
+        if not (np.isfinite(bounds).all() and (bounds[:, 0] <= bounds[:, 1]).all()):
+            raise DataError(
+                f"bounds of the uncertain w should be finite pairs low <= high: {bounds}"
+            )
+        if len(bounds) > MAX_UNCERTAIN:
+            raise DataError(f"{len(bounds)} uncertain entries; at most {MAX_UNCERTAIN} are decided")
+        if breaks.ndim != 1 or not np.isfinite(breaks).all() or (np.diff(breaks) <= 0).any():
+            raise DataError(f"breaks should be increasing times, are {breaks}")
+        names = ("t", *variable_names(self.n, self.m, len(bounds)))
+        object.__setattr__(self, "names", names)
+        valid = np.array(self.valid, dtype=np.float64).reshape(-1, 3)
+        if not (np.isfinite(valid).all() and np.isin(valid[:, 0], range(self.n + self.m)).all()):
+            raise DataError(f"rows of valid should be (entry of (x, u), low, high), are {valid}")
+        if not self.pieces or len(self.pieces) != len(breaks) + 1:
+            raise ShapeError(f"{len(self.pieces)} sets of equations for {len(breaks)} breaks")
+        pieces = []
+        for equations in self.pieces:
+            if len(equations) != self.n:
+                raise ShapeError(f"{len(equations)} equations for {self.n} states")
+            pieces.append(tuple(p.exact().over(names) for p in equations))
+            for i, p in enumerate(pieces[-1]):
+                if (p.exponents[:, 1 + self.n + self.m :] > 1).any():
+                    raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
+        for key, value in (("breaks", breaks), ("uncertain", bounds), ("valid", valid)):
+            value.setflags(write=False)
+            object.__setattr__(self, key, value)
+        object.__setattr__(self, "pieces", tuple(pieces))
+        object.__setattr__(self, "_plans", tuple(_Plan.of(*_table(p, names)) for p in pieces))
+
+    @classmethod
+    def from_function(
+        cls,
+        function: Callable[..., Any],
+        n: int,
+        m: int,
+        *,
+        uncertain: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+    ) -> "VectorField":
+        """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
+
+        Raises NotPolynomial naming the operation; a Taylor polynomial is then the way, with its
+        remainder as an uncertain w.
+        """
+        bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
+        given = tuple(inspect.signature(function).parameters)
+        if not given or not set(given) <= set(ARGUMENTS):
+            raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        sizes = {"t": 1, "x": n, "u": m, "w": len(bounds)}
+
+        def called(*vectors: Any) -> Any:
+            passed = [v[0] if name == "t" else v for name, v in zip(given, vectors, strict=True)]
+            return function(*passed)
+
+        called.__name__ = getattr(function, "__name__", "dynamics")
+        try:
+            traced = trace(called, {name: sizes[name] for name in given})
+        except NotPolynomial as error:
+            raise NotPolynomial(
+                f"{error}. Give its Taylor polynomial instead, and what it leaves out on "
+                "the states of interest as an uncertain w with bounds"
+            ) from error
+        if traced.shape != (n,):
+            raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")
+        equations = []
+        for p in traced.tolist():
+            renamed = tuple("t" if name == "t0" else name for name in p.names)
+            equations.append(Polynomial(p.exponents, p.coefficients, renamed))
+        names = ("t", *variable_names(n, m, len(bounds)))
+        within = np.zeros((0, 3)) if valid is None else np.asarray(valid, dtype=np.float64)
+        pieces = (tuple(p.over(names) for p in equations),)
+        return cls(pieces, n, m, uncertain=bounds, valid=within)
+
+    @property
+    def degree(self) -> int:
+        """Largest total degree in x and u."""
+        columns = slice(1, 1 + self.n + self.m)
+        return max(
+            int(np.max(p.exponents[:, columns].sum(axis=1), initial=0))
+            for equations in self.pieces
+            for p in equations
+        )
+
+    @property
+    def nonlinear_states(self) -> tuple[int, ...]:
+        """States such that every term of degree d ≥ 2 in x and u has at least d - 1 of them.
+
+        Those in terms of degree 2 or more, if inputs do not spoil it; else all of them. All, too,
+        if w is taken at its corners: a push is a term of degree 1 in Ẇ.
+        """
+        if len(self.uncertain) and not self.is_pushed:
+            return tuple(range(self.n))
+        found: set[int] = set()
+        for equations in self.pieces:
+            for p in equations:
+                high = p.exponents[p.exponents[:, 1 : 1 + self.n + self.m].sum(axis=1) > 1]
+                inputs = high[:, 1 + self.n : 1 + self.n + self.m].sum(axis=1)
+                if (inputs > 1).any():
+                    return tuple(range(self.n))
+                found |= set(np.flatnonzero(high[:, 1 : 1 + self.n].any(axis=0)).tolist())
+        return tuple(sorted(found))
+
+    @property
+    def is_pushed(self) -> bool:
+        """True if w only adds constants to ẋ, and has so many entries that corners are too many.
+
+        Then 2|x̄'Pg|r ≤ r(κ(x̄'Pg)² + 1/κ) bounds what each does, and no corner is needed.
+        """
+        return len(self.uncertain) >= MANY_PUSHES and all(
+            self.pushes(span) is not None for span in range(len(self.pieces))
+        )
+
+    def pushes(self, span: int) -> FloatArray | None:
+        """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""
+        count = len(self.uncertain)
+        result = np.zeros((self.n, count))
+        for i, p in enumerate(self.pieces[span]):
+            for exponent, coefficient in p.terms():
+                used = [j for j in range(count) if exponent[1 + self.n + self.m + j]]
+                if used:
+                    if sum(exponent) > 1 or Fraction(float(coefficient)) != coefficient:
+                        return None
+                    result[i, used[0]] = float(coefficient)
+        return result
+
+    def vertices(self) -> FloatArray:
+        """(2^n_w, n_w) corners of the box of w; one empty row without uncertainty."""
+        return np.array(list(product(*self.uncertain.tolist()))).reshape(
+            2 ** len(self.uncertain), -1
+        )
+
+    def span(self, t: float) -> int:
+        """The index of the equations that hold from time t on."""
+        return int(np.searchsorted(self.breaks, t, side="right"))
+
+    def __call__(
+        self,
+        t: float,
+        X: ArrayLike,
+        U: ArrayLike,
+        W: ArrayLike | None = None,
+        *,
+        span: int | None = None,
+    ) -> FloatArray:
+        """ẋ (N, n) at states X (N, n), inputs U (N, m); w is the centre of its box if not given.
+
+        span: which piece to take, if not the one that holds from t on.
+        """
+        X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
+        U = np.broadcast_to(U, (len(X), self.m))
+        w = self.uncertain.mean(axis=1) if W is None else np.asarray(W, dtype=np.float64)
+        columns = np.empty((len(self.names), len(X)))
+        columns[0] = t
+        columns[1 : 1 + self.n] = X.T
+        columns[1 + self.n : 1 + self.n + self.m] = U.T
+        columns[1 + self.n + self.m :] = w.T if w.ndim == 2 else w[:, None]
+        return self._plans[self.span(t) if span is None else span](columns)
+
+    def jacobians(self, t: float, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """A (n, n) = ∂f/∂x and B (n, m) = ∂f/∂u at one point, w in the centre of its box."""
+        span = self.span(t)
+        if span not in self._slopes:
+            names = self.names[1 : 1 + self.n + self.m]
+            slopes = [p.derivative(name) for p in self.pieces[span] for name in names]
+            self._slopes[span] = _Plan.of(*_table(slopes, self.names))
+        w = self.uncertain.mean(axis=1)
+        point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float), w])
+        J = self._slopes[span](point[:, None]).reshape(self.n, self.n + self.m)
+        return J[:, : self.n], J[:, self.n :]
+
+    def document(self) -> Json:
+        """The JSON form; every coefficient is exact."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "law": "dx/dt = f(t, x, u, w)",
+            "states": self.n,
+            "inputs": self.m,
+            "low": self.uncertain[:, 0].tolist(),
+            "high": self.uncertain[:, 1].tolist(),
+            "breaks": self.breaks.tolist(),
+            "valid": self.valid.tolist(),
+            "pieces": [[data.write_polynomial(p) for p in part] for part in self.pieces],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "vector field") -> "VectorField":
+        """Raises DocumentError if the document is not a vector field."""
+        _json.header(document, FORMAT, VERSION, source=source)
+        n = _json.member(document, "states", int, source=source)
+        m = _json.member(document, "inputs", int, source=source)
+        low = _json.array(document, "low", (None,), source=source)
+        bounds = np.stack([low, _json.array(document, "high", low.shape, source=source)], axis=1)
+        if not (0 < n <= data.MAX_VARIABLES and 0 <= m <= data.MAX_VARIABLES):
+            raise DocumentError(f"{source}: {n} states and {m} inputs are not a vector field")
+        names = ("t", *variable_names(n, m, len(bounds)))
+        parts = _json.member(document, "pieces", list, source=source)
+        pieces = []
+        for part in parts:
+            if not isinstance(part, list):
+                raise DocumentError(f"{source}: a piece should be a list of equations")
+            read = [data.read_polynomial(p, names, source=f"{source} equation") for p in part]
+            pieces.append(tuple(read))
+        breaks = _json.array(document, "breaks", (None,), source=source)
+        rows = _json.member(document, "valid", list, source=source)
+        valid = _json.array(document, "valid", (len(rows), 3), source=source)
+        return cls(tuple(pieces), n, m, breaks, bounds, valid)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """Monomials as products of two earlier ones, a row of points each: fast for many points.
+
+    products: (L, 2) rows of the stack [1, variables, products so far]. table: (n, stack size).
+    """
+
+    products: tuple[tuple[int, int], ...]
+    table: FloatArray
+
+    @classmethod
+    def of(cls, exponents: IntArray, table: FloatArray) -> "_Plan":
+        size = exponents.shape[1]
+        known = {(0,) * size: 0}
+        known |= {tuple(row): j + 1 for j, row in enumerate(np.eye(size, dtype=int).tolist())}
+        products: list[tuple[int, int]] = []
+
+        def place(exponent: tuple[int, ...]) -> int:
+            if exponent not in known:
+                last = max(j for j, e in enumerate(exponent) if e)
+                lower = tuple(e - (j == last) for j, e in enumerate(exponent))
+                products.append((place(lower), last + 1))
+                known[exponent] = size + len(products)
+            return known[exponent]
+
+        rows = [place(tuple(row)) for row in exponents.tolist()]
+        full = np.zeros((table.shape[1], size + 1 + len(products)))
+        full[:, rows] = table.T
+        return cls(tuple(products), full)
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """Values (N, n) from variables (number, N)."""
+        size = len(columns)
+        stack = np.empty((self.table.shape[1], columns.shape[1]))
+        stack[0] = 1.0
+        stack[1 : size + 1] = columns
+        for i, (a, b) in enumerate(self.products, start=size + 1):
+            np.multiply(stack[a], stack[b], out=stack[i])
+        return (self.table @ stack).T
+
+
+def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:
+    """x0.., u0.., w0.."""
+    return tuple(
+        f"{letter}{i}"
+        for letter, size in (("x", n), ("u", m), ("w", uncertain))
+        for i in range(size)
+    )
+
+
+def joined(fields: Sequence[VectorField], breaks: ArrayLike) -> VectorField:
+    """One vector field that follows the given ones in turn, changing at the times `breaks`."""
+    first = fields[0]
+    return VectorField(
+        tuple(part for f in fields for part in f.pieces),
+        first.n,
+        first.m,
+        np.asarray(breaks, dtype=np.float64),
+        first.uncertain,
+    )
+
+
+def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    if not any(len(p) for p in equations):
+        empty = np.zeros((1, len(names)), dtype=np.int64)
+        return empty, np.zeros((1, len(equations)))
+    exponents, table = coefficient_table([p.rounded() for p in equations])
+    return exponents, table
+
+
+def odd_denominator(equations: Sequence[Polynomial]) -> int:
+    """The least odd D > 0 that makes every coefficient times D a dyadic rational."""
+    result = 1
+    for p in equations:
+        for c in p.coefficients.tolist():
+            odd = Fraction(c).denominator
+            while odd % 2 == 0:
+                odd //= 2
+            result = result * odd // np.gcd(result, odd) if result % odd else result
+    return int(result)

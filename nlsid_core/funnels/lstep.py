@@ -1,0 +1,155 @@
+"""The L-step: the largest m with (ρ̇ - Ẇ)/ρ ≥ m on the boundary W = ρ at one instant.
+
+In coordinates x̄ = √ρ L⁻ᵀz, P = LL', the boundary is |z| = 1 at every t and φ = m - ρ̇/ρ does not
+depend on ρ̇. Source: thesis (6.4), in the sphere form.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+from nlsid_core.continuous import Policy, VectorField
+from nlsid_core.continuous.piecewise import bernstein
+from nlsid_core.errors import DataError
+from nlsid_core.funnels.line import LineProgram
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+
+MAX_DEGREE = 3  # of f: then Ẇ has degree 4, as much as the sphere program's squares
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One side of one knot: what c(s, z) is made of at that instant, except ρ.
+
+    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
+    x̄ = √ρ·base·z.
+    span: which of the field's pieces holds.
+    """
+
+    t: float
+    x: FloatArray
+    x_rate: FloatArray
+    u: FloatArray
+    K: FloatArray
+    P: FloatArray
+    P_rate: FloatArray
+    base: FloatArray
+    span: int
+
+
+def section_at(field: VectorField, policy: Policy, P: FloatArray, k: int, s: float) -> Section:
+    """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) is linear there."""
+    t = policy.t
+    h = t[k + 1] - t[k]
+    here = (1 - s) * P[k] + s * P[k + 1]
+    control = policy.x.control[k]
+    return Section(
+        t=float(t[k] + s * h),
+        x=bernstein(control, s),
+        x_rate=(len(control) - 1) * bernstein(np.diff(control, axis=0), s) / h,
+        u=bernstein(policy.u.control[k], s),
+        K=bernstein(policy.K.control[k], s),
+        P=here,
+        P_rate=(P[k + 1] - P[k]) / h,
+        base=coordinates(here, field.nonlinear_states),
+        span=field.span(float(t[k])),
+    )
+
+
+def sections(field: VectorField, policy: Policy, P: FloatArray) -> list[tuple[Section, Section]]:
+    """The start and the end of every interval, each seen from inside it."""
+    return [
+        (section_at(field, policy, P, k, 0.0), section_at(field, policy, P, k, 1.0))
+        for k in range(len(policy.t) - 1)
+    ]
+
+
+def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
+    """T (n, n) with T'PT = I, in which the nonlinear states are functions of the last z only."""
+    n = len(P)
+    order = [j for j in range(n) if j not in nonlinear] + list(nonlinear)
+    L = np.linalg.cholesky(P[np.ix_(order, order)])
+    T = np.zeros((n, n))
+    T[order] = np.triu(np.linalg.inv(L).T)  # exactly triangular, not up to rounding
+    return T
+
+
+class LSteps:
+    """L-steps of one vector field; holds the sphere program and counts what is solved."""
+
+    def __init__(self, field: VectorField, *, tolerance: float = 1e-5) -> None:
+        if field.degree > MAX_DEGREE:
+            raise DataError(
+                f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
+                "take a Taylor polynomial, and its remainder as an uncertain w"
+            )
+        self.field = field
+        self.tolerance = tolerance
+        self.program = sphere_program(field)
+        self.kappa: FloatArray | None = None
+        self.vertices = field.vertices()
+        self.solved = 0
+
+    def bound_pushes(self, P: FloatArray) -> None:
+        """If w only pushes, bound what it does on ellipsoids like {x̄'Px̄ ≤ 1}, not at corners.
+
+        κ near 1/max|x̄'Pg| makes the bound tight where the push hurts most.
+        """
+        pushes = self.field.pushes(0)
+        if self.field.is_pushed and pushes is not None:
+            largest = np.sqrt(np.einsum("ij,ik,kj->j", pushes, P, pushes))
+            self.kappa = np.exp2(np.round(-np.log2(largest)))
+            self.vertices = self.field.uncertain.mean(axis=1)[None]
+
+    def values(self, section: Section, rho: float, vertex: int) -> FloatArray:
+        """-Ẇ/ρ at the program's points, straight from the vector field."""
+        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        u = section.u - x_bar @ section.K.T
+        w = self.vertices[vertex]
+        rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
+        W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
+        W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
+        pushes = self.field.pushes(section.span)
+        if self.kappa is not None and pushes is not None:
+            radius = np.ptp(self.field.uncertain, axis=1) / 2
+            along = x_bar @ section.P @ pushes
+            W_rate += (self.kappa * along**2 + 1 / self.kappa) @ radius
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+
+    def _from_defect(self, section: Section, rho: float) -> FloatArray:
+        """What the nominal's defect adds to -Ẇ/ρ along z that enter linearly, of degree 1.
+
+        The reduced basis has no product for it; the proof's Gram matrix, which has 1, does.
+        """
+        linear = [j for j in range(self.program.n) if j not in self.program.chosen]
+        rate = self.field(section.t, section.x[None], section.u[None], span=section.span)[0]
+        slope = -2 * section.base.T @ section.P @ (rate - section.x_rate) / np.sqrt(rho)
+        return np.asarray(self.program.points[:, linear] @ slope[linear])
+
+    def solve(
+        self, section: Section, rho: float, start: list[SphereSolution] | None = None
+    ) -> list[SphereSolution]:
+        """φ for every vertex of w."""
+        found = []
+        for v in range(len(self.vertices)):
+            g = self.values(section, rho, v)
+            warm = None if start is None else start[v]
+            found.append(self.program.solve(g, tolerance=self.tolerance, start=warm))
+            self.solved += 1
+        return found
+
+    def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
+        """An upper bound of φ at another ρ or section, from dual solutions: no program solved."""
+        bounds = [float(self.values(section, rho, v) @ d.y) for v, d in enumerate(duals)]
+        return min(bounds)
+
+
+def sphere_program(field: VectorField) -> SphereProgram | LineProgram:
+    """The program for this field: nonlinear states last, degree 2 only where they occur."""
+    n, count = field.n, len(field.nonlinear_states)
+    if n == 1:
+        return LineProgram()
+    if count in (0, n):
+        return SphereProgram(n)
+    return SphereProgram(n, tuple(range(n - count, n)))

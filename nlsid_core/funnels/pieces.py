@@ -1,0 +1,292 @@
+"""From L-steps at the ends of pieces of time to a proof for every instant between them.
+
+The margin m of each L-step is turned into a strictly positive definite Gram matrix,
+m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)¾(1 + ½|z_nl|²), so that in between there is room. The checker
+decides; a piece it does not prove is halved, with a new L-step in its middle.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.certificate.arithmetic import Ball
+from nlsid_core.certificate.closed_loop import closed_loop_polynomial
+from nlsid_core.certificate.funnel_pieces import Pieces, piece_margins
+from nlsid_core.certificate.graded import monomials_of, positions, product_table
+from nlsid_core.continuous import Funnel, Policy
+from nlsid_core.errors import SolverError
+from nlsid_core.funnels.line import LineProgram
+from nlsid_core.funnels.lstep import LSteps, section_at
+from nlsid_core.funnels.sweep import Ends
+from nlsid_core.polynomial.maps import monomials
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+
+MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part [index, index + 1]/2^level of an interval."""
+
+    interval: int
+    level: int
+    index: int
+
+    def ends(self) -> tuple[float, float]:
+        """Start and end as fractions of the interval."""
+        return self.index / 2**self.level, (self.index + 1) / 2**self.level
+
+    def halves(self) -> tuple["Part", "Part"]:
+        """The two parts it is made of."""
+        return (
+            Part(self.interval, self.level + 1, 2 * self.index),
+            Part(self.interval, self.level + 1, 2 * self.index + 1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Proved:
+    """pieces and each one's margin in 1/s; unproved: the parts on which no proof was found."""
+
+    pieces: Pieces
+    margins: FloatArray
+    unproved: tuple[Part, ...]
+
+
+def prove_pieces(
+    steps: LSteps, policy: Policy, funnel: Funnel, ends: list[Ends] | None = None
+) -> Proved:
+    """A proof for all time, or the parts on which there is none.
+
+    ends: L-steps at the ends of the intervals, where they are at hand.
+    """
+    known: dict[tuple[int, float], list[SphereSolution]] = {}
+    for k, pair in enumerate(ends or []):
+        known[k, 0.0], known[k, 1.0] = pair.start, pair.end
+    waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1)]
+    done: list[tuple[Pieces, FloatArray]] = []
+    unproved: list[Part] = []
+    while waiting:
+        solvable = [part for part in waiting if _solved(steps, policy, funnel, part, known)]
+        unproved += [part for part in waiting if part not in solvable]
+        if not solvable:
+            break
+        solvable.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
+        alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
+        pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
+        margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
+        by_part = np.isfinite(margins).reshape(len(solvable), -1).all(axis=1)
+        keep = np.repeat(by_part, len(steps.vertices))
+        if keep.any():
+            chosen = np.flatnonzero(keep)
+            done.append((pieces.select(chosen), margins[chosen]))
+        failed = [part for part, good in zip(solvable, by_part, strict=True) if not good]
+        unproved += [part for part in failed if part.level == MAX_LEVEL]
+        waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
+    return Proved(*_joined(steps.program, done), unproved=tuple(unproved))
+
+
+def _solved(
+    steps: LSteps,
+    policy: Policy,
+    funnel: Funnel,
+    part: Part,
+    known: dict[tuple[int, float], list[SphereSolution]],
+) -> bool:
+    """L-steps at both ends of the part; False if one leaves no margin."""
+    k = part.interval
+    h = float(funnel.t[k + 1] - funnel.t[k])
+    for s in part.ends():
+        rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
+        if (k, s) not in known:
+            section = section_at(steps.field, policy, funnel.P, k, s)
+            try:
+                known[k, s] = steps.solve(section, rho)
+            except SolverError:
+                return False
+        growth = (funnel.rho[k + 1] - funnel.rho[k]) / h / rho
+        if min(found.m for found in known[k, s]) + growth <= 0:
+            return False
+    return True
+
+
+def _pieces(
+    steps: LSteps,
+    policy: Policy,
+    funnel: Funnel,
+    parts: list[Part],
+    known: dict[tuple[int, float], list[SphereSolution]],
+) -> Pieces:
+    """The pieces of the proof for these parts, part by part, vertex by vertex."""
+    n, program, vertices = funnel.n, steps.program, len(steps.vertices)
+    basis = with_one(program)
+    triangle = np.triu_indices(len(basis))
+    frames, mus, grams = [], [], []
+    for end in (0, 1):
+        T, rho, rows = [], [], []
+        for part in parts:
+            s = part.ends()[end]
+            i = part.interval
+            rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
+            section = section_at(steps.field, policy, funnel.P, i, s)
+            T += [np.sqrt(rho_here) * section.base] * vertices
+            rho += [rho_here] * vertices
+            rows += known[i, s]
+        blank = draft(program, parts, np.array(T), vertices, steps.kappa)
+        c, _ = closed_loop_polynomial(steps.field, policy, funnel, blank, Ball)
+        at_end = {q: part.approximate()[:, -end] for q, part in c.items()}
+        mu, gram = [], []
+        for b, solution in enumerate(rows):
+            i = int(blank.interval[b])
+            h = float(funnel.t[i + 1] - funnel.t[i])
+            growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
+            target = {q: values[b] for q, values in at_end.items()}
+            one = end_proof(program, solution, target, h * rho[b], solution.m + growth)
+            gram.append(one[0])
+            mu.append(one[1] / rho[b])
+        frames.append(np.array(T))
+        mus.append(np.array(mu))
+        grams.append(np.array(gram))
+    # Everything in the frame of the start: z_end = A z.
+    A = np.triu(np.linalg.solve(frames[1], frames[0]))
+    for b in range(len(A)):
+        M = substitution(basis, A[b])
+        grams[1][b] = M.T @ grams[1][b] @ M
+        full = monomials(n, [0, 1, 2])
+        mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
+    both = np.stack(grams, axis=1)
+    return replace(
+        blank,
+        T=frames[0],
+        mu=np.stack(mus, axis=1),
+        gram=both[..., triangle[0], triangle[1]],
+    )
+
+
+def with_one(program: SphereProgram | LineProgram) -> IntArray:
+    """The program's basis with 1 in front."""
+    return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
+
+
+def draft(
+    program: SphereProgram | LineProgram,
+    parts: list[Part],
+    T: FloatArray,
+    vertices: int,
+    kappa: FloatArray | None = None,
+) -> Pieces:
+    """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
+    basis, count = with_one(program), len(parts) * vertices
+    whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
+    repeated = np.repeat(whole, vertices, axis=0)
+    return Pieces(
+        basis,
+        interval=repeated[:, 0],
+        vertex=np.tile(np.arange(vertices), len(parts)),
+        level=repeated[:, 1],
+        index=repeated[:, 2],
+        T=T,
+        mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
+        gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
+        kappa=kappa,
+    )
+
+
+def end_proof(
+    program: SphereProgram | LineProgram,
+    solution: SphereSolution,
+    target: dict[int, FloatArray],
+    scale: float,
+    m: float,
+    *,
+    constant: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, target/scale ≥ m on the sphere, all of m used up.
+
+    constant: the share of m that stays a constant; the rest makes Q positive definite.
+    """
+    n = program.n
+    basis = with_one(program)
+    Q = np.zeros((len(basis), len(basis)))
+    Q[1:, 1:] = program.gram(solution) * scale
+    spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
+    spread[0] += constant
+    Q[np.diag_indices(len(basis))] += scale * m * spread
+    linear = np.array([j not in program.chosen for j in range(n)])
+    first = target.get(1, np.zeros(n))
+    for j in np.flatnonzero(linear).tolist():
+        place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
+        Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
+    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below.
+    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in range(5)])
+    rows = np.concatenate([monomials_of(n, q) for q in range(5)])
+    pairs = positions((basis[:, None] + basis[None]).reshape(-1, n), rows)
+    difference = np.bincount(pairs, Q.ravel(), len(rows)) - offset
+    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in range(5)])
+    squares = positions(2 * np.eye(n, dtype=np.int64), monomials_of(n, 2))
+    mu = [difference[starts[q] : starts[q + 1]] for q in range(3)]
+    mu[2] = mu[2] + mu[0][0] * np.isin(np.arange(len(mu[2])), squares)
+    # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
+    # with |z|² would put where the Gram matrix has no place for it.
+    for q in (1, 2):
+        mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
+    return Q, np.concatenate(mu)
+
+
+def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
+    """M with v(Az) = M v(z), v the monomials `rows` (k, n), of degree 2 at most.
+
+    Monomials that are not among the rows are dropped: with A triangular in the order of the
+    nonlinear variables their coefficients are zero.
+    """
+    n, k = len(A), len(rows)
+    places = {row.tobytes(): i for i, row in enumerate(rows)}
+    table = product_table(n, 1, 1)
+    second = monomials_of(n, 2)
+    M = np.zeros((k, k))
+    for i, row in enumerate(rows):
+        factors = np.repeat(np.arange(n), row)
+        if len(factors) == 0:
+            M[i, i] = 1.0
+        elif len(factors) == 1:
+            for j in range(n):
+                unit = np.eye(n, dtype=np.int64)[j].tobytes()
+                if unit in places:
+                    M[i, places[unit]] = A[factors[0], j]
+        else:
+            products = np.outer(A[factors[0]], A[factors[1]])
+            values = np.bincount(table.ravel(), products.ravel(), len(second))
+            for value, monomial in zip(values, second, strict=True):
+                if monomial.tobytes() in places:
+                    M[i, places[monomial.tobytes()]] = value
+    return M
+
+
+def _joined(
+    program: SphereProgram | LineProgram, done: list[tuple[Pieces, FloatArray]]
+) -> tuple[Pieces, FloatArray]:
+    """All proved pieces in the order of time."""
+    if not done:
+        return draft(program, [], np.zeros((0, program.n, program.n)), 1), np.zeros(0)
+    pieces = stacked([part for part, _ in done])
+    margins = np.concatenate([m for _, m in done])
+    order = np.lexsort((pieces.vertex, pieces.index / 2.0**pieces.level, pieces.interval))
+    return pieces.select(order), margins[order]
+
+
+def stacked(parts: Sequence[Pieces]) -> Pieces:
+    """All pieces in one; they have the same basis."""
+    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram")
+    whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+    return replace(parts[0], **whole)
+
+
+def unsolved(policy: Policy, parts: tuple[Part, ...]) -> str:
+    """The first unproved part in words."""
+    part = min(parts, key=lambda p: (p.interval, p.ends()))
+    start, h = policy.t[part.interval], policy.t[part.interval + 1] - policy.t[part.interval]
+    a, b = part.ends()
+    return f"{start + a * h:.6g} to {start + b * h:.6g} s"

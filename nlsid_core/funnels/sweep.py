@@ -1,0 +1,120 @@
+"""ρ(t) by one backward sweep: the largest piecewise-linear ρ that the L-steps allow.
+
+With s = log ρ the condition is ṡ ≥ margin - φ(t, ρ) at both ends of every interval, so each ρ_k
+follows from ρ_{k+1}: no alternation, no objective.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import Infeasible
+from nlsid_core.funnels.lstep import LSteps, Section
+from nlsid_core.sos.sphere import SphereSolution
+
+ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
+MAX_TRIES = 12
+LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """One interval's L-steps: solutions at its start and end per vertex; margins include ρ̇/ρ."""
+
+    start: list[SphereSolution]
+    end: list[SphereSolution]
+
+
+def sweep_rho(
+    steps: LSteps,
+    pairs: list[tuple[Section, Section]],
+    *,
+    margin: float,
+    rho_final: float = 1.0,
+    caps: FloatArray | None = None,
+    progress: Progress | None = None,
+) -> tuple[FloatArray, list[Ends]]:
+    """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
+
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below.
+    Raises Infeasible naming the time.
+    """
+    rho = np.empty(len(pairs) + 1)
+    rho[-1] = rho_final
+    ends: list[Ends] = []
+    duals: list[SphereSolution] | None = None
+    for k in range(len(pairs) - 1, -1, -1):
+        start, end = pairs[k]
+        h = end.t - start.t
+        at_end = steps.solve(end, rho[k + 1], duals)
+        phi = min(s.m for s in at_end)
+        cap = rho[k + 1] * (1 + h * (phi - margin))
+        if caps is not None:
+            cap = min(cap, float(caps[k]))
+        rho[k], at_start = _largest(steps, start, rho[k + 1], h, cap, margin, at_end)
+        ends.append(Ends(at_start, at_end))
+        duals = at_start
+        if progress is not None:
+            progress(f"rho at {start.t:.3g} s", 1 - k / len(pairs))
+    return rho, ends[::-1]
+
+
+def _largest(
+    steps: LSteps,
+    section: Section,
+    after: float,
+    h: float,
+    cap: float,
+    margin: float,
+    duals: list[SphereSolution],
+) -> tuple[float, list[SphereSolution]]:
+    """The largest ρ ≤ cap whose L-step leaves the margin, with its solutions."""
+
+    def slack(rho: float, phi: float) -> float:
+        return phi + (after / rho - 1) / h - margin
+
+    feasible, infeasible = 0.0, np.inf
+    best: list[SphereSolution] | None = None
+    for _ in range(MAX_TRIES):
+        if cap <= LOWEST * after:
+            break
+        known = duals
+        rho = _root(lambda r: slack(r, steps.predicted(section, r, known)),  # noqa: B023
+                    LOWEST * after, min(cap, infeasible))  # fmt: skip
+        if best is not None and rho <= feasible:
+            break
+        found = steps.solve(section, rho, duals)
+        left = slack(rho, min(s.m for s in found))
+        if left >= -ACCEPT * margin:
+            return rho, found
+        infeasible = min(infeasible, rho)
+        duals = found
+    if best is None:
+        raise Infeasible(
+            f"no rho at t = {section.t:.6g} s keeps solutions inside: the linearisation may not be "
+            "stabilised there. Try more knots, another P (Q and R of the LQR), or a smaller goal."
+        )
+    return feasible, best
+
+
+def _root(slack: Callable[[float], float], low: float, high: float) -> float:
+    """The largest r in [low, high] with slack(r) ≥ 0, by bisection on log r after a coarse look."""
+    if slack(high) >= 0:
+        return high
+    step = 0.9
+    inside = high
+    while inside > low and slack(inside) < 0:
+        high, inside = inside, inside * step
+        step *= step
+    if inside <= low:
+        return low
+    for _ in range(40):
+        middle = (inside + high) / 2
+        if high - inside <= 1e-9 * high:
+            break
+        inside, high = (middle, high) if slack(middle) >= 0 else (inside, middle)
+    return inside

@@ -1,0 +1,378 @@
+"""Funnels around trajectories: nouns, lemmas, proofs for every t, and what is refused."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.cli import app
+from bags.problems import FunnelProblem
+from examples import one_dimensional, pendulum
+from examples.satellite_funnel import goal_matrix, problem
+from nlsid_core import _json
+from nlsid_core.certificate import check
+from nlsid_core.certificate.arithmetic import Exact
+from nlsid_core.certificate.closed_loop import closed_loop_polynomial
+from nlsid_core.certificate.containment import ellipsoid_inside as decide_inside
+from nlsid_core.certificate.trajectory_funnel import refuse_invalid, refuse_kappa
+from nlsid_core.continuous import (
+    Funnel,
+    Nominal,
+    PiecewisePolynomial,
+    Policy,
+    VectorField,
+    constant_on,
+    cubic_through,
+    linear_through,
+)
+from nlsid_core.continuous.funnel import ellipsoid_inside
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, NotPolynomial
+from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, integrate_nominal, tvlqr
+from nlsid_core.funnels.alternation import alternate_rho, exponential_start
+from nlsid_core.funnels.lemmas import lemma_decay, lemma_invariance
+from nlsid_core.funnels.lstep import LSteps
+from nlsid_core.funnels.pieces import prove_pieces
+from nlsid_core.funnels.soundness import TrueDynamics, simulate_boundary, smallest_escape
+from nlsid_core.polynomial import variables
+from nlsid_core.sos import Program, SumOfSquares, solve
+
+
+@pytest.fixture(scope="module")
+def satellite() -> FunnelDesign:
+    """The satellite's funnel with 25 knots."""
+    field, nominal, weights = problem(25)
+    return design_funnel(field, nominal, goal=goal_matrix(), **weights)
+
+
+def damped(t: Any, x: Any, u: Any) -> Any:
+    """A pendulum to third order, hanging, with torque."""
+    del t
+    return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
+
+
+def hanging(knots: int = 21) -> tuple[VectorField, Nominal]:
+    """The pendulum at rest for 2 s."""
+    field = VectorField.from_function(damped, 2, 1)
+    t = np.linspace(0, 2, knots)
+    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+
+
+def test_a_satellite_funnel_is_proved_for_every_t_in_both_modes(
+    satellite: FunnelDesign, tmp_path: Path
+) -> None:
+    *_, proof = satellite.save(tmp_path)
+    rigorous, exact = check(proof, mode="rigorous"), check(proof)
+    assert rigorous.margin == pytest.approx(exact.margin, rel=1e-3)
+    assert exact.margin > 0
+    funnel, policy = Funnel.load(tmp_path / "funnel.json"), Policy.load(tmp_path / "policy.json")
+    assert (funnel.t0, funnel.tf) == (0.0, 5.0)
+    assert funnel.nominal(2.5).shape == (6,)
+    assert policy(1.0, np.zeros((7, 6))).shape == (7, 3)
+    assert funnel.volume(5.0) == pytest.approx(6.883e-3, rel=1e-3)
+
+
+def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDesign) -> None:
+    parts = (satellite.field, satellite.policy, satellite.funnel)
+    rng = np.random.default_rng(3)
+    for knot in (0, 12):
+        run = simulate_boundary(*parts, starts=2000, rng=rng, knot=knot)
+        assert run.violations == 0
+        assert 0.9 < run.max_v <= 1
+    assert simulate_boundary(*parts, starts=500, rng=rng, scale=1.2).violations == 500
+    assert smallest_escape(*parts, goal_matrix(), starts=300, rng=rng) < 1.4
+
+
+def test_alternation_ends_where_the_sweep_does() -> None:
+    field, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2))
+    steps = LSteps(field)
+    start = exponential_start(steps, design.policy, design.funnel.P)
+    found = alternate_rho(steps, design.policy, start, stop=0.002)
+    assert found.volumes[0] < found.volumes[-1]
+    assert found.volumes[-1] == pytest.approx(design.funnel.volume_integral(), rel=0.01)
+
+
+@pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])
+def test_every_kind_of_gain_is_proved(gain: str) -> None:
+    field, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2), gain=gain)
+    assert np.min(design.proved.margins) > 0
+
+
+def test_p_grows_beyond_rho_and_is_proved() -> None:
+    field, nominal = hanging(9)
+    rho = design_funnel(field, nominal, goal=20 * np.eye(2))
+    with ThreadPoolExecutor(2) as threads:
+        P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P", executor=threads)
+    assert P.funnel.volume_integral() > rho.funnel.volume_integral()
+    assert np.min(P.proved.margins) > 0
+
+
+def test_only_dynamics_nominal_and_weights_are_needed() -> None:
+    field, nominal = hanging(9)
+    design = design_funnel(damped, nominal, Q=np.eye(2), R=np.eye(1))
+    assert np.min(design.proved.margins) > 0
+    assert design.field.document() == field.document()
+
+
+def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
+    t = np.linspace(-1, 1, 401)
+    best = one_dimensional.true_sets(t)[1]
+    for knots, ratio in ((40, 0.95), (160, 0.985)):
+        found = one_dimensional.radius(one_dimensional.design(knots).funnel, t)
+        assert (found < best + 1e-9).all()
+        assert (found / best).mean() >= ratio
+
+
+@pytest.mark.parametrize("piece", [0, 17, 38])
+def test_the_literal_formulation_with_time_in_the_program_agrees(piece: int) -> None:
+    """Thesis (6.4): (ρ̇ - Ẇ) ≥ margin on W = ρ, 0 ≤ s ≤ 1, with multipliers in s and z."""
+    design = one_dimensional.design()
+    chosen = design.proved.pieces.select(np.array([piece]))
+    blank = replace(chosen, mu=0 * chosen.mu)
+    c, unit = closed_loop_polynomial(design.field, design.policy, design.funnel, blank, Exact)
+    s, z = variables("s z")
+    p = 0 * s
+    for q, part in c.items():
+        S = part.shape[1] - 1
+        for k, value in enumerate((part.approximate()[0, :, 0] / unit).tolist()):
+            p = p + value * s**k * (1 - s) ** (S - k) * z**q
+    k = int(chosen.interval[0])
+    T = float(chosen.T[0, 0, 0])
+    rho, P = design.funnel.rho[k : k + 2], design.funnel.P[k : k + 2, 0, 0] * T**2
+    boundary = (1 - s) * rho[0] + s * rho[1] - ((1 - s) * P[0] + s * P[1]) * z**2
+    (gamma,) = variables("gamma")
+    squares = SumOfSquares(p - gamma, (s * (1 - s),), (boundary,), degree=8)
+    best = solve(Program(("s", "z"), (squares,), maximise=gamma)).objective
+    h = float(design.funnel.t[k + 1] - design.funnel.t[k])
+    # The sweep leaves little: the literal optimum is above what is proved, and not by much.
+    assert design.proved.margins[piece] <= best / (h * float(np.min(rho))) <= 1e-2
+
+
+def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] * w[1] + u[0] + w[0]])
+
+    bounds = [[-0.02, 0.02], [0.15, 0.25]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds)
+    plain, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2))
+    calm = design_funnel(plain, nominal, goal=20 * np.eye(2))
+    assert design.funnel.volume_integral() < calm.funnel.volume_integral()
+    verdict = check(design.save(tmp_path)[-1], mode="rigorous")
+    assert any("w0 in [-0.02, 0.02]" in text for text in verdict.assumptions)
+    rng = np.random.default_rng(1)
+    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    assert run.violations == 0
+    worse = simulate_boundary(
+        replace(field, uncertain=20 * field.uncertain), design.policy, design.funnel,
+        starts=500, rng=rng,
+    )  # fmt: skip
+    assert worse.violations > 0
+
+
+def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
+    plain, _ = hanging()
+
+    def heavier(x: Any, u: Any) -> Any:
+        return np.array([x[1], -2 * x[0] + x[0] ** 3 / 3 - x[1] / 5 + u[0]])
+
+    second = VectorField.from_function(heavier, 2, 1)
+    field = VectorField(plain.pieces + second.pieces, 2, 1, np.array([1.0]))
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=np.linspace(0, 2, 21), start=[0, 0])
+    assert np.min(design_funnel(field, nominal, goal=20 * np.eye(2)).proved.margins) > 0
+
+
+def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_valid(
+    tmp_path: Path,
+) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
+
+    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
+    valid = [[0, -0.2, 0.2], [2, -9, 9]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
+    _, nominal = hanging()
+    design = design_funnel(field, nominal, goal=30 * np.eye(2))
+    assert design.proved.pieces.kappa is not None
+    assert not design.proved.pieces.vertex.any()
+    proof = design.save(tmp_path)[-1]
+    assert check(proof, mode="rigorous").margin > 0
+    verdict = check(proof)
+    assert verdict.margin > 0
+    assert "u0 within [-9, 9]" in verdict.statement
+    assert "saturation" not in " ".join(verdict.assumptions)
+    for t in design.funnel.t:
+        assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
+    rng = np.random.default_rng(4)
+    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    assert run.violations == 0
+    with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
+        refuse_invalid(
+            replace(field, valid=np.array([[0, -0.1, 0.1]])), design.policy, design.funnel
+        )
+    with pytest.raises(CertificateRejected, match="power of two"):
+        refuse_kappa(np.array([1.0, 3.0, 1.0]), field)
+
+
+def test_a_pendulum_with_its_true_sine_stays_within_its_torque_limits() -> None:
+    found = pendulum.design()
+    for t in found.funnel.t:
+        inputs = found.policy(float(t), found.funnel.outline(float(t), (0, 1)))
+        assert np.abs(inputs).max() <= pendulum.TORQUE
+    truth = TrueDynamics(pendulum.truth)
+    rng = np.random.default_rng(6)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=3000, rng=rng)
+    assert run.violations == 0
+
+
+# -- lemmas ----------------------------------------------------------------------------------
+
+
+def test_example_5_1_1_is_refused() -> None:
+    (x,) = variables("x")
+    with pytest.raises(Infeasible):
+        lemma_invariance(1 + (x**2 - 1) ** 3, [0 * x + 1], ["x"], degree=8)
+
+
+def test_example_5_1_2_by_lemma_5_3() -> None:
+    x, w = variables("x w")  # w = sin t, of which only |w| ≤ 1 is used
+    field = [x / 2 + w / 2 - x**3]
+    found = lemma_decay(x**2 / 4, field, ["x"], rate=3.0, sigma=0.36, domain=[1 - w**2], degree=6)
+    assert found.margin > 0
+    with pytest.raises(Infeasible):
+        lemma_decay(x**2 / 4, field, ["x"], rate=3.0, sigma=0.2, domain=[1 - w**2], degree=6)
+
+
+@pytest.mark.parametrize(("last", "proved"), [(1.1, True), (0.8, False)])
+def test_example_5_1_2_by_lemma_5_2(last: float, proved: bool) -> None:
+    field = VectorField.from_function(
+        lambda x, w: np.array([x[0] / 2 + w[0] / 2 - x[0] ** 3]), 1, 0, uncertain=[[-1, 1]]
+    )
+    t = np.linspace(0, 4 * np.pi, 9)
+    still = constant_on(t, np.zeros((8, 1)))
+    policy = Policy(
+        still, constant_on(t, np.zeros((8, 0))), constant_on(t, np.zeros((8, 0, 1))), ""
+    )
+    rho = 2.65 + (last - 2.65) * t / t[-1]
+    funnel = Funnel(still, np.ones((9, 1, 1)), rho, "", "")
+    assert (not prove_pieces(LSteps(field), policy, funnel).unproved) is proved
+
+
+# -- containment -----------------------------------------------------------------------------
+
+
+def test_containment_is_decided_at_the_touching_ellipsoid() -> None:
+    inner, outer = np.diag([4.0, 4.0]), np.eye(2)
+    assert decide_inside([0.5, 0.0], inner.tolist(), [0, 0], outer.tolist(), 0.5)
+    found = ellipsoid_inside([0.49, 0.0], inner, [0, 0], outer)
+    assert found is not None
+    assert decide_inside([0.49, 0.0], inner.tolist(), [0, 0], outer.tolist(), found)
+    assert ellipsoid_inside([0.51, 0.0], inner, [0, 0], outer) is None
+    for multiplier in np.linspace(0, 1, 101):
+        assert not decide_inside([0.51, 0.0], inner.tolist(), [0, 0], outer.tolist(), multiplier)
+
+
+def test_a_funnel_may_end_in_a_goal_around_another_point() -> None:
+    field, nominal = hanging(9)
+    goal = Goal(np.array([0.05, 0.0]), 20 * np.eye(2))
+    assert np.min(design_funnel(field, nominal, goal=goal).proved.margins) > 0
+    with pytest.raises(DataError, match="ends outside the goal"):
+        design_funnel(field, nominal, goal=Goal(np.array([0.5, 0.0]), 20 * np.eye(2)))
+
+
+# -- nouns -----------------------------------------------------------------------------------
+
+
+def test_piecewise_polynomials_meet_their_samples() -> None:
+    t = np.array([0.0, 0.5, 2.0])
+    curve = cubic_through(t, t[:, None] ** 3, 3 * t[:, None] ** 2)
+    times = np.linspace(0, 2, 11)
+    assert curve(times)[:, 0] == pytest.approx(times**3)
+    assert curve.derivative()(times)[:, 0] == pytest.approx(3 * times**2)
+    assert linear_through(t, t**2).ends() == pytest.approx(t**2)
+    with pytest.raises(DataError, match="does not increase after knot 1"):
+        PiecewisePolynomial(np.array([0.0, 1.0, 1.0]), np.zeros((2, 2, 1)))
+
+
+def test_value_gradient_volume_and_outline_agree() -> None:
+    x = constant_on([0.0, 1.0], [[1.0, 2.0]])
+    funnel = Funnel(x, np.array([np.diag([4.0, 1.0])] * 2), np.array([1.0, 4.0]), "", "")
+    assert funnel.volume(0.0) == pytest.approx(np.pi / 2)
+    assert funnel.volume(1.0) == pytest.approx(2 * np.pi)
+    points = funnel.outline(0.5, (0, 1))
+    assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
+    assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
+    step = 1e-6
+    moved = (funnel.value(0.5, points + np.array([step, 0])) - funnel.value(0.5, points)) / step
+    assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
+    assert funnel.contains_ellipsoid(1.0, [1, 2], np.eye(2))
+    assert not funnel.inside_ellipsoid(1.0, [1, 2], np.eye(2))
+
+
+# -- bad input -------------------------------------------------------------------------------
+
+
+def test_a_nominal_that_disobeys_the_dynamics_is_named() -> None:
+    field, nominal = hanging(9)
+    bent = nominal.x.control.copy()
+    bent[3, 1, 0] += 0.1
+    bad = Nominal(PiecewisePolynomial(nominal.t, bent), nominal.u)
+    with pytest.raises(DataError, match=r"dx0/dt is off by .* at t = "):
+        design_funnel(field, bad, goal=20 * np.eye(2))
+
+
+def test_dynamics_that_are_not_polynomial_name_the_operation() -> None:
+    with pytest.raises(NotPolynomial, match="sin"):
+        VectorField.from_function(lambda x: np.array([np.sin(x[0])]), 1, 0)
+
+
+@pytest.mark.parametrize(("Q", "R", "name"), [(-np.eye(2), None, "Q"), (None, -np.eye(1), "R")])
+def test_indefinite_weights_are_named(Q: Any, R: Any, name: str) -> None:
+    field, nominal = hanging(9)
+    with pytest.raises(DataError, match=f"{name} should be positive"):
+        design_funnel(field, nominal, goal=20 * np.eye(2), Q=Q, R=R)
+
+
+def test_an_uncontrollable_linearisation_is_named() -> None:
+    field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
+    t = np.linspace(0, 1, 5)
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=[0.0, 0.0])
+    with pytest.raises(Infeasible, match="uncontrollable"):
+        design_funnel(field, nominal)
+    assert tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).S.shape == (5, 2, 2)
+
+
+def test_no_feasible_start_says_what_to_try() -> None:
+    field = VectorField.from_function(
+        lambda x, w: np.array([x[0] + w[0]]), 1, 0, uncertain=[[-9, 9]]
+    )
+    t = np.linspace(0, 1, 5)
+    nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0])
+    with pytest.raises(Infeasible, match="Try"):
+        design_funnel(field, nominal, goal=np.eye(1), Q=np.zeros((1, 1)))
+
+
+# -- command line ----------------------------------------------------------------------------
+
+
+def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> None:
+    field, nominal = hanging(9)
+    goal = Goal(np.zeros(2), 20 * np.eye(2))
+    problem_file = tmp_path / "problem.json"
+    asked = FunnelProblem(field, nominal, np.eye(2), np.eye(1), goal)
+    _json.write_document(problem_file, asked.document())
+    runner = CliRunner()
+    made = runner.invoke(app, ["funnel", "--problem", str(problem_file), "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert "pieces proved" in made.output
+    assert Funnel.load(tmp_path / "funnel.json").tf == 2.0
+    checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
+    assert checked.exit_code == 0
+    assert "PROVED funnel" in checked.output
+    neither = runner.invoke(app, ["funnel", "--out", str(tmp_path)])
+    assert neither.exit_code != 0
