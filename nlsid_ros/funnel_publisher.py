@@ -10,7 +10,6 @@ from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.node import Node
 from std_msgs.msg import String
 
 from bags.documents import load_proved_funnel
@@ -18,20 +17,23 @@ from nlsid_core._types import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
-from nlsid_ros.running import declare, run
+from nlsid_ros.running import ManagedNode, declare_text, run
 
 NAME = "funnel_publisher"
 
 
-class FunnelPublisher(Node):
+class FunnelPublisher(ManagedNode):
     """Publishes one proved funnel for as long as it runs."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
+        self._path = Path(declare_text(self, "funnel", "", "funnel.json, with its proof beside it"))
+
+    def start(self) -> None:
+        """Check, publish latched, and say what was proved."""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        path = Path(str(declare(self, "funnel", "", "funnel.json, with its proof beside it")))
         try:
-            proved = load_proved_funnel(path)
+            proved = load_proved_funnel(self._path)
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")

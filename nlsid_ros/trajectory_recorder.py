@@ -14,7 +14,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
-from rclpy.node import Node
 
 from bags.message_types import definition, header_stamp_ns, is_stamped, standard_types
 from bags.writer import BagWriter
@@ -22,44 +21,52 @@ from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import declare, run
+from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 REPORT = 1.0  # s between diagnostics
 
 
-class TrajectoryRecorder(Node):
+class TrajectoryRecorder(ManagedNode):
     """Records topics from its start to its end into one new bag."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
         topics: Any = declare(self, "topics", [""], "/topic or /topic:=package/msg/Type, each")
-        bag = str(declare(self, "bag", "", "folder of the new bag; empty: trajectory_DATE_TIME"))
-        period: Any = declare(
+        self._name = declare_text(
+            self, "bag", "", "folder of the new bag; empty: trajectory_DATE_TIME"
+        )
+        self._period = declare_number(
             self, "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 1.0)
         )
-        self._waiting = dict(_topic_and_type(entry) for entry in topics if entry)
-        if not self._waiting:
+        self._topics = dict(_topic_and_type(entry) for entry in topics if entry)
+        if not self._topics:
             raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
-        for msgtype in filter(None, self._waiting.values()):
+
+    def prepare(self) -> None:
+        """Refuse types that are not known."""
+        for msgtype in filter(None, self._topics.values()):
             message_class(msgtype)
             definition(msgtype)
+
+    def start(self) -> None:
+        """Open a new bag and subscribe to what is there already."""
+        self._waiting = dict(self._topics)
         self._lost = dict.fromkeys(self._waiting, 0)
         self._refused: dict[str, str] = {}
-        path = Path(bag or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
-        self._bag = BagWriter(path, in_place=True, max_chunk_age=period)
+        path = Path(self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
+        self._bag = BagWriter(path, in_place=True, max_chunk_age=self._period)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._discovery = self.create_timer(DISCOVERY, self._connect)
-        self.create_timer(period, self._bag.close_chunk)
+        self.create_timer(self._period, self._bag.close_chunk)
         self.create_timer(REPORT, self._report)
         self.get_logger().info(f"recording {', '.join(self._waiting)} to {path}")
         self._connect()
 
-    def destroy_node(self) -> None:
-        """Close the bag, then the node."""
+    def stop(self) -> None:
+        """Close the bag."""
         self._bag.close()
-        super().destroy_node()
 
     def _connect(self) -> None:
         """Subscribe to topics that have publishers now."""
