@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -26,7 +27,6 @@ from bags.message_types import is_stamped, standard_types
 from bags.signals import SignalPath
 from bags.watch import Stamped, Watch
 from nlsid_core import _json
-from nlsid_core._types import Json
 from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError
 from nlsid_core.funnel import Funnel
@@ -35,7 +35,9 @@ from nlsid_core.monitor import Monitor, Nominal, Reading, Status
 from nlsid_core.policy import Policy
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
+from nlsid_ros.documents import FunnelSubscription
 from nlsid_ros.message_classes import message_class
+from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
@@ -93,7 +95,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._documents: dict[str, Json] = {}
+        self._signals: list[Subscription] = []
         self._waiting: dict[str, SignalPath] = {}
         self._watch: Watch | None = None
         self._run: Run | None = None
@@ -104,10 +106,7 @@ class FunnelMonitor(ManagedNode):
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        for role in ("model", "policy", "funnel"):
-            self.create_subscription(
-                String, f"{self._source}/{role}", partial(self._on_document, role), qos.DOCUMENT
-            )
+        self._funnel = FunnelSubscription(self, self._source, self._on_funnel, self._on_refusal)
         if self._controller:
             self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
         self.create_service(Trigger, "~/restart", self._on_restart)
@@ -125,33 +124,25 @@ class FunnelMonitor(ManagedNode):
         )
         self._release.cancel()
 
-    def _on_document(self, role: str, message: String) -> None:
-        """Take a latched document; start once all three are there and belong together."""
-        try:
-            self._documents[role] = _json.parse_document(message.data, source=role)
-            if len(self._documents) < 3:
-                return
-            model = DifferenceEquation.from_document(self._documents["model"])
-            policy = Policy.from_document(self._documents["policy"])
-            funnel = Funnel.from_document(self._documents["funnel"])
-            monitor = Monitor(model, policy, funnel, nominal=self._nominal)
-            paths = {"response": model.y.path, "excitation": model.u.path}
-            signals = {role: SignalPath.parse(path) for role, path in paths.items()}
-        except NlsidError as error:
-            self.get_logger().error(f"funnel not used: {error}")
-            self._watch = None
-            self._tell(f"funnel not used: {error}")
-            return
-        for subscription in list(self.subscriptions):
-            if subscription.topic_name in {path.topic for path in signals.values()}:
-                self.destroy_subscription(subscription)
-        self._digest = _json.digest(self._documents["funnel"])
+    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+        """A funnel came, or another one: watch its signals from scratch."""
+        monitor = Monitor(model, policy, funnel, nominal=self._nominal)
+        paths = {"response": model.y.path, "excitation": model.u.path}
+        signals = {role: SignalPath.parse(path) for role, path in paths.items()}
+        for subscription in self._signals:
+            self.destroy_subscription(subscription)
+        self._signals.clear()
         self._watch = Watch(monitor, options=self._options, announced=bool(self._controller))
         self._waiting = signals
         self._deadlines.clear()
         self._tell(f"no {model.y.name} yet")
         self.get_logger().info(f"watching {model.y.path} and {model.u.path}")
         self._begin()
+
+    def _on_refusal(self, reason: str) -> None:
+        self._watch = None
+        self.get_logger().error(reason)
+        self._tell(reason)
 
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0."""
@@ -166,7 +157,7 @@ class FunnelMonitor(ManagedNode):
         """Begin the announced run if it is of the funnel at hand."""
         if self._watch is None or self._run is None:
             return
-        if self._run.funnel != self._digest:
+        if self._run.funnel != self._funnel.digest:
             self._tell("the controller tracks another funnel than the one published")
             return
         self._publish(self._watch.begin(self._run.start_ns))
@@ -192,14 +183,16 @@ class FunnelMonitor(ManagedNode):
                 return
             callback = partial(self._on_signal, role, path)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self.create_subscription(message_class(kind), path.topic, callback, profile)
+            self._signals.append(
+                self.create_subscription(message_class(kind), path.topic, callback, profile)
+            )
 
     def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
             return
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        stamp_ns = stamp_ns_of(message)
         try:
             value = path.value(message)
         except BagError as error:
