@@ -1,5 +1,6 @@
 """Write a bag: a rosbag2 folder with one MCAP file, from messages that are already serialised."""
 
+import fcntl
 import os
 import shutil
 import tempfile
@@ -71,6 +72,7 @@ class BagWriter:
             )
             self._folder.chmod(0o755)
         self._stream: BinaryIO = (self._folder / self._file_name).open("xb")
+        fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
         # Any: half of mcap's writer is not annotated
         self._mcap: Any = Writer(
             self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD

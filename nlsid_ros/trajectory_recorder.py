@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 
 from bags.message_types import definition, header_stamp_ns, is_stamped, standard_types
+from bags.repair import repair, unfinished_bags
 from bags.writer import BagWriter
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
@@ -40,12 +41,19 @@ class TrajectoryRecorder(ManagedNode):
         self._period = declare_number(
             self, "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 1.0)
         )
+        self._repair = bool(
+            declare(self, "repair", True, "finish unfinished bags beside the new one first")
+        )
         self._topics = dict(_topic_and_type(entry) for entry in topics if entry)
         if not self._topics:
             raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
 
     def prepare(self) -> None:
-        """Refuse types that are not known."""
+        """Finish what a killed recorder left, and refuse types that are not known."""
+        path = Path(self._name)
+        for bag in unfinished_bags(path.parent) if self._repair else []:
+            count = repair(bag)
+            self.get_logger().warning(f"{bag} was not closed; repaired, {count} messages kept")
         for msgtype in filter(None, self._topics.values()):
             message_class(msgtype)
             definition(msgtype)
