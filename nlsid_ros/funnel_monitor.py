@@ -8,6 +8,7 @@ state is unknown (STALE), never inside. `~/restart` begins a new run.
 """
 
 import sys
+from array import array
 from collections import deque
 from collections.abc import Iterable
 from functools import partial
@@ -36,6 +37,7 @@ from nlsid_core.policy import Policy
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.documents import FunnelSubscription
+from nlsid_ros.draining import subscribe
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
@@ -50,6 +52,7 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
+NUMBERS = ["margin", "budget_spent", "nominal", "measured", "time_to_exit", "latency"]
 NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
@@ -184,10 +187,10 @@ class FunnelMonitor(ManagedNode):
             callback = partial(self._on_signal, role, path)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
             self._signals.append(
-                self.create_subscription(message_class(kind), path.topic, callback, profile)
+                subscribe(self, message_class(kind), path.topic, callback, profile)
             )
 
-    def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
+    def _on_signal(self, role: str, path: SignalPath, message: Any, _info: object) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
@@ -241,16 +244,18 @@ class FunnelMonitor(ManagedNode):
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        values = {
-            "margin": reading.margin,
-            "budget_spent": reading.budget_spent,
-            "nominal": reading.nominal,
-            "measured": reading.measured,
-            "time_to_exit": alert.time_to_exit,
-            "latency": latency_ns * 1e-9,
-        }
-        message.name = list(values)
-        message.position = list(values.values())
+        message.name = NUMBERS
+        message.position = array(
+            "d",
+            (
+                reading.margin,
+                reading.budget_spent,
+                reading.nominal,
+                reading.measured,
+                alert.time_to_exit,
+                latency_ns * 1e-9,
+            ),
+        )
         self._margin.publish(message)
 
     def _tell(self, reason: str) -> None:

@@ -21,11 +21,13 @@ from bags.writer import BagWriter
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
+from nlsid_ros.draining import Polled
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
+POLL = 0.005  # s between taking what has arrived; the middleware says when it did
 REPORT = 1.0  # s between diagnostics
 
 
@@ -66,6 +68,8 @@ class TrajectoryRecorder(ManagedNode):
         path = Path(self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
         self._bag = BagWriter(path, in_place=True, max_chunk_age=self._period)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._polled = Polled(self)
+        self.create_timer(POLL, self._polled.take)
         self._discovery = self.create_timer(DISCOVERY, self._connect)
         self.create_timer(self._period, self._bag.close_chunk)
         self.create_timer(REPORT, self._report)
@@ -73,7 +77,8 @@ class TrajectoryRecorder(ManagedNode):
         self._connect()
 
     def stop(self) -> None:
-        """Close the bag."""
+        """Take what has arrived, and close the bag."""
+        self._polled.take()
         self._bag.close()
 
     def _connect(self) -> None:
@@ -91,13 +96,12 @@ class TrajectoryRecorder(ManagedNode):
                 self._refused[topic] = str(error)
                 self.get_logger().error(f"{topic} is not recorded: {error}")
                 continue
-            self.create_subscription(
+            self._polled.subscribe(
                 kind,
                 topic,
                 partial(self._record, topic, msgtype, is_stamped(msgtype, standard_types())),
                 qos.recording_of([publisher.qos_profile for publisher in publishers]),
-                event_callbacks=SubscriptionEventCallbacks(message_lost=partial(self._lose, topic)),
-                raw=True,
+                events=SubscriptionEventCallbacks(message_lost=partial(self._lose, topic)),
             )
         if not self._waiting:
             self._discovery.cancel()
