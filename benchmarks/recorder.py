@@ -24,7 +24,7 @@ from bags.repair import repair
 from benchmarks.machine import describe
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_ros import qos
-from nlsid_ros.running import run
+from nlsid_ros.running import ManagedNode, run
 
 TOPICS = [f"/joints_{i}" for i in range(10)]
 TYPE = "sensor_msgs/msg/JointState"
@@ -32,7 +32,7 @@ RATE = 1000  # Hz
 ASKED = {"lost": 0.0, "cpu_percent_of_a_core": 60.0, "worst_loss_s": 1.1}
 
 
-class RosbagsRecorder(Node):
+class RosbagsRecorder(ManagedNode):
     """The least a recorder with rosbags' Writer can do."""
 
     def __init__(self, path: Path) -> None:
@@ -47,10 +47,9 @@ class RosbagsRecorder(Node):
 
             self.create_subscription(JointState, topic, record, qos.STREAM, raw=True)  # type: ignore[arg-type]
 
-    def destroy_node(self) -> None:
-        """Write what was buffered, then end."""
+    def stop(self) -> None:
+        """Write what was buffered."""
         self._writer.close()
-        super().destroy_node()
 
 
 def send(seconds: float, count: int) -> None:

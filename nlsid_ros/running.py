@@ -1,20 +1,24 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
+import signal
+import socket
+import threading
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
-AnyNode = TypeVar("AnyNode", bound=Node)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
 
@@ -109,30 +113,50 @@ class ManagedNode(LifecycleNode):
                     remove(entity)
 
 
-def run(
-    make: Callable[[], AnyNode],
-    args: list[str] | None,
-    *,
-    work: Callable[[AnyNode], None] = rclpy.spin,
-) -> None:
-    """Make the node and let it work until it is done, SIGINT, SIGTERM or shutdown; always destroy
-    it. Most nodes' work is to spin. Raises what made a managed node fail to start.
+def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
+    """Make the node, start it if it starts itself, and spin until SIGINT or SIGTERM.
+
+    The signals are waited for here and not left to rclpy, which would end all communication before
+    the node could send a last command. Raises what made the node fail to start.
     """
-    rclpy.init(args=args)
-    node: AnyNode | None = None
+    woken = _wake_on_signals()
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node: ManagedNode | None = None
     try:
         node = make()
-        if isinstance(node, ManagedNode) and node.autostart:
+        if node.autostart:
             for transition in (node.trigger_configure, node.trigger_activate):
                 if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
                     raise node.failure
-        work(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        _spin_until_signalled(node, woken)
     finally:
         if node is not None:
             node.destroy_node()
         try_shutdown()
+
+
+def _spin_until_signalled(node: ManagedNode, woken: socket.socket) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    asked = threading.Event()
+
+    def wait() -> None:
+        woken.recv(1)
+        executor.create_task(asked.set)
+
+    threading.Thread(target=wait, daemon=True).start()
+    while not asked.is_set():
+        executor.spin_once()
+
+
+def _wake_on_signals() -> socket.socket:
+    """A socket that gets a byte at once when a stop signal comes, whatever Python is waiting in."""
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.detach())
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda _number, _frame: None)
+    return receiver
 
 
 def declare(
