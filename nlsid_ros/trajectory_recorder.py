@@ -6,6 +6,7 @@ loses is what came after the last chunk, at most `chunk_period`. Counts of recei
 messages go to /diagnostics every second.
 """
 
+import shutil
 import sys
 from datetime import datetime
 from functools import partial
@@ -43,6 +44,13 @@ class TrajectoryRecorder(ManagedNode):
         self._period = declare_number(
             self, "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 1.0)
         )
+        self._least_free = declare_number(
+            self,
+            "least_free",
+            200.0,
+            "MB left on the disk at which recording stops",
+            between=(0.0, 1e12),
+        )
         self._repair = bool(
             declare(self, "repair", True, "finish unfinished bags beside the new one first")
         )
@@ -65,13 +73,14 @@ class TrajectoryRecorder(ManagedNode):
         self._waiting = dict(self._topics)
         self._lost = dict.fromkeys(self._waiting, 0)
         self._refused: dict[str, str] = {}
+        self._full = ""
         path = Path(self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
         self._bag = BagWriter(path, in_place=True, max_chunk_age=self._period)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._polled = Polled(self)
         self.create_timer(POLL, self._polled.take)
         self._discovery = self.create_timer(DISCOVERY, self._connect)
-        self.create_timer(self._period, self._bag.close_chunk)
+        self.create_timer(self._period, lambda: None if self._full else self._bag.close_chunk())
         self.create_timer(REPORT, self._report)
         self.get_logger().info(f"recording {', '.join(self._waiting)} to {path}")
         self._connect()
@@ -106,9 +115,20 @@ class TrajectoryRecorder(ManagedNode):
         if not self._waiting:
             self._discovery.cancel()
 
+    def _stop_if_the_disk_is_nearly_full(self) -> None:
+        free = shutil.disk_usage(self._bag.path).free / 1e6
+        if free >= self._least_free or self._full:
+            return
+        self._full = f"recording stopped: {free:.0f} MB left, {self._least_free:g} are to stay free"
+        self.get_logger().error(self._full)
+        self._polled.take()
+        self._bag.close()
+
     def _record(
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
     ) -> None:
+        if self._full:
+            return
         arrival_ns = info["received_timestamp"]
         stamp_ns = arrival_ns
         if stamped and len(data) >= 12:
@@ -127,6 +147,7 @@ class TrajectoryRecorder(ManagedNode):
 
     def _report(self) -> None:
         """Counts per topic; a warning while a topic is missing, silent or losing messages."""
+        self._stop_if_the_disk_is_nearly_full()
         values = {"bag": str(self._bag.path)}
         for topic, lost in self._lost.items():
             values[f"{topic} received"] = str(self._bag.counts.get(topic, 0))
@@ -143,6 +164,8 @@ class TrajectoryRecorder(ManagedNode):
         if self._refused:
             level = DiagnosticStatus.ERROR
             text = "; ".join(f"{topic}: {why}" for topic, why in self._refused.items())
+        if self._full:
+            level, text = DiagnosticStatus.ERROR, self._full
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, NAME, level, text, values))
 

@@ -17,6 +17,7 @@ NOT_SOURCE = shutil.ignore_patterns(
 EXECUTABLES = {
     "nlsid",
     "bag_player",
+    "excitation",
     "funnel_monitor",
     "funnel_publisher",
     "plant",
