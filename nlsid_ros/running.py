@@ -5,7 +5,7 @@ import socket
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -22,6 +22,15 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
 
+class Declared(NamedTuple):
+    """A parameter as a node declared it."""
+
+    name: str
+    default: Value
+    description: str
+    between: tuple[float, float] | None
+
+
 class ManagedNode(LifecycleNode):
     """A node with ROS 2's lifecycle: parameters when made, `start` on activation, `stop` after.
 
@@ -31,6 +40,7 @@ class ManagedNode(LifecycleNode):
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.declared: list[Declared] = []
         self.autostart = bool(
             declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
         )
@@ -53,7 +63,7 @@ class ManagedNode(LifecycleNode):
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: inactive to active."""
-        self._made_before = set(self._entities())
+        self._made_before = set(self.entities())
         result = self._attempt(self.start)
         self._running = result == TransitionCallbackReturn.SUCCESS
         if not self._running:
@@ -95,7 +105,8 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
-    def _entities(self) -> list[object]:
+    def entities(self) -> list[object]:
+        """Everything the node communicates with, and its timers."""
         kinds = (self.publishers, self.subscriptions, self.services, self.timers, self.clients)
         return [entity for kind in kinds for entity in kind]
 
@@ -172,6 +183,8 @@ def declare(
     The default's type is the parameter's: ROS keeps 2 and 2.0 apart. Raises DataError if the value
     given has another type or is out of range.
     """
+    if isinstance(node, ManagedNode):
+        node.declared.append(Declared(name, default, description, between))
     descriptor = ParameterDescriptor(name=name, description=description, read_only=True)
     if between is not None:
         lo, hi = between

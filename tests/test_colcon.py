@@ -15,6 +15,7 @@ NOT_SOURCE = shutil.ignore_patterns(
     ".*", "__pycache__", "*.egg-info", "build", "install", "log", "out", "dist", "nlsid-demo"
 )
 EXECUTABLES = {
+    "model_identifier",
     "nlsid",
     "bag_player",
     "excitation",
