@@ -130,6 +130,11 @@ class BagWriter:
             elif now - self._chunk_opened >= self._max_chunk_age:
                 self.close_chunk()
 
+    def annotate(self, custom: Mapping[str, str]) -> None:
+        """Add to the bag's own key-value pairs."""
+        self._custom.update(custom)
+        self._mcap.add_metadata(CUSTOM_DATA, dict(custom))
+
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
         self._mcap.flush()

@@ -76,12 +76,13 @@ def run_loop(funnel: Path, bag: Path, *, push: float) -> Loop:
         start = node.create_client(Trigger, "/tracking_controller/start")
         pushing = node.create_client(Trigger, "/plant/push")
         nodes: dict[str, dict[str, object]] = {
-            "trajectory_recorder": {"topics": TOPICS, "bag": bag},
+            "trajectory_recorder": {"topics": TOPICS, "bag": bag, "snapshot": 10.0},
             "funnel_publisher": {"funnel": funnel},
             "funnel_monitor": {
                 "nominal": "profile",
                 "controller": "tracking_controller",
                 "stop_service": "/tracking_controller/stop",
+                "snapshot_service": "/trajectory_recorder/snapshot",
                 "command_wait": 0.05,
             },
             "tracking_controller": {"highest": 0.4},
@@ -134,6 +135,7 @@ def test_a_gentle_push_is_tracked_through_and_the_run_ends_inside(
     assert len(live) == 117
     assert live == replayed, "bit for bit"
     assert min(margins[0] for margins in live) > 0.3
+    assert not (tmp_path / "gentle_snapshot_1").exists()
 
 
 def test_a_hard_push_is_called_out_and_the_robot_is_stopped(funnel: Path, tmp_path: Path) -> None:
@@ -147,3 +149,5 @@ def test_a_hard_push_is_called_out_and_the_robot_is_stopped(funnel: Path, tmp_pa
     with Bag(tmp_path / "hard") as bag:
         events = b"".join(m.data for m in bag.messages(["/funnel_monitor/events"]))
     assert b"above the budget" in events
+    with Bag(tmp_path / "hard_snapshot_1") as snapshot:
+        assert snapshot.count("/odom") > 40, "what led there was kept"
