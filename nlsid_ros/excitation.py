@@ -16,6 +16,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -33,6 +34,7 @@ from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text
 NAME = "excitation"
 KINDS = ("multisine", "chirp", "prbs", "steps", "replay")
 BIG = 1e9
+LAST_WORD = 1.0  # s for the last command to be received before the node goes
 
 
 class Excitation(ManagedNode):
@@ -124,6 +126,7 @@ class Excitation(ManagedNode):
             self._next = None
             self._to_rest()
             time.sleep(self._period)
+        self._publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def _on_tick(self) -> None:
         if self._next is None:

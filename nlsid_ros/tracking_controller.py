@@ -15,6 +15,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -37,6 +38,7 @@ from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
+LAST_WORD = 1.0  # s for the last command to be received before the node goes
 REPORT = 1.0  # s between diagnostics while nothing changes
 BIG = 1e9
 
@@ -110,6 +112,7 @@ class TrackingController(ManagedNode):
         while self._input != self._limits.stop_at:
             self._step_down()
             time.sleep(period)
+        self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
         """Take a funnel, but never in the middle of a run: stop that first."""

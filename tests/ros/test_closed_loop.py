@@ -1,16 +1,22 @@
 """Design, publish, track, monitor: the loop closed over DDS, pushed gently and too hard."""
 
 import math
+import signal
 import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags import documents
@@ -151,3 +157,61 @@ def test_a_hard_push_is_called_out_and_the_robot_is_stopped(funnel: Path, tmp_pa
     assert b"above the budget" in events
     with Bag(tmp_path / "hard_snapshot_1") as snapshot:
         assert snapshot.count("/odom") > 40, "what led there was kept"
+
+
+def test_an_interrupted_controller_ramps_down_before_it_goes(funnel: Path) -> None:
+    commands: list[float] = []
+
+    def hear(message: TwistStamped) -> None:
+        commands.append(message.twist.linear.x)
+
+    with ExitStack() as stack:
+        node, spin_until = stack.enter_context(node_here("test_operator"))
+        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+        start = node.create_client(Trigger, "/tracking_controller/start")
+        stack.enter_context(process("nlsid_ros.funnel_publisher", funnel=funnel))
+        stack.enter_context(process("nlsid_ros.plant", model=funnel.with_name(documents.MODEL)))
+        settings: dict[str, object] = {"highest": 0.4, "stop_rate": 2.0}
+        running = stack.enter_context(process("nlsid_ros.tracking_controller", **settings))
+        spin_until(start.service_is_ready)
+        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+        start.call_async(Trigger.Request())
+        spin_until(lambda: bool(commands) and commands[-1] > 0.2)
+        running.send_signal(signal.SIGTERM)
+        spin_until(lambda: commands[-1] == 0.0)
+        assert running.wait(timeout=10) == 0
+    falling = np.diff(commands[commands.index(max(commands)) :])
+    assert float(np.min(falling)) >= -2.0 * 0.025 * (1 + 1e-9)
+    assert len(falling) >= 4
+
+
+def test_a_lifecycle_manager_can_hold_a_node_stop_it_and_start_it_again(funnel: Path) -> None:
+    heard: list[str] = []
+
+    def hear(message: String) -> None:
+        heard.append(message.data)
+
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process("nlsid_ros.funnel_publisher", funnel=funnel, autostart=False) as publisher,
+    ):
+        node.create_subscription(String, "/funnel_publisher/funnel", hear, qos.DOCUMENT)
+        change = node.create_client(ChangeState, "/funnel_publisher/change_state")
+        spin_until(change.service_is_ready)
+
+        def to(transition: int) -> None:
+            request = ChangeState.Request()
+            request.transition.id = transition
+            answer = change.call_async(request)
+            spin_until(answer.done)
+            assert answer.result().success
+
+        to(Transition.TRANSITION_CONFIGURE)
+        assert node.count_publishers("/funnel_publisher/funnel") == 0
+        to(Transition.TRANSITION_ACTIVATE)
+        spin_until(lambda: len(heard) == 1)
+        to(Transition.TRANSITION_DEACTIVATE)
+        spin_until(lambda: node.count_publishers("/funnel_publisher/funnel") == 0)
+        to(Transition.TRANSITION_ACTIVATE)
+        spin_until(lambda: len(heard) == 2)
+        stop(publisher)

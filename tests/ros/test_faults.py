@@ -12,8 +12,11 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -261,3 +264,28 @@ def test_a_recording_stops_while_there_is_room_to_finish_it(robot: Robot, tmp_pa
         robot.spin_until(lambda: robot.has_said("are to stay free", "trajectory_recorder"))
         stop(recorder)
     assert (bag / "metadata.yaml").is_file(), "the bag was closed"
+
+
+def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robot: Robot) -> None:
+    with process(MONITOR, __node="picky_monitor") as monitor:
+        robot.ready(monitors=2)
+        offers_less = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        unreliable = robot.node.create_publisher(Odometry, "/odom", offers_less)
+        time.sleep(1.0)
+        output = stop(monitor)
+        robot.node.destroy_publisher(unreliable)
+    assert "'/odom', offering incompatible QoS" in output
+    assert "RELIABILITY" in output
+
+
+def test_a_parameter_cannot_be_changed_under_a_running_monitor(robot: Robot) -> None:
+    robot.ready()
+    client = robot.node.create_client(SetParameters, "/funnel_monitor/set_parameters")
+    robot.spin_until(client.service_is_ready)
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=-1.0)
+    request = SetParameters.Request(parameters=[Parameter(name="stale_after", value=value)])
+    answer = client.call_async(request)
+    robot.spin_until(answer.done)
+    [result] = answer.result().results
+    assert not result.successful
+    assert "stale_after" in result.reason
