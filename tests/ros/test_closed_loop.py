@@ -2,6 +2,8 @@
 
 import math
 import signal
+import subprocess
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -28,7 +30,7 @@ from bags.shipped import config_file
 from bags.steps import design_funnel_files, identify_bags
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
@@ -215,3 +217,23 @@ def test_a_lifecycle_manager_can_hold_a_node_stop_it_and_start_it_again(funnel: 
         to(Transition.TRANSITION_ACTIVATE)
         spin_until(lambda: len(heard) == 2)
         stop(publisher)
+
+
+def test_nlsid_live_starts_a_whole_loop_and_ends_it(funnel: Path) -> None:
+    options = ["--funnel", str(funnel), "--track", "--plant", "--highest", "0.4"]
+    loop = Loop()
+    running = subprocess.Popen([sys.executable, "-m", "bags.cli", "live", *options], cwd=ROOT)
+    try:
+        with node_here("test_operator") as (node, spin_until):
+            node.create_subscription(DiagnosticArray, "/diagnostics", loop.hear_status, qos.EVENTS)
+            start = node.create_client(Trigger, "/tracking_controller/start")
+            spin_until(start.service_is_ready)
+            spin_until(lambda: loop.has_said("funnel_monitor", "waiting for the controller"))
+            spin_until(lambda: loop.has_said("tracking_controller", "idle"))
+            start.call_async(Trigger.Request())
+            spin_until(lambda: loop.has_said("tracking_controller", "tracking"))
+            running.send_signal(signal.SIGINT)
+            assert running.wait(timeout=30) == 0
+    finally:
+        running.kill()
+        running.wait()
