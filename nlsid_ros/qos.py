@@ -26,7 +26,7 @@ STREAM = QoSProfile(
 )
 SENSOR = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
-    depth=10,
+    depth=200,
     reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )
