@@ -1,5 +1,6 @@
-"""The command line `nlsid`: identify, funnel, check, monitor, demo; `bag` for recordings."""
+"""The command line `nlsid`: identify, funnel, check, monitor, live, demo; `bag` for recordings."""
 
+import importlib.util
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from bags import documents, show
+from bags import documents, show, stack
 from bags.bag_cli import bag_app
 from bags.config import load_config
 from bags.demo import run_demo
@@ -182,6 +183,27 @@ def monitor(
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.verdict != Status.INSIDE.value for entry in replays):
         raise typer.Exit(1)
+
+
+@app.command()
+def live(
+    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
+    track: Annotated[
+        bool, typer.Option("--track", help="Run the policy too; give --highest. Default: watch.")
+    ] = False,
+    plant: Annotated[
+        bool, typer.Option("--plant", help="With --track: simulate the robot by the model.")
+    ] = False,
+    lowest: Annotated[float, typer.Option(help="Least input the robot may get.")] = 0.0,
+    highest: Annotated[float, typer.Option(help="Greatest input the robot may get.")] = 0.0,
+) -> None:
+    """Start the live nodes on a funnel and end them together: no ROS launch needed, rclpy is."""
+    if importlib.util.find_spec("rclpy") is None:
+        raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    nodes = stack.monitoring(funnel)
+    if track:
+        nodes = stack.tracking(funnel, lowest=lowest, highest=highest, plant=plant)
+    raise typer.Exit(stack.run_stack(nodes))
 
 
 @app.command()

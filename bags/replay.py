@@ -4,15 +4,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from bags.announcement import Run
 from bags.bag import Bag
 from bags.documents import ProvedFunnel
 from bags.message_types import decode, header_stamp_ns, is_stamped
 from bags.signals import SignalPath
 from bags.watch import Stamped, Watch
+from nlsid_core import _json
 from nlsid_core.errors import BagError
 from nlsid_core.monitor import Nominal, Reading, Status
 
 RESPONSE, EXCITATION = "response", "excitation"
+STRING = "std_msgs/msg/String"
+RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,22 +74,37 @@ def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Re
     unknown, as it does live.
     """
     bag, model = Path(bag), proved.model
-    watch = Watch(proved.monitor(nominal))
-    stamped: list[Stamped] = []
+    run = announced_run(proved, bag) if nominal is Nominal.PROFILE else None
+    watch = Watch(proved.monitor(nominal), announced=run is not None)
+    stamped: list[Stamped] = [] if run is None else watch.begin(run.start_ns)
     for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
         feed = watch.response if role == RESPONSE else watch.excitation
         stamped += feed(stamp_ns, value)
     stamped += watch.flush()
-    if watch.origin_ns is None:
+    if not stamped:
         raise BagError(f"{bag}: no message on {model.y.path}")
     return Replay(
         name=bag.name,
-        readings=tuple(reading for _, reading in stamped),
-        stamps_ns=tuple(stamp_ns for stamp_ns, _ in stamped),
+        readings=tuple(entry.reading for entry in stamped),
+        stamps_ns=tuple(entry.stamp_ns for entry in stamped),
         axis=model.y.name,
         unit=model.y.unit,
         half_width=proved.funnel.half_width,
     )
+
+
+def announced_run(proved: ProvedFunnel, bag: Path | str) -> Run | None:
+    """The last run of this funnel that a controller announced in `bag`, None if there is none."""
+    digest = _json.digest(proved.funnel.document())
+    found = None
+    with Bag(bag) as source:
+        topics = [t for t, kind in source.topics.items() if t.endswith(RUN_TOPIC)]
+        topics = [topic for topic in topics if source.types_on(topic)[0] == STRING]
+        for message in source.messages(topics):
+            text = decode(message.data, *source.types_on(message.topic))
+            run = Run.from_document(_json.parse_document(text.data, source=message.topic))  # type: ignore[attr-defined]
+            found = run if run.funnel == digest else found
+    return found
 
 
 def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, int, float]]:

@@ -1,5 +1,6 @@
 """Write a bag: a rosbag2 folder with one MCAP file, from messages that are already serialised."""
 
+import fcntl
 import os
 import shutil
 import tempfile
@@ -75,6 +76,7 @@ class BagWriter:
             )
             self._folder.chmod(0o755)
         self._stream: BinaryIO = (self._folder / self._file_name).open("xb")
+        fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
         # Any: half of mcap's writer is not annotated
         self._mcap: Any = Writer(
             self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
@@ -176,6 +178,11 @@ class BagWriter:
                 self._chunk_opened = now
             elif now - self._chunk_opened >= self._max_chunk_age:
                 self.close_chunk()
+
+    def annotate(self, custom: Mapping[str, str]) -> None:
+        """Add to the bag's own key-value pairs."""
+        self._custom.update(custom)
+        self._mcap.add_metadata(CUSTOM_DATA, dict(custom))
 
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""

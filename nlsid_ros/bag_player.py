@@ -9,17 +9,19 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+import rclpy
 from rclpy.duration import Duration
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.utilities import ok
+from rclpy.utilities import ok, try_shutdown
 
 from bags.bag import Bag
 from bags.grid import seconds
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import declare, run
+from nlsid_ros.running import declare
 
 NAME = "bag_player"
 SLICE = 0.05  # s: longest sleep, so that an interrupt is noticed
@@ -93,9 +95,16 @@ class BagPlayer(Node):
 def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid bag_player`."""
     try:
-        run(BagPlayer, args, work=BagPlayer.play)
+        rclpy.init(args=args)
+        player = BagPlayer()
+        player.play()
+        player.destroy_node()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     except (NlsidError, OSError) as error:
         sys.exit(f"{NAME}: {error}")
+    finally:
+        try_shutdown()
 
 
 if __name__ == "__main__":

@@ -2,27 +2,33 @@
 
 Subscribes to the funnel, its model and its policy, and to the two signals by the model's own field
 paths, on message stamps. Publishes ~/margin (sensor_msgs/JointState: stamped, named numbers) for
-every sample, and /diagnostics at once when the status changes, otherwise once a second.
-Missing, stale or NaN state is unknown (STALE), never inside. `~/restart` begins a new run.
+every sample, ~/events when the state changes, and /diagnostics at once when it does, otherwise
+once a second. Leaving the funnel calls `stop_service` and `snapshot_service`. Missing, stale or NaN
+state is unknown (STALE), never inside. `~/restart` begins a new run.
 """
 
 import sys
-import time
+from array import array
+from collections import deque
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.node import Node
+from rclpy.client import Client
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.announcement import Run
 from bags.message_types import is_stamped, standard_types
 from bags.signals import SignalPath
 from bags.watch import Stamped, Watch
 from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError
 from nlsid_core.funnel import Funnel
 from nlsid_core.models import DifferenceEquation
@@ -30,159 +36,279 @@ from nlsid_core.monitor import Monitor, Nominal, Reading, Status
 from nlsid_core.policy import Policy
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
+from nlsid_ros.documents import FunnelSubscription
+from nlsid_ros.draining import subscribe
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import declare, run
+from nlsid_ros.messages import stamp_ns_of
+from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
-TICK = 0.005  # s: how often waiting samples and staleness are looked at
 DISCOVERY = 0.1  # s: how often the graph is asked for the signals' types
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
 LEVELS = {
-    Status.INSIDE: DiagnosticStatus.OK,
-    Status.ASSUMPTION_VIOLATED: DiagnosticStatus.ERROR,
-    Status.OUTSIDE: DiagnosticStatus.ERROR,
-    Status.UNKNOWN: DiagnosticStatus.STALE,
+    State.INSIDE: DiagnosticStatus.OK,
+    State.WARNING: DiagnosticStatus.WARN,
+    State.ASSUMPTION_VIOLATED: DiagnosticStatus.ERROR,
+    State.OUTSIDE: DiagnosticStatus.ERROR,
+    State.UNKNOWN: DiagnosticStatus.STALE,
 }
+NUMBERS = ["margin", "budget_spent", "nominal", "measured", "time_to_exit", "latency"]
+NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
-class FunnelMonitor(Node):
+class FunnelMonitor(ManagedNode):
     """Reads stamped signals, asks the core's Monitor, publishes what it says."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        source = declare(self, "source", "/funnel_publisher", "node that publishes the funnel")
+        self._source = declare_text(
+            self, "source", "funnel_publisher", "node that publishes the funnel"
+        )
+        self._controller = declare_text(
+            self, "controller", "", "node that announces when a run starts; empty: first sample"
+        )
         self._nominal = Nominal(
-            str(declare(self, "nominal", "command", "what the tube is around: command or profile"))
+            declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
-        self._stale_after = float(
-            declare(self, "stale_after", 0.1, "s without a response: unknown", between=(0.001, 60))  # type: ignore[arg-type]
+        number = partial(declare_number, self)
+        self._stale_after = number(
+            "stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0)
         )
-        self._command_wait = float(
-            declare(
-                self, "command_wait", 0.02, "s a response waits for its command", between=(0, 1)
-            )  # type: ignore[arg-type]
+        self._command_wait = number(
+            "command_wait", 0.02, "s a response waits for its command", between=(0.0, 1.0)
         )
-        self._documents: dict[str, Json] = {}
-        self._watch: Watch | None = None
-        self._last_arrival = 0.0
-        self._reading = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel")
-        self._said_at = -HEARTBEAT
-        self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        for role in ("model", "policy", "funnel"):
-            self.create_subscription(
-                String, f"{source}/{role}", partial(self._on_document, role), qos.DOCUMENT
-            )
-        self.create_service(Trigger, "~/restart", self._on_restart)
-        self._discovery = self.create_timer(DISCOVERY, self._connect)
-        self.create_timer(TICK, self._on_tick)
-        self._waiting: dict[str, SignalPath] = {}
+        self._options = AlarmOptions(
+            warning_margin=number("warning_margin", 0.2, "warn below", between=(0.0, 1.0)),
+            warning_time=number(
+                "warning_time", 0.0, "s: warn if the exit is predicted sooner", between=(0.0, 60.0)
+            ),
+            hysteresis=number(
+                "hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0)
+            ),
+            clear_after=number(
+                "clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0)
+            ),
+        )
+        self._stop_service = declare_text(
+            self, "stop_service", "", "std_srvs/Trigger called on leaving the funnel; empty: none"
+        )
+        self._snapshot_service = declare_text(
+            self, "snapshot_service", "", "std_srvs/Trigger called on leaving; empty: none"
+        )
 
-    def _on_document(self, role: str, message: String) -> None:
-        """Take a latched document; start once all three are there and belong together."""
-        try:
-            self._documents[role] = _json.parse_document(message.data, source=role)
-            if len(self._documents) < 3:
-                return
-            model = DifferenceEquation.from_document(self._documents["model"])
-            policy = Policy.from_document(self._documents["policy"])
-            funnel = Funnel.from_document(self._documents["funnel"])
-            self._watch = Watch(Monitor(model, policy, funnel, nominal=self._nominal))
-        except NlsidError as error:
-            self.get_logger().error(f"funnel not used: {error}")
-            self._reading = Reading(0.0, Status.UNKNOWN, reason=f"funnel not used: {error}")
-            return
-        self._waiting = {
-            "response": SignalPath.parse(model.y.path),
-            "excitation": SignalPath.parse(model.u.path),
-        }
-        self._reading = Reading(0.0, Status.UNKNOWN, reason=f"no {model.y.name} yet")
+    def start(self) -> None:
+        """Listen for the funnel; its signals are subscribed to once it is there."""
+        self._signals: list[Subscription] = []
+        self._waiting: dict[str, SignalPath] = {}
+        self._watch: Watch | None = None
+        self._run: Run | None = None
+        self._said = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel"), NOTHING
+        self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
+        self._slowest_ns = 0
+        self._judged = 0
+        self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
+        self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._funnel = FunnelSubscription(self, self._source, self._on_funnel, self._on_refusal)
+        if self._controller:
+            self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
+        self.create_service(Trigger, "~/restart", self._on_restart)
+        names = (self._stop_service, self._snapshot_service)
+        self._on_exit = [self.create_client(Trigger, name) for name in names if name]
+        simulated = self.get_parameter("use_sim_time").value
+        self._patience = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(DISCOVERY, self._connect, clock=wall)
+        self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
+        self._stale = self.create_timer(self._stale_after, self._on_stale, clock=self._patience)
+        self._stale.cancel()
+        self._release = self.create_timer(
+            max(self._command_wait, 1e-4), self._on_release, clock=self._patience
+        )
+        self._release.cancel()
+
+    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+        """A funnel came, or another one: watch its signals from scratch."""
+        monitor = Monitor(model, policy, funnel, nominal=self._nominal)
+        paths = {"response": model.y.path, "excitation": model.u.path}
+        signals = {role: SignalPath.parse(path) for role, path in paths.items()}
+        for subscription in self._signals:
+            self.destroy_subscription(subscription)
+        self._signals.clear()
+        self._watch = Watch(monitor, options=self._options, announced=bool(self._controller))
+        self._waiting = signals
+        self._deadlines.clear()
+        self._tell(f"no {model.y.name} yet")
         self.get_logger().info(f"watching {model.y.path} and {model.u.path}")
+        self._begin()
+
+    def _on_refusal(self, reason: str) -> None:
+        self._watch = None
+        self.get_logger().error(reason)
+        self._tell(reason)
+
+    def _on_run(self, message: String) -> None:
+        """A controller announced the stamp of its sample 0."""
+        try:
+            self._run = Run.from_document(_json.parse_document(message.data, source="run"))
+        except NlsidError as error:
+            self.get_logger().error(f"announcement not used: {error}")
+            return
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin the announced run if it is of the funnel at hand."""
+        if self._watch is None or self._run is None:
+            return
+        if self._run.funnel != self._funnel.digest:
+            self._tell("the controller tracks another funnel than the one published")
+            return
+        self._publish(self._watch.begin(self._run.start_ns))
 
     def _connect(self) -> None:
         """Subscribe to signals whose topic has appeared, once its type is known to carry them."""
+        if not self._waiting:
+            return
         types = dict(self.get_topic_names_and_types())
         for role, path in list(self._waiting.items()):
-            found = types.get(path.topic)
-            if not found:
+            publishers = self.get_publishers_info_by_topic(path.topic)
+            if path.topic not in types or not publishers:
                 continue
             del self._waiting[role]
+            kind = types[path.topic][0]
             try:
-                path.check(found[0], standard_types())
-                if not is_stamped(found[0], standard_types()):
-                    raise BagError(f"{path.topic}: {found[0]} has no header stamp")
+                path.check(kind, standard_types())
+                if not is_stamped(kind, standard_types()):
+                    raise BagError(f"{path.topic}: {kind} has no header stamp")
             except BagError as error:
-                self._reading = Reading(0.0, Status.UNKNOWN, reason=str(error))
                 self.get_logger().error(str(error))
+                self._tell(str(error))
                 return
             callback = partial(self._on_signal, role, path)
-            publishers = self.get_publishers_info_by_topic(path.topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self.create_subscription(message_class(found[0]), path.topic, callback, profile)
+            self._signals.append(
+                subscribe(self, message_class(kind), path.topic, callback, profile)
+            )
 
-    def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
+    def _on_signal(self, role: str, path: SignalPath, message: Any, _info: object) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
-        if self._watch is None:
-            return
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        value = path.value(message)
-        if role == "excitation":
-            self._publish(self._watch.excitation(stamp_ns, value))
-        else:
-            self._last_arrival = time.monotonic()
-            self._publish(self._watch.response(stamp_ns, value))
-
-    def _on_tick(self) -> None:
-        """Let go of samples whose command does not come, notice stale state, keep a heartbeat."""
-        silent = time.monotonic() - self._last_arrival
         watch = self._watch
-        if watch is not None and watch.origin_ns is not None:
-            if silent > self._command_wait:
-                self._publish(watch.flush())
-            if silent > self._stale_after:
-                name = watch.monitor.model.y.name
-                for _, reading in watch.missing(f"no {name} for {self._stale_after:g} s"):
-                    self._say(reading)
-        if time.monotonic() - self._said_at >= HEARTBEAT:
-            self._say(self._reading)
+        if watch is None:
+            return
+        stamp_ns = stamp_ns_of(message)
+        try:
+            value = path.value(message)
+        except BagError as error:
+            self._publish(watch.missing(str(error)))
+            return
+        if role == "excitation":
+            self._publish(watch.excitation(stamp_ns, value))
+            return
+        self._stale.reset()
+        judged = watch.response(stamp_ns, value)
+        self._publish(judged)
+        if not judged:
+            due = self._patience.now().nanoseconds + round(self._command_wait * 1e9)
+            self._deadlines.append((due, stamp_ns))
+            if self._release.is_canceled():
+                self._release.reset()
 
-    def _publish(self, stamped: Iterable[Stamped]) -> None:
+    def _on_release(self) -> None:
+        """Let go of samples whose command did not come in time."""
+        now, until = self._patience.now().nanoseconds, None
+        while self._deadlines and self._deadlines[0][0] <= now:
+            until = self._deadlines.popleft()[1]
+        if until is not None and self._watch is not None:
+            self._publish(self._watch.flush(until))
+        if not self._deadlines:
+            self._release.cancel()
+
+    def _on_stale(self) -> None:
+        """The response stopped coming."""
+        self._stale.cancel()
+        if self._watch is not None:
+            name = self._watch.monitor.model.y.name
+            self._publish(self._watch.flush())
+            for entry in self._watch.missing(f"no {name} for {self._stale_after:g} s"):
+                self._say(entry.reading, entry.alert)
+
+    def _publish(self, judged: Iterable[Stamped]) -> None:
         """Diagnostics first: an alarm should not wait behind a number."""
-        for stamp_ns, reading in stamped:
-            self._say(reading)
-            self._publish_margin(stamp_ns, reading)
+        for stamp_ns, reading, alert in judged:
+            self._say(reading, alert)
+            self._publish_margin(stamp_ns, reading, alert)
 
-    def _publish_margin(self, stamp_ns: int, reading: Reading) -> None:
+    def _publish_margin(self, stamp_ns: int, reading: Reading, alert: Alert) -> None:
+        latency_ns = self.get_clock().now().nanoseconds - stamp_ns
+        self._slowest_ns = max(self._slowest_ns, latency_ns)
+        self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        values = {
-            "margin": reading.margin,
-            "budget_spent": reading.budget_spent,
-            "nominal": reading.nominal,
-            "measured": reading.measured,
-        }
-        message.name = list(values)
-        message.position = list(values.values())
+        message.name = NUMBERS
+        message.position = array(
+            "d",
+            (
+                reading.margin,
+                reading.budget_spent,
+                reading.nominal,
+                reading.measured,
+                alert.time_to_exit,
+                latency_ns * 1e-9,
+            ),
+        )
         self._margin.publish(message)
 
-    def _say(self, reading: Reading, *, at_once: bool = False) -> None:
-        """Publish diagnostics if the status changed or the heartbeat is due."""
-        now = time.monotonic()
-        changed = reading.status is not self._reading.status
-        self._reading = reading
-        if not (changed or at_once) and now - self._said_at < HEARTBEAT:
+    def _tell(self, reason: str) -> None:
+        """Unknown, and why, at once."""
+        self._say(Reading(0.0, Status.UNKNOWN, reason=reason), NOTHING, at_once=True)
+
+    def _say(self, reading: Reading, alert: Alert, *, at_once: bool = False) -> None:
+        """Publish diagnostics, and an event, if the state changed; remember what to repeat."""
+        before = self._said[1].state
+        self._said = reading, alert
+        if alert.state is before and not at_once:
             return
-        self._said_at = now
+        message = self._status_message()
+        self._diagnostics.publish(message)
+        self._events.publish(message)
+        worse = SEVERITY.get(alert.state, 0) >= SEVERITY[State.ASSUMPTION_VIOLATED]
+        if worse and SEVERITY.get(before, 0) < SEVERITY[State.ASSUMPTION_VIOLATED]:
+            self._call_for_help()
+
+    def _call_for_help(self) -> None:
+        """Ask the configured services to stop the robot and to keep what led here."""
+        for client in self._on_exit:
+            if not client.service_is_ready():
+                self.get_logger().error(f"{client.srv_name} is not there to be called")
+                continue
+            client.call_async(Trigger.Request()).add_done_callback(partial(self._on_answer, client))
+
+    def _on_answer(self, client: Client, future: Any) -> None:
+        answer = future.result()
+        log = self.get_logger().info if answer.success else self.get_logger().error
+        log(f"{client.srv_name}: {answer.message}")
+
+    def _on_heartbeat(self) -> None:
+        self._diagnostics.publish(self._status_message())
+        self._slowest_ns = 0
+
+    def _status_message(self) -> DiagnosticArray:
+        reading, alert = self._said
+        watch = self._watch
         values = {
             "margin": f"{reading.margin:.6g}",
             "worst axis": reading.worst_axis,
             "budget spent": f"{reading.budget_spent:.6g}",
+            "time to exit [s]": f"{alert.time_to_exit:.4g}",
             "time in run [s]": f"{reading.t:.9g}",
-            "late commands": str(self._watch.pairing.late if self._watch else 0),
+            "judged": str(self._judged),
+            "late commands": str(watch.pairing.late if watch else 0),
+            "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
+            "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
-        text = reading.status.value + (f": {reading.reason}" if reading.reason else "")
+        text = alert.state.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(stamp, NAME, LEVELS[reading.status], text, values))
+        return status(stamp, self.get_name(), LEVELS[alert.state], text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""
@@ -190,7 +316,9 @@ class FunnelMonitor(Node):
         answer.message = "new run" if answer.success else "there is no funnel yet"
         if self._watch is not None:
             self._watch.restart()
-            self._say(Reading(0.0, Status.UNKNOWN, reason="restarted"), at_once=True)
+            self._run = None
+            self._deadlines.clear()
+            self._tell("restarted")
         return answer
 
 
@@ -198,7 +326,7 @@ def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid funnel_monitor`."""
     try:
         run(FunnelMonitor, args)
-    except NlsidError as error:
+    except (NlsidError, ValueError) as error:
         sys.exit(f"{NAME}: {error}")
 
 

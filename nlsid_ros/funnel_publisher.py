@@ -1,56 +1,95 @@
 """Node `funnel_publisher`: checks a funnel's proof, then publishes the funnel, latched.
 
 Publishes ~/funnel, ~/model and ~/policy (std_msgs/String, transient local): the JSON documents as
-they were proved. Refuses what is not proved: one error on /diagnostics, and exit status 1.
+they were proved; ~/tube (visualization_msgs/MarkerArray) and ~/nominal
+(trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses what is
+not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.node import Node
 from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
-from bags.documents import load_proved_funnel
+from bags import documents
+from bags.documents import ProvedFunnel, load_proved_funnel
 from nlsid_core._types import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
-from nlsid_ros.running import declare, run
+from nlsid_ros.pictures import nominal_trajectory, tube_markers
+from nlsid_ros.running import ManagedNode, declare, declare_text, run
 
 NAME = "funnel_publisher"
+LOOK = 0.5  # s between looks at the files
 
 
-class FunnelPublisher(Node):
+class FunnelPublisher(ManagedNode):
     """Publishes one proved funnel for as long as it runs."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
+        self._path = Path(declare_text(self, "funnel", "", "funnel.json, with its proof beside it"))
+        self._frame = declare_text(self, "frame", "map", "frame the tube is drawn in")
+        self._watch = bool(declare(self, "watch", True, "publish again when the files change"))
+
+    def start(self) -> None:
+        """Check, publish latched, and say what was proved."""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        path = Path(str(declare(self, "funnel", "", "funnel.json, with its proof beside it")))
+        self._latched = {
+            name: self.create_publisher(kind, f"~/{name}", qos.DOCUMENT)
+            for name, kind in (
+                ("model", String),
+                ("policy", String),
+                ("funnel", String),
+                ("tube", MarkerArray),
+                ("nominal", JointTrajectory),
+            )
+        }
+        self._seen = self._files()
+        self._publish(self._load())
+        if self._watch:
+            self.create_timer(LOOK, self._look)
+
+    def _files(self) -> list[tuple[int, int]]:
+        """When each file last changed, and its size."""
+        names = (documents.MODEL, documents.POLICY, documents.FUNNEL_PROOF, self._path.name)
+        found = (self._path.with_name(name) for name in names)
+        states = (path.stat() for path in found if path.exists())
+        return [(state.st_mtime_ns, state.st_size) for state in states]
+
+    def _look(self) -> None:
+        """Publish again if the files changed and are proved; else keep what was, and say so."""
+        files = self._files()
+        if files == self._seen:
+            return
+        self._seen = files
+        with suppress(NlsidError, OSError):  # said by _load
+            self._publish(self._load())
+
+    def _load(self) -> ProvedFunnel:
         try:
-            proved = load_proved_funnel(path)
+            return load_proved_funnel(self._path)
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
-        documents: dict[str, Json] = {
-            "model": proved.model.document(),
-            "policy": proved.policy.document(),
-            "funnel": proved.funnel.document(),
-        }
-        self._latched = [self._latch(name, document) for name, document in documents.items()]
+
+    def _publish(self, proved: ProvedFunnel) -> None:
+        for name in ("model", "policy", "funnel"):
+            document: Json = getattr(proved, name).document()
+            self._latched[name].publish(String(data=json.dumps(document)))
+        self._latched["tube"].publish(tube_markers(proved, self._frame))
+        self._latched["nominal"].publish(nominal_trajectory(proved))
         self._say(DiagnosticStatus.OK, str(proved.verdict))
         self.get_logger().info(str(proved.verdict))
         for assumption in proved.verdict.assumptions:
             self.get_logger().info(f"assuming {assumption}")
-
-    def _latch(self, name: str, document: Json) -> rclpy.publisher.Publisher:
-        publisher = self.create_publisher(String, f"~/{name}", qos.DOCUMENT)
-        publisher.publish(String(data=json.dumps(document)))
-        return publisher
 
     def _say(self, level: bytes, message: str) -> None:
         now = self.get_clock().now().to_msg()

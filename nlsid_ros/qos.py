@@ -3,8 +3,10 @@
 DOCUMENT: a funnel, model or policy. Latched (transient local), so that a monitor that starts later
 still gets it; one is enough, the newest counts.
 STREAM: signals and margins. Reliable, because a lost sample ends a monitor's run, and deep enough
-for a second at 1 kHz, so that a busy subscriber catches up. A reliable subscription does not match
-a best-effort publisher: `subscription_to` matches what the publisher offers.
+for five seconds at 1 kHz, so that a busy subscriber catches up. A reliable subscription does not
+match a best-effort publisher: `subscription_to` matches what the publisher offers.
+SENSOR: the response a controller acts on. Best effort matches every publisher, and an old sample
+sent again would be too late to act on.
 EVENTS: diagnostics. Reliable; a few pending are enough.
 """
 
@@ -18,8 +20,14 @@ DOCUMENT = QoSProfile(
 )
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
+    depth=5000,
     reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+SENSOR = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=200,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
     durability=DurabilityPolicy.VOLATILE,
 )
 EVENTS = QoSProfile(

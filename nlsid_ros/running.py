@@ -1,41 +1,173 @@
-"""What every node's `main` and constructor share: start, spin, stop cleanly; declare parameters."""
+"""What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
-from collections.abc import Callable
-from typing import TypeVar
+import signal
+import socket
+import threading
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, NlsidError
 
-AnyNode = TypeVar("AnyNode", bound=Node)
-Value = str | float | bool | list[str]
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+Value = str | float | bool | Sequence[str] | Sequence[float]
 
 
-def run(
-    make: Callable[[], AnyNode],
-    args: list[str] | None,
-    *,
-    work: Callable[[AnyNode], None] = rclpy.spin,
-) -> None:
-    """Make the node and let it work until it is done, SIGINT, SIGTERM or shutdown; always destroy
-    it. Most nodes' work is to spin.
+class Declared(NamedTuple):
+    """A parameter as a node declared it."""
+
+    name: str
+    default: Value
+    description: str
+    between: tuple[float, float] | None
+
+
+class ManagedNode(LifecycleNode):
+    """A node with ROS 2's lifecycle: parameters when made, `start` on activation, `stop` after.
+
+    Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
+    deactivation. With `autostart` it is configured and activated at once.
     """
-    rclpy.init(args=args)
-    node: AnyNode | None = None
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.declared: list[Declared] = []
+        self.autostart = bool(
+            declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
+        )
+        self.failure: Exception | None = None
+        self._running = False
+        self._made_before: set[object] = set()
+
+    def prepare(self) -> None:
+        """Check whatever can be checked before starting: files, names."""
+
+    def start(self) -> None:
+        """Make publishers and subscriptions, and work."""
+
+    def stop(self) -> None:
+        """Finish: send the last command, close files."""
+
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition: unconfigured to inactive."""
+        return self._attempt(self.prepare)
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition: inactive to active."""
+        self._made_before = set(self.entities())
+        result = self._attempt(self.start)
+        self._running = result == TransitionCallbackReturn.SUCCESS
+        if not self._running:
+            self._destroy_made()
+        return result
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition: active to inactive."""
+        self._running = False
+        result = self._attempt(self.stop)
+        self._destroy_made()
+        return result
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition: inactive to unconfigured."""
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Transition: to finalized."""
+        return self.on_deactivate(state) if self._running else TransitionCallbackReturn.SUCCESS
+
+    def destroy_node(self) -> None:
+        """Stop, then destroy the node."""
+        if self._running:
+            self._running = False
+            self.stop()
+        super().destroy_node()
+
+    def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            work()
+        except (NlsidError, OSError) as error:
+            self.failure = error
+            self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:  # rclpy would swallow it
+            self.failure = error
+            self.get_logger().fatal(traceback.format_exc())
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    def entities(self) -> list[object]:
+        """Everything the node communicates with, and its timers."""
+        kinds = (self.publishers, self.subscriptions, self.services, self.timers, self.clients)
+        return [entity for kind in kinds for entity in kind]
+
+    def _destroy_made(self) -> None:
+        destroy: tuple[tuple[Iterable[Any], Callable[[Any], bool]], ...] = (
+            (self.timers, self.destroy_timer),
+            (self.subscriptions, self.destroy_subscription),
+            (self.services, self.destroy_service),
+            (self.clients, self.destroy_client),
+            (self.publishers, self.destroy_publisher),
+        )
+        for entities, remove in destroy:
+            for entity in list(entities):
+                if entity not in self._made_before:
+                    remove(entity)
+
+
+def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
+    """Make the node, start it if it starts itself, and spin until SIGINT or SIGTERM.
+
+    The signals are waited for here and not left to rclpy, which would end all communication before
+    the node could send a last command. Raises what made the node fail to start.
+    """
+    woken = _wake_on_signals()
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    node: ManagedNode | None = None
     try:
         node = make()
-        work(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        if node.autostart:
+            for transition in (node.trigger_configure, node.trigger_activate):
+                if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
+                    raise node.failure
+        _spin_until_signalled(node, woken)
     finally:
         if node is not None:
             node.destroy_node()
         try_shutdown()
+
+
+def _spin_until_signalled(node: ManagedNode, woken: socket.socket) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    asked = threading.Event()
+
+    def wait() -> None:
+        woken.recv(1)
+        executor.create_task(asked.set)
+
+    threading.Thread(target=wait, daemon=True).start()
+    while not asked.is_set():
+        executor.spin_once()
+
+
+def _wake_on_signals() -> socket.socket:
+    """A socket that gets a byte at once when a stop signal comes, whatever Python is waiting in."""
+    receiver, sender = socket.socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.detach())
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda _number, _frame: None)
+    return receiver
 
 
 def declare(
@@ -51,6 +183,8 @@ def declare(
     The default's type is the parameter's: ROS keeps 2 and 2.0 apart. Raises DataError if the value
     given has another type or is out of range.
     """
+    if isinstance(node, ManagedNode):
+        node.declared.append(Declared(name, default, description, between))
     descriptor = ParameterDescriptor(name=name, description=description, read_only=True)
     if between is not None:
         lo, hi = between
@@ -63,3 +197,17 @@ def declare(
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
     return value
+
+
+def declare_number(
+    node: Node, name: str, default: float, description: str, *, between: tuple[float, float]
+) -> float:
+    """`declare` for a float parameter."""
+    value = declare(node, name, float(default), description, between=between)
+    assert isinstance(value, float)
+    return value
+
+
+def declare_text(node: Node, name: str, default: str, description: str) -> str:
+    """`declare` for a string parameter."""
+    return str(declare(node, name, default, description))

@@ -14,7 +14,17 @@ ROOT = Path(__file__).resolve().parents[1]
 NOT_SOURCE = shutil.ignore_patterns(
     ".*", "__pycache__", "*.egg-info", "build", "install", "log", "out", "dist", "nlsid-demo"
 )
-EXECUTABLES = {"nlsid", "bag_player", "funnel_monitor", "funnel_publisher", "trajectory_recorder"}
+EXECUTABLES = {
+    "model_identifier",
+    "nlsid",
+    "bag_player",
+    "excitation",
+    "funnel_monitor",
+    "funnel_publisher",
+    "plant",
+    "tracking_controller",
+    "trajectory_recorder",
+}
 
 pytestmark = [
     pytest.mark.colcon,

@@ -17,6 +17,7 @@ from nav_msgs.msg import Goals
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from bags.bag import Bag
 from bags.message_types import header_stamp_ns
@@ -72,7 +73,7 @@ def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(tmp_path: Path) -
         stop(recorder, signal.SIGINT)
 
     assert texts[-1] == "recording"
-    assert reports[-1] == {
+    expected = {
         "bag": str(bag),
         "/odom received": "121",
         "/odom lost": "0",
@@ -81,6 +82,10 @@ def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(tmp_path: Path) -
         "/steering_command received": "120",
         "/steering_command lost": "0",
     }
+    assert expected.items() <= reports[-1].items()
+    assert float(reports[-1]["/odom rate [Hz]"]) == pytest.approx(40.0, rel=0.01)
+    with Bag(bag) as source:
+        assert source.custom["/odom received"] == "121"
     for topic in TOPICS:
         assert messages_on(bag, topic) == messages_on(TRIAL_05, topic)
     with (bag / "recorded.mcap").open("rb") as stream:
@@ -215,3 +220,42 @@ def test_what_a_node_cannot_do_it_says_and_exits_with_status_1(
     assert node.returncode == 1
     assert message in output
     assert "Traceback" not in output
+
+
+def test_patterns_pauses_and_snapshots(tmp_path: Path) -> None:
+    bag = tmp_path / "patterned"
+    settings: dict[str, object] = {"topics": "['/robot/*']", "bag": bag, "snapshot": 60.0}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(RECORDER, **settings) as recorder,
+    ):
+        names = ("/robot/a", "/robot/b", "/other")
+        a, b, other = (node.create_publisher(String, name, qos.STREAM) for name in names)
+        spin_until(lambda: min(a.get_subscription_count(), b.get_subscription_count()) == 1)
+        assert other.get_subscription_count() == 0
+
+        def ask(what: str) -> str:
+            client = node.create_client(Trigger, f"/trajectory_recorder/{what}")
+            spin_until(client.service_is_ready)
+            answer = client.call_async(Trigger.Request())
+            spin_until(answer.done)
+            assert answer.result().success, answer.result().message
+            return str(answer.result().message)
+
+        for publisher in (a, b):
+            publisher.publish(String(data="before"))
+        time.sleep(0.3)
+        ask("pause")
+        a.publish(String(data="while paused"))
+        time.sleep(0.3)
+        ask("resume")
+        a.publish(String(data="after"))
+        time.sleep(0.3)
+        assert ask("snapshot").startswith("4 messages in ")
+        stop(recorder)
+    assert [m[8:].rstrip(b"\0") for m in messages_on(bag, "/robot/a")] == [b"before", b"after"]
+    assert len(messages_on(bag, "/robot/b")) == 1
+    snapshot = tmp_path / "patterned_snapshot_1"
+    assert [m[8:].rstrip(b"\0") for m in messages_on(snapshot, "/robot/a")] == [
+        b"before", b"while paused", b"after",
+    ]  # fmt: skip

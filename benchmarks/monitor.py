@@ -1,0 +1,229 @@
+"""The monitor: time of an update alone, and margins at 1 kHz over DDS between processes.
+
+python -m benchmarks.monitor [--seconds 60] [--json]
+
+Beside ours: what was asked of it, and rclpy alone between two processes (p50 0.17, p99 0.43 ms).
+Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival.
+The node runs on a funnel made for timing (its horizon is as long as the run), not on a proved one.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from bags.grid import read_dataset
+from bags.samples import f1tenth
+from benchmarks.machine import describe
+from benchmarks.processes import cpu_seconds, isolate, node, python
+from nlsid_core import _json
+from nlsid_core.funnels import TubeDesign, design_tube
+from nlsid_core.identification import LinearClass, identify
+from nlsid_core.models import DifferenceEquation, Signal
+from nlsid_core.monitor import MonitorBank
+from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_ros import qos
+
+LAGS, FUNNELS, ROUNDS = 6, 10, 40
+RATE = 1000  # Hz
+SOURCE = "/benchmark"
+STATE, COMMAND = "/benchmark/state:position[0]", "/benchmark/command:position[0]"
+OUTSIDE = 100.0  # a response no funnel holds
+ASKED = {
+    "update_us_p50": 20.0,
+    "update_us_p99": 50.0,
+    "update10_us_p50": 20.0,
+    "update10_us_p99": 50.0,
+    "missed": 0.0,
+    "latency_ms_p99": 1.0,
+    "error_ms": 5.0,
+}
+
+
+def updates() -> dict[str, float]:
+    """Microseconds per update on F1TENTH trials, n = 6, for one funnel and for ten."""
+    speed, command = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+    data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
+    model = identify(data, LinearClass(LAGS)).model
+    designs = [
+        design_tube(
+            model, data, profile=[(0.0, 0.0), (2.8, 0.35)], horizon=2.8, safety_factor=1.5 + 0.1 * i
+        )
+        for i in range(FUNNELS)
+    ]
+    result = {}
+    for label, count in (("update", 1), ("update10", FUNNELS)):
+        bank = MonitorBank(model, [(d.policy, d.funnel) for d in designs[:count]])
+        times = []
+        for trial in data.trajectories[:ROUNDS]:
+            bank.restart()
+            rows = zip(
+                trial.t.tolist(), trial.y[:, 0].tolist(), trial.u[:, 0].tolist(), strict=True
+            )
+            for k, (t, y, u) in enumerate(rows):
+                if k == LAGS + designs[0].funnel.assumption.samples:
+                    break
+                started = time.perf_counter_ns()
+                bank.update(t, y, u)
+                if k >= LAGS:
+                    times.append(time.perf_counter_ns() - started)
+        for percent in (50, 99):
+            result[f"{label}_us_p{percent}"] = float(np.percentile(times, percent)) / 1e3
+    return result
+
+
+def timing_funnel(seconds: float) -> TubeDesign:
+    """A model sampled at 1 kHz and a funnel that lasts `seconds`; for timing only."""
+    period, samples = 1.0 / RATE, 200
+    rng = np.random.default_rng(1)
+    a, b = np.array([1.9, -0.905]), np.array([0.0, 0.003, 0.002])
+    blank = DifferenceEquation(
+        a, b, 0.0, period, Signal("state", "1", STATE), Signal("command", "1", COMMAND), (-1.0, 1.0)
+    )
+    trials = []
+    for index in range(3):
+        u = np.repeat(rng.uniform(-1.0, 1.0, samples // 10), 10)
+        y = blank.simulate(u, [0.0, 0.0]) + 1e-3 * rng.standard_normal(samples)
+        t = np.arange(samples) * period
+        trials.append(Trajectory(t=t, y=y, u=u, name=f"run_{index}", digest=f"sha256:{index:064x}"))
+    design = design_tube(
+        blank, Dataset(tuple(trials)), profile=[(0.0, 0.0), (0.1, 0.1)], horizon=0.1
+    )
+    lasting = replace(design.funnel.assumption, budget=1.0, samples=round((seconds + 10.0) * RATE))
+    return replace(design, funnel=replace(design.funnel, level=2.0, assumption=lasting))
+
+
+class Ear(Node):
+    """Publishes the documents, and hears margins and alarms with their time of arrival."""
+
+    def __init__(self, design: TubeDesign) -> None:
+        super().__init__("ear")
+        self.arrivals: dict[int, int] = {}
+        self.error_ns = 0
+        self.ready = False
+        for role in ("model", "policy", "funnel"):
+            document = getattr(design, role).document()
+            publisher = self.create_publisher(String, f"{SOURCE}/{role}", qos.DOCUMENT)
+            publisher.publish(String(data=_json.canonical(document).decode()))
+        self.create_subscription(JointState, "/funnel_monitor/margin", self._margin, qos.STREAM)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
+
+    def _margin(self, message: JointState) -> None:
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        self.arrivals[stamp_ns] = time.time_ns()
+
+    def _status(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.ready |= status.name == "funnel_monitor"
+            if status.level == DiagnosticStatus.ERROR and not self.error_ns:
+                self.error_ns = time.time_ns()
+
+
+def send(seconds: float) -> None:
+    """Publish command and response at 1 kHz, the last 100 responses outside; print the stamps."""
+    rclpy.init()
+    sender = Node("sender")
+    state = sender.create_publisher(JointState, STATE.partition(":")[0], qos.STREAM)
+    command = sender.create_publisher(JointState, COMMAND.partition(":")[0], qos.STREAM)
+    while min(state.get_subscription_count(), command.get_subscription_count()) < 1:
+        time.sleep(0.01)
+    time.sleep(0.5)
+    count, message = round(seconds * RATE), JointState(position=[0.0])
+    sent, start, start_ns = [], time.perf_counter(), time.time_ns()
+    for k in range(count):
+        while (ahead := start + k / RATE - time.perf_counter()) > 0:
+            time.sleep(max(ahead - 1e-4, 0.0))
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(start_ns + k * 10**9 // RATE, 10**9)
+        sent.append(time.time_ns())
+        message.position[0] = 0.0
+        command.publish(message)
+        message.position[0] = OUTSIDE if k >= count - 100 else 0.0
+        state.publish(message)
+    time.sleep(1.0)
+    print(json.dumps({"start_ns": start_ns, "sent_ns": sent}))
+    sender.destroy_node()
+    rclpy.shutdown()
+
+
+def live(seconds: float) -> dict[str, float]:
+    """Missed samples, latency from stamp to margin, and time to ERROR, between processes."""
+    isolate()
+    rclpy.init()
+    ear = Ear(timing_funnel(seconds))
+    executor = SingleThreadedExecutor()
+    executor.add_node(ear)
+    with python(*node("funnel_monitor", source=SOURCE)) as monitor:
+        while not ear.ready:
+            executor.spin_once(timeout_sec=0.1)
+        sender = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.monitor", "--send", str(seconds)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        heard: list[str] = []
+        assert sender.stdout is not None
+        reader = threading.Thread(target=lambda: heard.extend(sender.stdout or ()))
+        reader.start()
+        while reader.is_alive():
+            executor.spin_once(timeout_sec=0.1)
+        cpu = cpu_seconds(monitor.pid)
+        sender.wait()
+    sent = json.loads(heard[-1])
+    stamps = [sent["start_ns"] + k * 10**9 // RATE for k in range(len(sent["sent_ns"]))]
+    ways = [
+        ear.arrivals[stamp] - at
+        for stamp, at in zip(stamps, sent["sent_ns"], strict=True)
+        if stamp in ear.arrivals
+    ]
+    latencies = np.array(ways) / 1e6
+    result = {
+        "sent": len(stamps),
+        "missed": len(stamps) - len(latencies),
+        "latency_ms_p50": float(np.percentile(latencies, 50)),
+        "latency_ms_p99": float(np.percentile(latencies, 99)),
+        "latency_ms_max": float(np.max(latencies)),
+        "error_ms": (ear.error_ns - sent["sent_ns"][-100]) / 1e6,
+    }
+    result["cpu_percent_of_a_core"] = 100.0 * cpu / seconds
+    ear.destroy_node()
+    rclpy.shutdown()
+    return result
+
+
+def main() -> None:
+    """Print the table; with --json the last line is one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.send:
+        send(options.send)
+        return
+    result = updates() | live(options.seconds)
+    print(f"{describe()}\n{'':24} {'reached':>10} {'asked':>10}")
+    for key, value in result.items():
+        asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""
+        print(f"{key:24} {value:10.4g} {asked}")
+    if options.json:
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""The recorder: messages lost and CPU used at 10 topics x 1 kHz; what kills leave behind.
+
+python -m benchmarks.recorder [--seconds 60] [--kills 50] [--json]
+
+Beside ours, in the same run: a node of the same subscriptions that writes with rosbags' Writer.
+"""
+
+import argparse
+import json
+import random
+import tempfile
+import time
+from pathlib import Path
+
+import rclpy
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import Writer
+from sensor_msgs.msg import JointState
+
+from bags.bag import Bag
+from bags.message_types import header_stamp_ns, standard_types
+from bags.repair import repair
+from benchmarks.machine import describe
+from benchmarks.processes import cpu_seconds, isolate, node, python
+from nlsid_ros import qos
+from nlsid_ros.running import ManagedNode, run
+
+TOPICS = [f"/joints_{i}" for i in range(10)]
+TYPE = "sensor_msgs/msg/JointState"
+RATE = 1000  # Hz
+ASKED = {"lost": 0.0, "cpu_percent_of_a_core": 60.0, "worst_loss_s": 1.1}
+
+
+class RosbagsRecorder(ManagedNode):
+    """The least a recorder with rosbags' Writer can do."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__("rosbags_recorder")
+        self._writer = Writer(path, version=9)
+        self._writer.open()
+        for topic in TOPICS:
+            connection = self._writer.add_connection(topic, TYPE, typestore=standard_types())
+
+            def record(data: bytes, info: dict[str, int], to: object = connection) -> None:
+                self._writer.write(to, info["received_timestamp"], data)  # type: ignore[arg-type]
+
+            self.create_subscription(JointState, topic, record, qos.STREAM, raw=True)  # type: ignore[arg-type]
+
+    def stop(self) -> None:
+        """Write what was buffered."""
+        self._writer.close()
+
+
+def send(seconds: float, count: int) -> None:
+    """Publish six joints on each of the first `count` topics at 1 kHz, stamped with the time."""
+    rclpy.init()
+    sender = Node("sender")
+    publishers = [
+        sender.create_publisher(JointState, topic, qos.STREAM) for topic in TOPICS[:count]
+    ]
+    while min(p.get_subscription_count() for p in publishers) < 1:
+        time.sleep(0.01)
+    time.sleep(0.5)
+    names = [f"joint_{i}" for i in range(6)]
+    values = [0.0] * 6
+    data = bytearray(serialize_message(JointState(name=names, position=values, velocity=values)))
+    start, ticks = time.perf_counter(), round(seconds * RATE)
+    for k in range(ticks):
+        while (ahead := start + k / RATE - time.perf_counter()) > 0:
+            time.sleep(ahead)
+        seconds_part, nanoseconds = divmod(time.time_ns(), 10**9)
+        data[4:8] = seconds_part.to_bytes(4, "little")
+        data[8:12] = nanoseconds.to_bytes(4, "little")
+        message = bytes(data)
+        for publisher in publishers:
+            publisher.publish(message)
+    time.sleep(1.0)
+    sender.destroy_node()
+    rclpy.shutdown()
+
+
+def sending(seconds: float, count: int) -> list[str]:
+    """Arguments that start the sender."""
+    return ["benchmarks.recorder", "--send", str(seconds), "--topics", str(count)]
+
+
+def throughput(recorder: list[str], bag: Path, seconds: float) -> dict[str, float]:
+    """Messages lost, and CPU used while they came."""
+    with python(*recorder) as recording:
+        time.sleep(3.0)
+        before = cpu_seconds(recording.pid)
+        with python(*sending(seconds, len(TOPICS))) as sender:
+            sender.wait()
+        used = cpu_seconds(recording.pid) - before
+    with Bag(bag) as source:
+        kept = sum(source.count(topic) for topic in TOPICS)
+    sent = round(seconds * RATE) * len(TOPICS)
+    return {"sent": sent, "lost": sent - kept, "cpu_percent_of_a_core": 100.0 * used / seconds}
+
+
+def kills(folder: Path, count: int) -> dict[str, float]:
+    """Kill the recorder at random times; the worst time lost and the bags that are whole after
+    repair.
+    """
+    rng, losses, readable = random.Random(1), [], 0
+    with python(*sending(1e6, 1)) as sender:
+        for index in range(count):
+            bag = folder / f"killed_{index}"
+            parameters = {"topics": f"[{TOPICS[0]}]", "bag": bag, "repair": False}
+            with python(*node("trajectory_recorder", **parameters)) as recorder:
+                file = bag / f"{bag.name}.mcap"
+                while not file.exists() or file.stat().st_size < 10_000:
+                    time.sleep(0.02)
+                time.sleep(rng.uniform(0.0, 1.5))
+                recorder.kill()
+                killed_ns = time.time_ns()
+                recorder.wait()
+            repair(bag)
+            with Bag(bag) as source:
+                stamps = [header_stamp_ns(m.data) for m in source.messages(TOPICS[:1])]
+            readable += bool(stamps)
+            losses.append((killed_ns - stamps[-1]) / 1e9)
+        sender.kill()
+    return {"kills": count, "bags_readable": readable, "worst_loss_s": max(losses)}
+
+
+def main() -> None:
+    """Print the table; with --json the last line is one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--topics", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--rosbags", type=Path, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.send:
+        send(options.send, options.topics)
+        return
+    if options.rosbags:
+        run(lambda: RosbagsRecorder(options.rosbags), [])
+        return
+    isolate()
+    with tempfile.TemporaryDirectory() as scratch:
+        ours, theirs = Path(scratch) / "ours", Path(scratch) / "theirs"
+        listed = json.dumps(TOPICS)
+        result = throughput(
+            node("trajectory_recorder", topics=listed, bag=ours), ours, options.seconds
+        )
+        other = throughput(
+            ["benchmarks.recorder", "--rosbags", str(theirs)], theirs, options.seconds
+        )
+        result |= {f"rosbags_{key}": value for key, value in other.items() if key != "sent"}
+        if options.kills:
+            result |= kills(Path(scratch), options.kills)
+    print(f"{describe()}\n{'':30} {'reached':>10} {'asked':>10}")
+    for key, value in result.items():
+        asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""
+        print(f"{key:30} {value:10.6g} {asked}")
+    if options.json:
+        print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""Node `model_identifier`: identification as a service, in a worker process.
+
+`~/identify` answers at once whether work began; progress is on /diagnostics; the model comes out on
+~/model (latched) once it is proved stable, beside the files in `out`. `~/cancel` calls it off.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags import documents
+from bags.background import BackgroundIdentification, Progress
+from bags.config import load_config
+from nlsid_core.certificate import check
+from nlsid_core.errors import DataError, NlsidError
+from nlsid_ros import qos
+from nlsid_ros.diagnostics import status
+from nlsid_ros.running import ManagedNode, declare, declare_text, run
+
+NAME = "model_identifier"
+LOOK = 0.1  # s between looks at the worker
+REPORT = 1.0  # s between diagnostics while nothing changes
+
+
+class ModelIdentifier(ManagedNode):
+    """One identification at a time; callbacks only start, look at and end the worker."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        bags: Any = declare(
+            self, "bags", [""], "bags or folders of bags, read when ~/identify is called"
+        )
+        self._bags = [Path(bag) for bag in bags if bag]
+        self._config = Path(declare_text(self, "config", "", "the robot's YAML configuration"))
+        self._out = Path(declare_text(self, "out", "", "folder for model.json and its proof"))
+
+    def prepare(self) -> None:
+        """Refuse to wait for a request that could not be served."""
+        if not self._bags or self._out == Path():
+            raise DataError("nothing to identify from or to; set the parameters bags and out")
+        load_config(self._config)
+
+    def start(self) -> None:
+        """Wait for requests."""
+        self._work: BackgroundIdentification | None = None
+        self._said = Progress("idle", 0.0)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._model = self.create_publisher(String, "~/model", qos.DOCUMENT)
+        self.create_service(Trigger, "~/identify", self._on_identify)
+        self.create_service(Trigger, "~/cancel", self._on_cancel)
+        self.create_timer(LOOK, self._look)
+        self.create_timer(REPORT, self._report)
+
+    def stop(self) -> None:
+        """Call off what runs."""
+        if self._work is not None:
+            self._work.cancel()
+
+    def _on_identify(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success = self._work is None
+        answer.message = "started" if answer.success else f"busy: {self._said.what}"
+        if answer.success:
+            self._work = BackgroundIdentification(self._bags, self._config, self._out)
+        return answer
+
+    def _on_cancel(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success = self._work is not None
+        answer.message = "cancelled" if answer.success else "nothing runs"
+        if self._work is not None:
+            self._work.cancel()
+            self._look()
+        return answer
+
+    def _look(self) -> None:
+        """Pass on the worker's progress; on success check the proof and publish the model."""
+        if self._work is None:
+            return
+        progress = self._work.poll()
+        if progress.done:
+            self._work.cancel()
+            self._work = None
+            if progress.what == "done":
+                progress = self._publish()
+        if progress != self._said:
+            self._said = progress
+            self._report()
+
+    def _publish(self) -> Progress:
+        try:
+            verdict = check(self._out / documents.MODEL_PROOF)
+            model = documents.load_model(self._out / documents.MODEL)
+        except (NlsidError, OSError) as error:
+            return Progress("failed", 1.0, done=True, error=str(error))
+        self._model.publish(String(data=json.dumps(model.document())))
+        return Progress(str(verdict), 1.0, done=True)
+
+    def _report(self) -> None:
+        said = self._said
+        level = DiagnosticStatus.ERROR if said.error else DiagnosticStatus.OK
+        text = said.what + (f": {said.error}" if said.error else "")
+        now = self.get_clock().now().to_msg()
+        values = {"progress": f"{said.fraction:.2f}", "out": str(self._out)}
+        self._diagnostics.publish(status(now, self.get_name(), level, text, values))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of `ros2 run nlsid model_identifier`."""
+    try:
+        run(ModelIdentifier, args)
+    except (NlsidError, OSError) as error:
+        sys.exit(f"{NAME}: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,263 @@
+"""Node `tracking_controller`: runs the certified policy u = u_k - K(x̂ - x_k) on the live state.
+
+Sample k's input is known one period ahead; it is published when it comes into force, stamped a
+quarter of a period before its sample is due, so that a sample off the grid by that much is still
+paired with it. `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and
+the funnel's digest. Stale or impossible state, `~/stop`, and the end of the plan ramp the input to
+`stop_at`.
+"""
+
+import sys
+import time
+from functools import partial
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags.announcement import Run
+from bags.grid import seconds
+from bags.message_types import standard_types
+from bags.signals import SignalPath
+from nlsid_core import _json
+from nlsid_core.controller import Controller, Limits
+from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.funnel import Funnel
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.monitor import GRID_TOLERANCE
+from nlsid_core.policy import Policy
+from nlsid_ros import qos
+from nlsid_ros.diagnostics import status
+from nlsid_ros.documents import FunnelSubscription
+from nlsid_ros.message_classes import message_class
+from nlsid_ros.messages import SignalMessage, stamp_ns_of
+from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+
+NAME = "tracking_controller"
+LAST_WORD = 1.0  # s for the last command to be received before the node goes
+REPORT = 1.0  # s between diagnostics while nothing changes
+BIG = 1e9
+
+
+class TrackingController(ManagedNode):
+    """Samples in, inputs out; between runs it is silent, so that others may drive."""
+
+    def __init__(self) -> None:
+        super().__init__(NAME)
+        number = partial(declare_number, self)
+        self._source = declare_text(
+            self, "source", "funnel_publisher", "node that publishes the funnel"
+        )
+        self._response_type = declare_text(
+            self, "response_type", "nav_msgs/msg/Odometry", "type of the response's topic"
+        )
+        self._command_type = declare_text(
+            self, "command_type", "geometry_msgs/msg/TwistStamped", "type of the commands published"
+        )
+        self._start_at_once = bool(
+            declare(self, "start_at_once", False, "begin a run as soon as there is a funnel")
+        )
+        self._stale_after = number(
+            "stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0)
+        )
+        self._settling = number(
+            "settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0)
+        )
+        self._limits = Limits(
+            lowest=number("lowest", 0.0, "least input", between=(-BIG, BIG)),
+            highest=number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG)),
+            stop_at=number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
+            stop_rate=number(
+                "stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG)
+            ),
+        )
+        if self._limits.lowest == self._limits.highest:
+            raise DataError("no room between lowest and highest; set the limits of the input")
+
+    def start(self) -> None:
+        """Listen for the funnel; it names the signals."""
+        self._parts: tuple[DifferenceEquation, Policy, Funnel] | None = None
+        self._controller: Controller | None = None
+        self._command: SignalMessage | None = None
+        self._input = self._limits.stop_at
+        self._first_ns: int | None = None
+        self._due_ns = 0
+        self._stopping = ""
+        self._text = "waiting for the funnel"
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self._funnel = FunnelSubscription(self, self._source, self._on_funnel, self._tell)
+        self._due = self.create_timer(1.0, self._on_due)
+        self._due.cancel()
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self._stale = self.create_timer(
+            self._stale_after, lambda: self._halt("the response stopped coming"), clock=wall
+        )
+        self._stale.cancel()
+        self.create_timer(REPORT, self._report, clock=wall)
+
+    def stop(self) -> None:
+        """Ramp down before going, in real time."""
+        if self._controller is None and not self._stopping:
+            return
+        assert self._parts is not None
+        period = self._parts[0].period
+        self._halt("the node stops")
+        while self._input != self._limits.stop_at:
+            self._step_down()
+            time.sleep(period)
+        self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
+
+    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+        """Take a funnel, but never in the middle of a run: stop that first."""
+        if self._controller is not None or self._stopping:
+            self._halt("the funnel was replaced")
+        response = SignalPath.parse(model.y.path)
+        response.check(self._response_type, standard_types())
+        if self._parts is None:
+            self._command = SignalMessage(SignalPath.parse(model.u.path), self._command_type)
+            self._commands = self.create_publisher(
+                self._command.kind, self._command.path.topic, qos.STREAM
+            )
+            self.create_subscription(
+                message_class(self._response_type),
+                response.topic,
+                partial(self._on_response, response),
+                qos.SENSOR,
+            )
+        elif (model.y.path, model.u.path) != (self._parts[0].y.path, self._parts[0].u.path):
+            self._tell("the new funnel is about other signals; deactivate and activate again")
+            return
+        self._parts = model, policy, funnel
+        self._tell("idle")
+        if self._start_at_once:
+            self._begin()
+
+    def _begin(self) -> str:
+        """Begin a run; why not, empty if it began."""
+        if self._parts is None:
+            return "there is no funnel yet"
+        if self._controller is not None or self._stopping:
+            return "a run is on"
+        model, policy, funnel = self._parts
+        self._controller = Controller(
+            model, policy, funnel, limits=self._limits, settling=self._settling
+        )
+        self._first_ns = None
+        self._tell("waiting for the response")
+        return ""
+
+    def _on_response(self, path: SignalPath, message: Any) -> None:
+        """Decode, ask the core for the next input, and set it down for when it is due."""
+        controller = self._controller
+        if controller is None:
+            return
+        stamp_ns = stamp_ns_of(message)
+        if self._first_ns is None:  # its input is not ours; the next sample's is
+            self._first_ns = stamp_ns
+        else:
+            starting = controller.k == 0
+            try:
+                value = path.value(message)
+            except BagError as error:
+                self._halt(str(error))
+                return
+            controller.update(seconds(stamp_ns, self._first_ns), value)
+            if controller.ended:
+                self._halt(controller.ended)
+                return
+            if starting:
+                announced = Run(stamp_ns, self._funnel.digest).document()
+                self._announce.publish(String(data=_json.canonical(announced).decode()))
+                self._tell("tracking")
+        self._stale.reset()
+        lead = round((1.0 - GRID_TOLERANCE) * controller.model.period * 1e9)
+        self._schedule(stamp_ns + lead)
+
+    def _schedule(self, due_ns: int) -> None:
+        """Publish at `due_ns`, at once if that has passed."""
+        self._due_ns = due_ns
+        ahead = due_ns - self.get_clock().now().nanoseconds
+        if ahead <= 0:
+            self._on_due()
+        else:
+            self._due.timer_period_ns = ahead
+            self._due.reset()
+
+    def _on_due(self) -> None:
+        self._due.cancel()
+        if self._controller is not None:
+            self._input = self._controller.u
+            self._send(self._due_ns)
+        elif self._stopping:
+            self._step_down()
+            if self._input == self._limits.stop_at:
+                self._tell(f"idle; stopped: {self._stopping}")
+                self._stopping = ""
+            else:
+                assert self._parts is not None
+                self._schedule(self._due_ns + round(self._parts[0].period * 1e9))
+
+    def _step_down(self) -> None:
+        assert self._parts is not None
+        self._input = self._limits.towards_stop(self._input, self._parts[0].period)
+        self._send(self.get_clock().now().nanoseconds)
+
+    def _send(self, stamp_ns: int) -> None:
+        assert self._command is not None
+        self._commands.publish(self._command.make(stamp_ns, self._input))
+
+    def _halt(self, reason: str) -> None:
+        """End the run and ramp down."""
+        self._stale.cancel()
+        if self._controller is None:
+            return
+        self._controller = None
+        self._stopping = reason
+        self._tell(f"stopping: {reason}")
+        self._schedule(self.get_clock().now().nanoseconds)
+
+    def _on_start(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.message = self._begin()
+        answer.success = not answer.message
+        return answer
+
+    def _on_stop(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        answer.success, answer.message = True, "stopping" if self._controller else "not running"
+        self._halt("asked to")
+        return answer
+
+    def _tell(self, text: str) -> None:
+        self._text = text
+        self.get_logger().info(text)
+        self._report()
+
+    def _report(self) -> None:
+        level = DiagnosticStatus.OK
+        if self._stopping or "stopped" in self._text:
+            level = DiagnosticStatus.WARN
+        values = {
+            "input": f"{self._input:.6g}",
+            "sample": str(self._controller.k) if self._controller else "",
+            "funnel": self._funnel.digest if hasattr(self, "_funnel") else "",
+        }
+        now = self.get_clock().now().to_msg()
+        self._diagnostics.publish(status(now, self.get_name(), level, self._text, values))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of `ros2 run nlsid tracking_controller`."""
+    try:
+        run(TrackingController, args)
+    except NlsidError as error:
+        sys.exit(f"{NAME}: {error}")
+
+
+if __name__ == "__main__":
+    main()

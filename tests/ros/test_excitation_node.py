@@ -1,0 +1,124 @@
+"""The excitation node over DDS: within its limits, repeated exactly, stopped when asked."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from geometry_msgs.msg import TwistStamped
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags.samples import f1tenth
+from nlsid_ros import qos
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+EXCITATION = "nlsid_ros.excitation"
+LIMITS: dict[str, object] = {"lowest": -0.1, "highest": 0.4, "slew": 2.0, "fade": 0.2}
+
+
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_domain_of_this_run(monkeypatch)
+
+
+def excite(
+    parameters: dict[str, object], *, stop_after: float | None = None
+) -> tuple[list[tuple[int, float]], list[str]]:
+    """(stamp, command) of everything sent after ~/start, and what was said to have been done."""
+    sent: list[tuple[int, float]] = []
+    did: list[str] = []
+
+    def hear_experiment(message: String) -> None:
+        did.append(message.data)
+
+    def hear(message: TwistStamped) -> None:
+        stamp = message.header.stamp
+        sent.append((stamp.sec * 10**9 + stamp.nanosec, message.twist.linear.x))
+
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(EXCITATION, **(LIMITS | parameters)) as running,
+    ):
+        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+        node.create_subscription(String, "/excitation/experiment", hear_experiment, qos.DOCUMENT)
+        start = node.create_client(Trigger, "/excitation/start")
+        halt = node.create_client(Trigger, "/excitation/stop")
+        spin_until(start.service_is_ready)
+        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+        settled = time.monotonic() + 0.5
+        spin_until(lambda: time.monotonic() > settled)
+        assert not sent, "nothing moves before it is asked to"
+        start.call_async(Trigger.Request())
+        spin_until(lambda: bool(sent))
+        if stop_after is not None:
+            asked = time.monotonic() + stop_after
+            spin_until(lambda: time.monotonic() > asked)
+            halt.call_async(Trigger.Request())
+        quiet = [0, time.monotonic()]
+
+        def ended() -> bool:
+            if len(sent) != quiet[0]:
+                quiet[:] = [len(sent), time.monotonic()]
+            return time.monotonic() - quiet[1] > 1.0
+
+        spin_until(ended)
+        stop(running)
+    return sent, did
+
+
+def test_repeats_are_the_same_signal_within_the_limits() -> None:
+    parameters: dict[str, object] = {
+        "period": 0.02,
+        "duration": 2.0,
+        "pause": 0.5,
+        "repeats": 2,
+        "lowest_hz": 0.5,
+        "highest_hz": 3.0,
+    }
+    sent, did = excite(parameters)
+    stamps, inputs = np.array([s for s, _ in sent]), np.array([u for _, u in sent])
+    assert (np.diff(stamps) == 20_000_000).all(), "on an exact grid"
+    half = len(inputs) // 2
+    assert half >= 125
+    np.testing.assert_array_equal(inputs[:half], inputs[half:])
+    assert inputs.min() >= -0.1
+    assert inputs.max() <= 0.4
+    assert np.ptp(inputs) > 0.3
+    assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+    assert inputs[-1] == 0.0
+    [experiment] = map(json.loads, did)
+    assert (experiment["kind"], experiment["repeats"]) == ("multisine", 2)
+    assert experiment["limits"]["highest"] == 0.4
+
+
+def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
+    sent, _ = excite({"kind": "steps", "period": 0.02, "pause": 0.0}, stop_after=1.5)
+    inputs = [u for _, u in sent]
+    assert inputs[-1] == 0.0
+    assert len(inputs) < 200
+    assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+
+
+def test_a_recorded_command_is_replayed_within_the_limits() -> None:
+    trial: Path = f1tenth()[4]
+    sent, _ = excite({"kind": "replay", "bag": trial, "pause": 0.0, "slew": 100.0, "fade": 0.0})
+    inputs = [u for _, u in sent]
+    assert max(inputs) == pytest.approx(0.4)
+    assert len(inputs) > 100
+
+
+@pytest.mark.parametrize(
+    "missing", [{"lowest": 0.0, "highest": 0.0, "slew": 1.0}, {"highest": 1.0, "slew": 0.0}]
+)
+def test_without_limits_it_does_not_run(missing: dict[str, object]) -> None:
+    with process(EXCITATION, **missing) as node:
+        output = node.communicate(timeout=20)[0]
+    assert node.returncode == 1
+    assert "to what the robot may do" in output

@@ -1,0 +1,291 @@
+"""What goes wrong on a robot, done to the monitor and the recorder over DDS."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags import documents
+from bags.config import load_config
+from bags.samples import f1tenth
+from bags.shipped import config_file
+from bags.steps import design_funnel_files, identify_bags
+from nlsid_core import _json
+from nlsid_ros import qos
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+MONITOR = "nlsid_ros.funnel_monitor"
+PERIOD_NS = 25_000_000
+Spin = Callable[[Callable[[], bool]], None]
+
+
+class Robot:
+    """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
+
+    def __init__(self, node: Node, spin_until: Spin, folder: Path) -> None:
+        self.node, self.spin_until = node, spin_until
+        self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
+        self.latched: dict[str, Publisher] = {}
+        self.texts: dict[str, str] = {}
+        for role in ("model", "policy", "funnel"):
+            self.latched[role] = node.create_publisher(
+                String, f"/funnel_publisher/{role}", qos.DOCUMENT
+            )
+            self.texts[role] = (folder / f"{role}.json").read_text()
+            self.latched[role].publish(String(data=self.texts[role]))
+        self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
+        self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
+        self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.said.setdefault(status.name, []).append((status.message, values))
+
+    def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
+        """Whether `node` has said `text`."""
+        return any(text in said for said, _ in self.said.get(node, []))
+
+    def ready(self, monitors: int = 1) -> None:
+        """Wait until the monitors listen."""
+        self.spin_until(lambda: self.odom.get_subscription_count() >= monitors)
+        self.spin_until(lambda: self.command.get_subscription_count() >= monitors)
+
+    def restart(self) -> None:
+        """Begin a new run."""
+        self.ready()
+        client = self.node.create_client(Trigger, "/funnel_monitor/restart")
+        self.spin_until(client.service_is_ready)
+        self.said.clear()
+        answer = client.call_async(Trigger.Request())
+        self.spin_until(answer.done)
+        self.spin_until(lambda: self.has_said("restarted"))
+        self.node.destroy_client(client)
+
+    def drive(
+        self,
+        samples: list[int],
+        *,
+        speed: float = 0.0,
+        odom: Publisher | None = None,
+        shift_ns: int = 0,
+        slower: float = 1.0,
+        clock: bool = False,
+    ) -> None:
+        """Samples by index, at 40 Hz by their stamps whatever these are."""
+        base = 10**18 + shift_ns
+        for k in samples:
+            command, state = TwistStamped(), Odometry()
+            for message in (command, state):
+                stamp = message.header.stamp
+                stamp.sec, stamp.nanosec = divmod(base + k * PERIOD_NS, 10**9)
+            state.twist.twist.linear.x = speed
+            if clock:
+                self.clock.publish(Clock(clock=state.header.stamp))
+            self.command.publish(command)
+            (odom or self.odom).publish(state)
+            due = time.monotonic() + slower * PERIOD_NS * 1e-9
+            self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The F1TENTH chain's files."""
+    out = tmp_path_factory.mktemp("chain")
+    config = load_config(config_file("f1tenth.yaml"))
+    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    design_funnel_files(out / documents.MODEL, config, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def robot(folder: Path) -> Iterator[Robot]:
+    """One robot with one monitor, which each test restarts."""
+    with pytest.MonkeyPatch.context() as patch:
+        use_domain_of_this_run(patch)
+        with (
+            node_here("test_robot") as (node, spin_until),
+            process(MONITOR, stale_after=0.5) as monitor,
+        ):
+            yield Robot(node, spin_until, folder)
+            stop(monitor)
+
+
+GOOD = list(range(10))
+
+
+@pytest.mark.parametrize(
+    ("samples", "speed", "says"),
+    [
+        ([*GOOD, 4], 0.0, "time went back"),
+        ([*GOOD, 50], 0.0, "between samples"),
+        ([0, 1, 2, 3, 5, 4], 0.0, "between samples"),
+        (GOOD, math.nan, "speed is nan"),
+        (GOOD, math.inf, "speed is inf"),
+        (GOOD, 1e300, "outside"),
+        (GOOD, 0.0, "no speed for 0.5 s"),
+    ],
+    ids=["back", "ahead", "out of order", "nan", "infinite", "huge", "silence"],
+)
+def test_a_state_that_cannot_be_trusted_is_named_and_never_inside_again(
+    robot: Robot, samples: list[int], speed: float, says: str
+) -> None:
+    robot.restart()
+    robot.drive(samples, speed=speed)
+    robot.spin_until(lambda: robot.has_said(says))
+    robot.said.clear()
+    robot.drive([100, 101, 102, 103, 104, 105])
+    assert not robot.has_said("inside")
+
+
+def test_messages_that_come_twice_count_once(robot: Robot) -> None:
+    robot.restart()
+    robot.drive([k for k in range(12) for _ in range(2)], slower=0.5)
+    robot.spin_until(lambda: robot.has_said("unknown: no speed"))
+    texts = [text for text, _ in robot.said["funnel_monitor"]]
+    assert "inside" in texts
+    assert texts[-1] == "unknown: no speed for 0.5 s", "nothing else went wrong"
+    assert int(robot.said["funnel_monitor"][-1][1]["duplicate responses"]) == 12
+
+
+def test_a_publisher_that_dies_ends_the_run_and_one_that_returns_can_begin_another(
+    robot: Robot,
+) -> None:
+    robot.restart()
+    robot.drive(GOOD)
+    robot.spin_until(lambda: robot.has_said("inside"))
+    robot.node.destroy_publisher(robot.odom)
+    robot.spin_until(lambda: robot.has_said("unknown: no speed"))
+    robot.odom = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
+    robot.restart()
+    robot.drive(GOOD)
+    robot.spin_until(lambda: robot.has_said("inside"))
+
+
+def test_a_second_publisher_between_the_samples_is_not_mistaken_for_the_robot(
+    robot: Robot,
+) -> None:
+    robot.restart()
+    second = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
+    robot.spin_until(lambda: second.get_subscription_count() >= 1)
+    for k in range(8):
+        robot.drive([k])
+        robot.drive([k], odom=second, speed=0.2, shift_ns=PERIOD_NS // 2)
+    robot.spin_until(lambda: robot.has_said("between samples"))
+    assert not robot.has_said("inside")
+    robot.node.destroy_publisher(second)
+
+
+def test_a_funnel_that_does_not_fit_replaces_nothing_and_a_whole_one_begins_again(
+    robot: Robot,
+) -> None:
+    robot.restart()
+    robot.drive(GOOD)
+    robot.spin_until(lambda: robot.has_said("inside"))
+    forged = _json.parse_document(robot.texts["policy"]) | {"K": [0.0, 0.0, 0.0, 0.0]}
+    robot.latched["policy"].publish(String(data=_json.canonical(forged).decode()))
+    robot.spin_until(lambda: robot.has_said("funnel not used: the funnel was made for another"))
+    robot.said.clear()
+    robot.drive([10, 11, 12, 13, 14, 15])
+    assert not robot.has_said("inside")
+    robot.latched["policy"].publish(String(data=robot.texts["policy"]))
+    robot.spin_until(lambda: robot.has_said("no speed yet"))
+    robot.ready()
+    robot.restart()
+    robot.drive(GOOD)
+    robot.spin_until(lambda: robot.has_said("inside"))
+
+
+def test_two_monitors_say_the_same(robot: Robot) -> None:
+    with process(MONITOR, __node="second_monitor") as second:
+        robot.ready(monitors=2)
+        robot.spin_until(lambda: robot.has_said(" yet", "second_monitor"))
+        robot.restart()
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        robot.spin_until(lambda: robot.has_said("inside", "second_monitor"))
+        stop(second)
+
+
+def test_in_simulated_time_a_slow_simulation_is_not_a_silent_robot(robot: Robot) -> None:
+    simulated = {"use_sim_time": True, "stale_after": 0.1, "__node": "simulated_monitor"}
+    with process(MONITOR, **simulated) as monitor:
+        robot.ready(monitors=2)
+        robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
+        robot.spin_until(lambda: robot.has_said(" yet", "simulated_monitor"))
+        robot.drive(GOOD, slower=8.0, clock=True)  # 0.2 s of wall time between samples
+        robot.spin_until(lambda: robot.has_said("inside", "simulated_monitor"))
+        assert not robot.has_said("no speed for", "simulated_monitor")
+        stop(monitor)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"stale_after": 0.0}, "parameter stale_after (s without a response: unknown)"),
+        ({"stale_after": "soon"}, "parameter stale_after"),
+        ({"nominal": "profil"}, "profil"),
+    ],
+)
+def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
+    robot: Robot, parameters: dict[str, object], message: str
+) -> None:
+    with process(MONITOR, **parameters, __node="misconfigured") as node:
+        output = node.communicate(timeout=20)[0]
+    assert robot.node is not None
+    assert node.returncode == 1
+    assert message in output
+    assert "Traceback" not in output
+
+
+def test_a_recording_stops_while_there_is_room_to_finish_it(robot: Robot, tmp_path: Path) -> None:
+    bag = tmp_path / "full"
+    settings: dict[str, object] = {"topics": "[/odom]", "bag": bag, "least_free": 1e11}
+    with process("nlsid_ros.trajectory_recorder", **settings) as recorder:
+        robot.spin_until(lambda: robot.has_said("are to stay free", "trajectory_recorder"))
+        stop(recorder)
+    assert (bag / "metadata.yaml").is_file(), "the bag was closed"
+
+
+def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robot: Robot) -> None:
+    with process(MONITOR, __node="picky_monitor") as monitor:
+        robot.ready(monitors=2)
+        offers_less = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        unreliable = robot.node.create_publisher(Odometry, "/odom", offers_less)
+        time.sleep(1.0)
+        output = stop(monitor)
+        robot.node.destroy_publisher(unreliable)
+    assert "'/odom', offering incompatible QoS" in output
+    assert "RELIABILITY" in output
+
+
+def test_a_parameter_cannot_be_changed_under_a_running_monitor(robot: Robot) -> None:
+    robot.ready()
+    client = robot.node.create_client(SetParameters, "/funnel_monitor/set_parameters")
+    robot.spin_until(client.service_is_ready)
+    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=-1.0)
+    request = SetParameters.Request(parameters=[Parameter(name="stale_after", value=value)])
+    answer = client.call_async(request)
+    robot.spin_until(answer.done)
+    [result] = answer.result().results
+    assert not result.successful
+    assert "stale_after" in result.reason

@@ -1,0 +1,35 @@
+"""Rates, jitter and gaps of stamps, and the ring of the last seconds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.arrivals import Arrival, Recent, Regularity
+from bags.bag import Bag
+from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
+
+PERIOD_NS = 1_000_000
+
+
+def test_rate_jitter_and_gaps_are_those_of_the_stamps() -> None:
+    rng = np.random.default_rng(2)
+    stamps = np.arange(5000) * PERIOD_NS + (5e4 * rng.standard_normal(5000)).astype(int)
+    regularity = Regularity()
+    for k, stamp in enumerate(stamps.tolist()):
+        if k not in (1000, 2000, 2001, 4000):
+            regularity.update(stamp)
+    assert regularity.gaps == 3
+    assert regularity.rate == pytest.approx(1000.0, rel=0.02)
+    assert regularity.jitter == pytest.approx(5e-5 * 2**0.5, rel=0.3)
+
+
+def test_the_last_seconds_are_kept_and_nothing_older(tmp_path: Path) -> None:
+    recent = Recent(2.0)
+    for k in range(100):
+        at = START_NS + k * 10**8
+        recent.add(Arrival(CMD, CMD_TYPE, command(at, float(k)), at, at))
+    assert recent.save(tmp_path / "snapshot") == 21
+    with Bag(tmp_path / "snapshot") as bag:
+        data = [message.data for message in bag.messages()]
+    assert data == [command(START_NS + k * 10**8, float(k)) for k in range(79, 100)]
