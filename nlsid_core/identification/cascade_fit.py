@@ -123,16 +123,15 @@ def second_inputs(parameters: Parameters, u: FloatArray) -> FloatArray:
 
 def basis_responses(parameters: Parameters, x: FloatArray) -> FloatArray:
     """(K + 3, N): the output's part of each coefficient of f, for x (M, N)."""
+    A2, rows = _monic(parameters.a2), np.arange(x.shape[1])
     responses = np.zeros((len(parameters.f.coefficients), x.shape[1]))
-    rows = np.arange(x.shape[1])
     for x_j, b2 in zip(x, parameters.b2, strict=True):
-        index, values, _ = parameters.f.weights(x_j)
-        for delay, b in enumerate(b2.tolist()):
-            late = rows[delay:]
-            for r in range(4):
-                responses[index[: len(late)] + r, late] += b * values[: len(late), r]
-    filtered: FloatArray = lfilter([1.0], _monic(parameters.a2), responses)
-    return filtered
+        index, weights = parameters.f.weights(x_j)
+        basis = np.zeros_like(responses)
+        for r in range(4):
+            basis[index + r, rows] = weights[r]
+        responses += lfilter(b2, A2, basis)
+    return responses
 
 
 def _residual(trials: tuple[Trial, ...], parameters: Parameters) -> FloatArray:

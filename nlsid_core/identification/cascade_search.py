@@ -57,10 +57,10 @@ def with_intervals(parameters: Parameters, trials: tuple[Trial, ...], intervals:
     )
     f = Spline(low, spacing, np.zeros(intervals + 3))
     x = np.linspace(f.low, f.high, FINE * intervals)
-    index, values, _ = f.weights(x)
+    index, weights = f.weights(x)
     basis = np.zeros((len(x), intervals + 3))
     for r in range(4):
-        basis[np.arange(len(x)), index + r] += values[:, r]
+        basis[np.arange(len(x)), index + r] = weights[r]
     coefficients = np.linalg.lstsq(basis, parameters.f(x), rcond=None)[0]
     return replace(parameters, f=replace(f, coefficients=coefficients))
 

@@ -8,6 +8,7 @@ Source: de Boor, "A Practical Guide to Splines", chapters IX and X.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,34 +55,42 @@ class Spline:
         """The last knot."""
         return self.low + self.intervals * self.spacing
 
-    def weights(self, x: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-        """First coefficient index (N,), weights of values and of slopes (N, 4) at x (N,).
-
-        f(x) = Σ_r values[:, r] coefficients[index + r], the same for f'.
-        """
-        position = (x - self.low) / self.spacing
-        index = np.clip(np.floor(position), 0, self.intervals - 1).astype(np.intp)
-        s = np.clip(position - index, 0.0, 1.0)
-        beyond = (position - index - s)[:, None]
-        powers = np.stack([np.ones_like(s), s, s**2, s**3], axis=1)
-        rates = np.stack([np.zeros_like(s), np.ones_like(s), 2.0 * s, 3.0 * s**2], axis=1)
-        slopes = rates @ (B_SPLINES.T / 6.0)
-        values = powers @ (B_SPLINES.T / 6.0) + beyond * slopes
-        return index, values, slopes / self.spacing
+    def weights(self, x: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """First coefficient index (N,) and weights (4, N): f(x) = Σ_r weights[r] c[index + r]."""
+        index, s, beyond = self._position(x)
+        basis = B_SPLINES / 6.0
+        return index, basis @ np.stack(
+            [np.ones_like(s), s + beyond, s * (s + 2.0 * beyond), s * s * (s + 3.0 * beyond)]
+        )
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """f(x), the shape of x."""
-        index, values, _ = self.weights(np.ravel(x))
-        return self._combined(index, values).reshape(np.shape(x))
+        index, s, beyond = self._position(np.ravel(x))
+        c0, c1, c2, c3 = self._powers[:, index]
+        slope = (3.0 * c3 * s + 2.0 * c2) * s + c1
+        values = ((c3 * s + c2) * s + c1) * s + c0 + beyond * slope
+        return np.asarray(values.reshape(np.shape(x)))
 
     def slope(self, x: FloatArray) -> FloatArray:
         """f'(x), the shape of x."""
-        index, _, slopes = self.weights(np.ravel(x))
-        return self._combined(index, slopes).reshape(np.shape(x))
+        index, s, _ = self._position(np.ravel(x))
+        _, c1, c2, c3 = self._powers[:, index]
+        slopes = ((3.0 * c3 * s + 2.0 * c2) * s + c1) / self.spacing
+        return np.asarray(slopes.reshape(np.shape(x)))
 
-    def _combined(self, index: NDArray[np.intp], weights: FloatArray) -> FloatArray:
-        picked = self.coefficients[index[:, None] + np.arange(4)]
-        return np.asarray((weights * picked).sum(axis=1))
+    @cached_property
+    def _powers(self) -> FloatArray:
+        """(4, K): coefficients of 1, s, s², s³ on each interval."""
+        windows = np.lib.stride_tricks.sliding_window_view(self.coefficients, 4)
+        return np.asarray((windows @ (B_SPLINES / 6.0)).T)
+
+    def _position(self, x: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+        """Interval, position s in [0, 1] in it, and how far beyond the knots, in spacings."""
+        position = (x - self.low) / self.spacing
+        index = np.clip(np.floor(position), 0, self.intervals - 1)
+        position -= index
+        s = np.clip(position, 0.0, 1.0)
+        return index.astype(np.intp), s, position - s
 
     def document(self) -> Json:
         """The JSON form."""
