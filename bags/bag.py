@@ -1,26 +1,25 @@
-"""An open bag: its topics, its metadata, and its messages in log order.
+"""An open bag: its topics, its metadata, and its messages in log order or in batches.
 
-Bags are untrusted. Whatever the libraries below say about a damaged one leaves here as a BagError
-that names the bag.
+Bags are untrusted. Whatever is wrong with one leaves here as a BagError that names the bag.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-from mcap.reader import SeekingReader
-from rosbags.interfaces import Connection, ConnectionExtRosbag2
-from rosbags.rosbag2 import Reader
 from rosbags.typesys.store import Typestore
 
-from bags.message_types import types_in_bag
+from bags.batch import Batch
+from bags.folders import COMPRESSED, bag_files
+from bags.mcap_file import MAGIC
+from bags.message_types import are_same, types_in_bag
+from bags.names import did_you_mean, listed
+from bags.storage import Channel, McapStorage, RosbagsStorage, Storage
 from bags.writer import CUSTOM_DATA
 from nlsid_core.errors import BagError
 
-MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-DATA_FILES: Final = (".mcap", ".db3", ".zstd")  # .zstd: a file rosbag2 compressed whole
+RECOVER: Final = "`nlsid bag recover`"
 
 
 class Message(NamedTuple):
@@ -30,149 +29,139 @@ class Message(NamedTuple):
     msgtype: str
     log_time_ns: int
     data: bytes
+    publish_time_ns: int = 0
 
 
 class Bag:
-    """A bag open for reading: a rosbag2 folder or a single .mcap file. Use as a context manager.
+    """A bag open for reading. Use as a context manager.
 
-    Raises BagError if there is no such bag, or if it is unfinished, damaged or not a bag.
+    A bag is a rosbag2 folder (MCAP or sqlite3, split or not), a single .mcap, or a ROS 1 .bag.
+    Raises BagError if there is no such bag, if it is damaged or not a bag, or if it is unfinished.
+    With `unfinished=True` the last is no error: the messages there are can be read, and `ending`
+    says why there may be more.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, *, unfinished: bool = False) -> None:
         self.path = Path(path)
-        self.files = _data_files(self.path)
+        self._described = bag_files(self.path)
+        self.files: tuple[Path, ...] = self._described.files
+        self.ending: str | None = None
         for file in self.files:
-            _check_ends(file)
-        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
-            raise BagError(
-                f"{self.path} has no metadata.yaml: the recording was not closed; "
-                f"read {self.files[0].name} itself, or `ros2 bag reindex` the folder"
-            )
-        with reading(self.path):
-            self._reader = Reader(self.path)
-            self._reader.open()
-        self._connections: dict[str, Connection] = {}
-        self._types: dict[str, Typestore] = {}
+            _check_start(file)
+        if not self._described.finished:
+            self.ending = "it has no metadata.yaml: the recording was not closed"
+        if self._described.storage == "mcap" and not self._described.compressed:
+            self._storage: Storage = McapStorage(self.files, CUSTOM_DATA)
+        else:
+            whole = self._described.compressed
+            self._storage = RosbagsStorage([self.path] if whole else self.files)
+        self.ending = self._storage.ending or self.ending
+        if self.ending is not None and not unfinished:
+            self.close()
+            raise BagError(self._unfinished())
+
+    def close(self) -> None:
+        """Close the bag's files."""
+        self._storage.close()
 
     def __enter__(self) -> "Bag":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._reader.close()
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
+    def channels(self) -> Sequence[Channel]:
+        """The recorded streams; a topic has one, or several in a split bag."""
+        return self._storage.channels
+
+    @cached_property
     def topics(self) -> dict[str, str]:
         """Topic -> message type, in the order of recording; several types are joined by ' and '."""
         types: dict[str, list[str]] = {}
-        for connection in self._reader.connections:
-            known = types.setdefault(connection.topic, [])
-            if connection.msgtype not in known:
-                known.append(connection.msgtype)
+        for channel in self.channels:
+            known = types.setdefault(channel.topic, [])
+            if channel.msgtype not in known:
+                known.append(channel.msgtype)
         return {topic: " and ".join(names) for topic, names in types.items()}
 
     @property
     def custom(self) -> dict[str, str]:
         """The bag's own metadata: `custom_data` of metadata.yaml or of the MCAP file."""
-        if self.path.is_dir():
-            storage: Any = self._reader.storage
-            found = storage.metadata.custom or {}
-        else:
-            found = {}
-            with reading(self.path), self.path.open("rb") as stream:
-                for record in SeekingReader(stream).iter_metadata():
-                    if record.name == CUSTOM_DATA:
-                        found.update(record.metadata)
-        if not isinstance(found, dict):
-            raise BagError(f"{self.path}: custom_data in metadata.yaml is not a mapping")
-        return {str(key): str(value) for key, value in found.items()}
+        return dict(self._described.custom if self.path.is_dir() else self._storage.custom)
 
     def types_on(self, topic: str) -> tuple[str, Typestore]:
         """The message type on `topic`, and the types it is made of.
 
         Raises BagError if the topic does not exist, holds several types or is not CDR.
         """
-        found = [c for c in self._reader.connections if c.topic == topic]
+        found = [c for c in self.channels if c.topic == topic]
         if not found:
-            there = ", ".join(f"{name} ({kind})" for name, kind in self.topics.items())
-            raise BagError(f"{self.path} has no topic {topic}; it has: {there or 'none'}")
+            there = listed(f"{name} ({kind})" for name, kind in self.topics.items())
+            near = did_you_mean(topic, self.topics)
+            raise BagError(f"{self.path} has no topic {topic}; it has: {there}{near}")
         if len({c.msgtype for c in found}) > 1:
             raise BagError(
                 f"{self.path}: {topic} holds messages of {self.topics[topic]}; "
                 "a signal needs one type on its topic"
             )
-        connection = found[0]
-        extension = connection.ext
-        if isinstance(extension, ConnectionExtRosbag2) and extension.serialization_format != "cdr":
-            raise BagError(
-                f"{self.path}: {topic} is serialised as '{extension.serialization_format}', "
-                "only 'cdr' can be read"
-            )
-        with reading(self.path):
-            return connection.msgtype, types_in_bag(connection.msgtype, connection.msgdef)
+        stated = self._described.encodings.get(topic, "cdr")
+        for encoding in (*(channel.encoding for channel in found), stated):
+            if encoding != "cdr":
+                raise BagError(
+                    f"{self.path}: {topic} is serialised as '{encoding}', only 'cdr' can be read"
+                )
+        try:
+            types = [types_in_bag(channel.msgtype, channel.definition) for channel in found]
+        except BagError as error:
+            raise BagError(f"{self.path}: {topic}: {error}") from error
+        if not all(are_same(types[0], other) for other in types):
+            raise BagError(f"{self.path}: {topic} has parts with different definitions of its type")
+        return found[0].msgtype, types[0]
 
     def count(self, topic: str) -> int:
-        """How many messages the bag's index lists on `topic`."""
-        return sum(c.msgcount for c in self._reader.connections if c.topic == topic)
+        """How many messages the bag says it has on `topic`."""
+        if self._described.counts is not None and self.ending is None:
+            return self._described.counts.get(topic, 0)
+        return sum(channel.count for channel in self.channels if channel.topic == topic)
+
+    def batches(self, topics: Sequence[str] | None = None) -> Iterator[tuple[Channel, Batch]]:
+        """The messages on `topics` (None: on all), many at once, in the order of the files.
+
+        Memory: one batch. Raises BagError where the bag is damaged.
+        """
+        for key, batch in self._storage.batches(self._keys(topics)):
+            yield self.channels[key], batch
 
     def messages(self, topics: Sequence[str] | None = None) -> Iterator[Message]:
         """The messages on `topics` (None: on all) by log time; equal log times as recorded."""
-        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
-        with reading(self.path):
-            for connection, log_time_ns, data in self._reader.messages(wanted):
-                if log_time_ns >= 2**63:
-                    raise BagError(f"a message on {connection.topic} has log time {log_time_ns} ns")
-                yield Message(connection.topic, connection.msgtype, log_time_ns, bytes(data))
+        for raw in self._storage.messages(self._keys(topics)):
+            channel = self.channels[raw.key]
+            yield Message(channel.topic, channel.msgtype, raw.log_ns, raw.data, raw.publish_ns)
+
+    def _keys(self, topics: Sequence[str] | None) -> list[int]:
+        wanted = None if topics is None else set(topics)
+        return [c.key for c in self.channels if wanted is None or c.topic in wanted]
+
+    def _unfinished(self) -> str:
+        if self.path.is_dir() and self._storage.ending is None:
+            return (
+                f"{self.path} has no metadata.yaml: the recording was not closed; "
+                f"read {self.files[0].name} itself, or make a whole bag of it with {RECOVER}"
+            )
+        bytes_there = sum(file.stat().st_size for file in self.files)
+        return (
+            f"{self.path} is truncated or unfinished: of {bytes_there} bytes, {self.ending}; "
+            f"copy it again, or recover its complete chunks with {RECOVER}"
+        )
 
 
-@contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Turn what rosbags and mcap raise on damaged input into a BagError that names the bag.
-
-    They raise nearly anything there (struct.error, KeyError, TypeError, decompression errors), so
-    every Exception is caught, but only around calls into them.
-    """
-    try:
-        yield
-    except OSError:
-        raise
-    except BagError as error:
-        raise BagError(f"{path}: {error}") from error
-    except Exception as error:
-        raise BagError(
-            f"{path} is damaged or not a bag: {type(error).__name__}: {str(error)[:200]}"
-        ) from error
-
-
-def _data_files(path: Path) -> list[Path]:
-    if path.is_file():
-        return [path]
-    if not path.is_dir():
-        raise BagError(f"there is no bag {path}; name a rosbag2 folder or an .mcap file")
-    files = sorted(p for p in path.iterdir() if p.suffix in DATA_FILES and p.is_file())
-    if not files:
-        raise BagError(f"{path} is not a bag: it holds no {' or '.join(DATA_FILES)} file")
-    return files
-
-
-def _check_ends(file: Path) -> None:
-    """BagError if an MCAP file does not begin and end as one."""
-    if file.suffix in (".db3", ".zstd"):
+def _check_start(file: Path) -> None:
+    """BagError if an MCAP file does not begin as one."""
+    if file.suffix in (".db3", ".bag", COMPRESSED):
         return
     with file.open("rb") as stream:
-        start = stream.read(len(MCAP_MAGIC))
-        size = stream.seek(0, 2)
-        stream.seek(max(0, size - len(MCAP_MAGIC)))
-        end = stream.read()
-    if start != MCAP_MAGIC:
-        what = "is empty" if not size else f"starts with {start.hex(' ')}"
+        start = stream.read(len(MAGIC))
+    if start != MAGIC:
+        what = f"starts with {start.hex(' ')}" if start else "is empty"
         raise BagError(f"{file} is not an MCAP file: it {what}")
-    if end != MCAP_MAGIC or size < 2 * len(MCAP_MAGIC):
-        raise BagError(
-            f"{file} is truncated or unfinished: after {size} bytes it stops without the end of an "
-            "MCAP file; copy it again, or recover its complete chunks (`mcap recover`)"
-        )

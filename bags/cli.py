@@ -1,25 +1,27 @@
-"""The command line `nlsid`: identify, funnel, check, monitor, demo."""
+"""The command line `nlsid`: identify, funnel, check, monitor, demo; `bag` for recordings."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.markup import escape
 
 from bags import documents, show
+from bags.bag_cli import bag_app
 from bags.config import load_config
 from bags.demo import run_demo
 from bags.folders import expand_bags
 from bags.problems import FunnelProblem
+from bags.progress import progress_bar
 from bags.replay import replay_bag
 from bags.report import report_available, write_margins
-from bags.steps import design_funnel_files, identify_bags
+from bags.steps import compare_bags, design_funnel_files, identify_bags
+from bags.tracking_cli import app as track_app
+from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
-from nlsid_core.errors import CertificateRejected, NlsidError
+from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
 from nlsid_core.monitor import Status
 
 app = typer.Typer(
@@ -29,6 +31,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+app.add_typer(track_app, name="track")
+app.add_typer(bag_app)
 out = Console()
 err = Console(stderr=True)
 
@@ -36,17 +40,17 @@ BagsArgument = Annotated[
     list[Path], typer.Argument(help="Bags: rosbag2 folders, .mcap files, or folders of bags.")
 ]
 ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
-OutOption = Annotated[Path, typer.Option(help="Folder for the results; made if it is not there.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
+]
 
 
 @app.command()
-def identify(bags: BagsArgument, config: ConfigOption, out_dir: Annotated[
-    Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
-]) -> None:  # fmt: skip
+def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
     settings = load_config(config)
     folders = expand_bags(bags)
-    with _progress("identifying") as progress:
+    with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)
     out.print(show.methods_table(result.fit, result.test))
     for file in result.files:
@@ -56,10 +60,26 @@ def identify(bags: BagsArgument, config: ConfigOption, out_dir: Annotated[
 
 
 @app.command()
+def compare(
+    bags: BagsArgument,
+    config: ConfigOption,
+    lags: Annotated[
+        list[int] | None,
+        typer.Option(help="Numbers of lags to try, repeatable; default the configuration's."),
+    ] = None,
+) -> None:
+    """Score every method on the same test bags: simulation, prediction, residual tests, proof."""
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    with progress_bar("comparing") as progress:
+        tried = lags or [settings.identification.lags]
+        compared = compare_bags(folders, settings, tried, progress=progress)
+    out.print(show.comparison_table(compared))
+
+
+@app.command()
 def funnel(
-    out_dir: Annotated[
-        Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
-    ],
+    out_dir: OutOption,
     model: Annotated[
         Path | None, typer.Option(help="The model.json that `nlsid identify` wrote.")
     ] = None,
@@ -81,7 +101,7 @@ def funnel(
     if model is None or config is None:
         raise typer.BadParameter("give --model and --config, or --problem")
     settings = load_config(config)
-    with _progress("designing") as progress:
+    with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, out_dir)
         progress("done", 1.0)
@@ -93,12 +113,19 @@ def funnel(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    mode: Annotated[
+        Mode,
+        typer.Option(help="exact: integers; rigorous: floating point with proved rounding bounds."),
+    ] = "exact",
 ) -> None:
-    """Decide proofs exactly, without a solver: PROVED (status 0) or REJECTED (status 1)."""
+    """Decide proofs without a solver: PROVED (status 0), REJECTED or UNDECIDED (status 1)."""
     rejected = False
     for path in proofs:
         try:
-            verdict = check_proof(path)
+            verdict = check_proof(path, mode=mode)
+        except Undecided as doubt:
+            rejected = True
+            typer.echo(f"UNDECIDED {path.name}: {doubt}")
         except (CertificateRejected, OSError) as refusal:
             rejected = True
             typer.echo(f"REJECTED {path.name}: {refusal}")
@@ -138,7 +165,7 @@ def monitor(
     if settings is not None:
         folders = [f for f in folders if f.name in settings.split.test] or folders
     nominal = show.nominal_of(settings)
-    with _progress("replaying") as progress:
+    with progress_bar("replaying") as progress:
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
@@ -169,7 +196,7 @@ def demo(
 
 
 def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
-    with _progress("designing") as progress:
+    with progress_bar("designing") as progress:
         design = FunnelProblem.load(problem).design(progress)
     for path in design.save(out_dir):
         out.print(f"wrote {path}", soft_wrap=True)
@@ -182,20 +209,12 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
     out.print(str(design), soft_wrap=True)
 
 
-@contextmanager
-def _progress(task: str) -> Iterator[Callable[[str, float], None]]:
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True) as bar:
-        identifier = bar.add_task(task, total=1.0)
-        yield lambda what, fraction: bar.update(identifier, description=what, completed=fraction)
-
-
 def main() -> None:
     """Entry point: errors made for people are shown as one message and end with status 1."""
     try:
         app()
     except NlsidError as error:
-        err.print(f"[red]error:[/red] {error}", soft_wrap=True, markup=True, highlight=False)
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
         sys.exit(1)
     except OSError as error:
         err.print(f"error: {error}", soft_wrap=True, markup=False, highlight=False)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from nlsid_core.errors import DataError
+from nlsid_core.identification import LinearClass, ModelClass, StateAffineClass
 from nlsid_core.models import Signal
 from nlsid_core.monitor import Nominal
 
@@ -22,6 +23,9 @@ class _Section(BaseModel):
     """A part of the file: unknown keys are errors, values are not coerced across types."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+Section = TypeVar("Section", bound=_Section)
 
 
 class SignalConfig(_Section):
@@ -57,10 +61,34 @@ class SplitConfig(_Section):
 
 
 class IdentificationConfig(_Section):
-    """lags n of the difference equation; the most iterates of the robust simulation error."""
+    """lags n of the difference equation; the most iterates of the robust simulation error.
+
+    model: `linear`, or `state_affine` with polynomial degrees in the window of inputs (see
+    `StateAffineClass`); input_range: to which that model clips its input (default: the data's).
+    method: which candidate is kept.
+    """
 
     lags: int = Field(ge=1, le=100)
     iterations: int = Field(default=40, ge=1, le=1000)
+    model: Literal["linear", "state_affine"] = "linear"
+    method: Literal["least_squares", "rie", "rse_first", "rse", "rse_certified", "sem"] = "rse"
+    leading_degree: int = Field(default=0, ge=0, le=5)
+    lagged_degree: int = Field(default=0, ge=0, le=5)
+    right_degree: int = Field(default=1, ge=0, le=5)
+    input_range: Corner | None = None
+
+    @property
+    def model_class(self) -> ModelClass:
+        """The same as the core's noun."""
+        if self.model == "linear":
+            return LinearClass(self.lags)
+        return StateAffineClass(
+            self.lags,
+            leading_degree=self.leading_degree,
+            lagged_degree=self.lagged_degree,
+            right_degree=self.right_degree,
+            u_range=None if self.input_range is None else (self.input_range,),
+        )
 
 
 class LqrConfig(_Section):
@@ -114,6 +142,11 @@ def load_config(path: Path | str) -> Config:
 
     OS errors pass through.
     """
+    return read_yaml(path, Config)
+
+
+def read_yaml(path: Path | str, kind: type[Section]) -> Section:
+    """A YAML file as a configuration of `kind`; see `load_config`."""
     path = Path(path)
     if path.stat().st_size > MAX_CONFIG_BYTES:
         raise DataError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")
@@ -124,7 +157,7 @@ def load_config(path: Path | str) -> Config:
     if not isinstance(content, dict):
         raise DataError(f"{path}: expected sections (robot, signals, grid, ...), found none")
     try:
-        return Config.model_validate(content)
+        return kind.model_validate(content)
     except ValidationError as error:
         problems = [
             f"  {_where(problem['loc'])}: {problem['msg']} (found {problem['input']!r:.60})"

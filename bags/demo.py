@@ -6,14 +6,15 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import track
 
 from bags import documents, samples, show
-from bags.config import load_config
+from bags.config import Config, load_config
 from bags.faults import FAULTS, write_faulty_copy
+from bags.progress import progress_bar
 from bags.replay import Replay, replay_bag
 from bags.report import report_available, write_margins
 from bags.shipped import config_file
@@ -29,88 +30,116 @@ SABOTAGED_PLOT = "sabotaged.png"
 def run_demo(out: Path, console: Console) -> bool:
     """Run every step into `out`, saying what happens; True if all came out as it should."""
     started = time.perf_counter()
-    config_path = config_file("f1tenth.yaml")
-    config = load_config(config_path)
-    bags = samples.f1tenth()
-    test = [bag for bag in bags if bag.name in config.split.test]
-
-    console.rule("1  identify", align="left")
-    console.print(
-        f"$ nlsid identify {bags[0].parent} --config {config_path} --out {out}",
-        soft_wrap=True,
-        highlight=False,
-    )
-    with console.status("identifying") as status:
-        result = identify_bags(bags, config, out, progress=lambda what, _: status.update(what))
-    console.print(show.methods_table(result.fit, result.test))
-    if not report_available():
-        console.print("no report and no pictures: install matplotlib (pip install 'nlsid[report]')")
-
-    console.rule("2  funnel", align="left")
-    console.print(
-        f"$ nlsid funnel --model {out / documents.MODEL} --config {config_path} --out {out}",
-        soft_wrap=True,
-        highlight=False,
-    )
-    console.print(show.funnel_table(design_funnel_files(out / documents.MODEL, config, out)))
-
-    console.rule("3  check", align="left")
-    for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
-        console.print(f"$ nlsid check {out / name}", soft_wrap=True, highlight=False)
-        console.print(str(check(out / name)), soft_wrap=True)
-
-    console.rule("4  monitor", align="left")
-    console.print(
-        f"$ nlsid monitor --funnel {out / documents.FUNNEL} --replay <the 8 test trials>",
-        soft_wrap=True,
-        highlight=False,
-    )
-    proved = documents.load_proved_funnel(out / documents.FUNNEL)
-    nominal = config.monitor.nominal_source
-    replays = [replay_bag(proved, bag, nominal=nominal) for bag in test]
-    console.print(show.replay_table(replays))
-    console.print("The same trials with a broken speed sensor:")
-    signal = config.signals.response.path
-    sabotaged: list[Replay] = []
-    with tempfile.TemporaryDirectory() as folder:
-        pairs = [(bag, fault) for bag in test for fault in FAULTS]
-        for bag, fault in track(pairs, description="sabotaging", console=console, transient=True):
-            copy = Path(folder) / f"{bag.name}, {fault}"
-            write_faulty_copy(bag, copy, signal, FAULTS[fault])
-            sabotaged.append(replay_bag(proved, copy, nominal=nominal))
-    console.print(show.replay_table(sabotaged))
-    if report_available():
-        write_margins(out / documents.MARGIN_PLOT, replays)
-        write_margins(out / SABOTAGED_PLOT, sabotaged)
-
-    inside = sum(r.verdict == Status.INSIDE.value for r in replays)
-    caught = sum(r.first_bad is not None for r in sabotaged)
-    console.print(f"{inside} of {len(replays)} test trials inside, "
-                  f"{caught} of {len(sabotaged)} sabotaged trials caught")  # fmt: skip
-    live = _live(out, console)
-
-    console.rule("done", align="left")
-    if report_available():
-        console.print(f"report    {out / documents.REPORT}", soft_wrap=True)
-        console.print(f"pictures  {out / documents.MARGIN_PLOT}, {out / SABOTAGED_PLOT}",
-                      soft_wrap=True)  # fmt: skip
-    console.print(f"proofs    {out / documents.MODEL_PROOF}, {out / documents.FUNNEL_PROOF}",
-                  soft_wrap=True)  # fmt: skip
+    demo = _Demo(out, console)
+    demo.identify()
+    demo.funnel()
+    demo.check()
+    monitored = demo.monitor()
+    live = demo.live()
+    demo.where_to_look()
     console.print(f"{time.perf_counter() - started:.0f} s in all")
-    return inside == len(replays) and caught == len(sabotaged) and live
+    return monitored and live
 
 
-def _live(out: Path, console: Console) -> bool:
-    """The live part in processes of its own; True where ROS is not there to run it."""
-    console.rule("5  live, over ROS 2", align="left")
-    if importlib.util.find_spec("rclpy") is None:
-        console.print("skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
-        return True
-    recording = out / "live"
-    shutil.rmtree(recording, ignore_errors=True)
-    trial = next(bag for bag in samples.f1tenth() if bag.name == LIVE_TRIAL)
-    command = [
-        sys.executable, "-m", LIVE_MODULE,
-        "--funnel", str(out / documents.FUNNEL), "--bag", str(trial), "--out", str(recording),
-    ]  # fmt: skip
-    return subprocess.run(command, check=False).returncode == 0
+class _Demo:
+    """The steps, each under its own heading with the command that does the same."""
+
+    def __init__(self, out: Path, console: Console) -> None:
+        self.out, self.console = out, console
+        self.config_path = config_file("f1tenth.yaml")
+        self.config: Config = load_config(self.config_path)
+        self.bags = samples.f1tenth()
+
+    def identify(self) -> None:
+        self._heading("1  identify a model from the recordings")
+        self._command(
+            f"identify {self.bags[0].parent} --config {self.config_path} --out {self.out}"
+        )
+        with progress_bar("identifying") as progress:
+            result = identify_bags(self.bags, self.config, self.out, progress=progress)
+        self.console.print(show.methods_table(result.fit, result.test))
+        if not report_available():
+            self._say("no report and no pictures: install matplotlib (pip install 'nlsid[report]')")
+
+    def funnel(self) -> None:
+        self._heading("2  design a policy and a tube around its motion")
+        model = self.out / documents.MODEL
+        self._command(f"funnel --model {model} --config {self.config_path} --out {self.out}")
+        with progress_bar("designing policy, observer and tube"):
+            design = design_funnel_files(model, self.config, self.out)
+        self.console.print(show.funnel_table(design))
+
+    def check(self) -> None:
+        self._heading("3  check both proofs, exactly and without a solver")
+        for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
+            self._command(f"check {self.out / name}")
+            self._say(str(check(self.out / name)))
+
+    def monitor(self) -> bool:
+        self._heading("4  hold unseen recordings against the tube")
+        test = [bag for bag in self.bags if bag.name in self.config.split.test]
+        self._command(f"monitor --funnel {self.out / documents.FUNNEL} --replay BAG... (8 trials)")
+        with progress_bar("replaying") as progress, tempfile.TemporaryDirectory() as folder:
+            replays = self._replay(test)
+            sabotaged: list[Replay] = []
+            pairs = [(bag, fault) for bag in test for fault in FAULTS]
+            for done, (bag, fault) in enumerate(pairs):
+                copy = Path(folder) / f"{bag.name}, {fault}"
+                progress(f"sabotaging {copy.name}", done / len(pairs))
+                write_faulty_copy(bag, copy, self.config.signals.response.path, FAULTS[fault])
+                sabotaged += self._replay([copy])
+            progress("drawing", 1.0)
+            if report_available():
+                write_margins(self.out / documents.MARGIN_PLOT, replays)
+                write_margins(self.out / SABOTAGED_PLOT, sabotaged)
+        self.console.print(show.replay_table(replays))
+        self.console.print(show.caught_table(sabotaged))
+        inside = sum(r.verdict == Status.INSIDE.value for r in replays)
+        caught = sum(r.first_bad is not None for r in sabotaged)
+        self._say(
+            f"{inside} of {len(replays)} test trials inside, "
+            f"{caught} of {len(sabotaged)} sabotaged trials caught"
+        )
+        return inside == len(replays) and caught == len(sabotaged)
+
+    def live(self) -> bool:
+        """The live part in processes of its own; True where ROS is not there to run it."""
+        self._heading("5  the same live, over ROS 2")
+        if importlib.util.find_spec("rclpy") is None:
+            self._say("skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
+            return True
+        self._say("recorder, publisher, monitor and player as processes; two trials in real time")
+        recording = self.out / "live"
+        shutil.rmtree(recording, ignore_errors=True)
+        trial = next(bag for bag in self.bags if bag.name == LIVE_TRIAL)
+        command = [
+            *(sys.executable, "-m", LIVE_MODULE, "--funnel", str(self.out / documents.FUNNEL)),
+            *("--bag", str(trial), "--out", str(recording)),
+        ]
+        with progress_bar("playing"):
+            done = subprocess.run(command, check=False, capture_output=True, text=True)
+        self._say((done.stdout + done.stderr).strip())
+        return done.returncode == 0
+
+    def where_to_look(self) -> None:
+        self._heading("where to look")
+        if report_available():
+            self._say(f"report    {self.out / documents.REPORT}")
+            self._say(f"pictures  {self.out / documents.MARGIN_PLOT}, {self.out / SABOTAGED_PLOT}")
+        self._say(f"proofs    {self.out / documents.MODEL_PROOF}")
+        self._say(f"          {self.out / documents.FUNNEL_PROOF}")
+
+    def _replay(self, bags: Sequence[Path]) -> list[Replay]:
+        proved = documents.load_proved_funnel(self.out / documents.FUNNEL)
+        nominal = self.config.monitor.nominal_source
+        return [replay_bag(proved, bag, nominal=nominal) for bag in bags]
+
+    def _heading(self, text: str) -> None:
+        self.console.print()
+        self.console.rule(text, align="left")
+
+    def _command(self, text: str) -> None:
+        self.console.print(f"$ nlsid {text}", soft_wrap=True, highlight=False, markup=False)
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, soft_wrap=True, highlight=False, markup=False)

@@ -5,14 +5,19 @@ a sample is the latest command stamped at or before it (zero-order hold).
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final, overload
 
 import numpy as np
 
-from bags.reader import Samples, bag_digest, bag_metadata, read_signals, stamp_text
-from nlsid_core._types import FloatArray, IntArray
+from bags.reader import Samples, bag_origin, read_signals, stamp_text
+from bags.timing import segments
+from nlsid_core._json import canonical
+from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.errors import DataError
 from nlsid_core.trajectory import Dataset, Trajectory
 
@@ -20,6 +25,7 @@ JITTER_TOLERANCE: Final = (
     0.05  # of the period: a loop's usual scatter; interpolating would filter it
 )
 DEFAULT_MAX_GAP: Final = 1.5  # periods: no sample may be missing
+MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
 log = logging.getLogger(__name__)
@@ -47,6 +53,7 @@ def to_trajectory(
     name: str = "",
     group: str = "",
     digest: str = "",
+    provenance: str = "",
 ) -> Trajectory:
     """One trajectory on the grid of the first response, t = 0 at its first sample.
 
@@ -100,9 +107,14 @@ def to_trajectory(
         u=np.column_stack([_hold(s, sampled_at, gap_ns, label) for s in excitations]),
         y_names=tuple(samples.path for samples in responses),
         u_names=tuple(samples.path for samples in excitations),
+        y_units=tuple(samples.unit for samples in responses),
+        u_units=tuple(samples.unit for samples in excitations),
+        y_paths=tuple(samples.path for samples in responses),
+        u_paths=tuple(samples.path for samples in excitations),
         name=name,
         group=group,
         digest=digest,
+        provenance=provenance,
     )
 
 
@@ -114,36 +126,111 @@ def read_dataset(
     period: float | None = None,
     max_gap: float | None = None,
     tolerance: float = JITTER_TOLERANCE,
+    clock: str | None = None,
+    sort: bool = False,
+    drop_duplicates: bool = False,
+    split_gaps: bool = False,
+    unfinished: bool = False,
+    executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """The signals (`topic:field.path[index]`) of several bags, one trajectory a bag.
+    """The signals (see `bags.signals`, `bags.expressions`) of several bags, one trajectory a bag.
 
-    A trajectory has the bag's name and digest, and as group its custom datum `repeat_group`. For
-    the grid see `to_trajectory`. `progress(done, total)` is called after each bag. Raises BagError
-    and DataError as `read_signals`, `to_trajectory` and `Dataset` do.
+    A trajectory has the bag's name and digest, and as group its custom datum `repeat_group`. Its
+    provenance is the bag's digest, files and custom data, the signals and the options. For the grid
+    see `to_trajectory`, for clock, sort, drop_duplicates and unfinished `read_signals`.
+
+    split_gaps: a bag in which a response is missing for more than `max_gap` gives one trajectory
+    per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error. executor: reads
+    bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)` is
+    called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectory` and
+    `Dataset` do.
     """
     paths = [Path(bag) for bag in bags]
     names = [path.stem if path.is_file() else path.resolve().name for path in paths]
     if len(twice := {name for name in names if names.count(name) > 1}):
         raise DataError(f"two bags are called '{min(twice)}'; trials are told apart by name")
-    trajectories = []
-    for done, (path, name) in enumerate(zip(paths, names, strict=True), start=1):
-        signals = read_signals(path, [*responses, *excitations])
-        trajectories.append(
-            to_trajectory(
-                [signals[response] for response in responses],
-                [signals[excitation] for excitation in excitations],
-                period=period,
-                max_gap=max_gap,
-                tolerance=tolerance,
-                name=name,
-                group=bag_metadata(path).get(REPEAT_GROUP, ""),
-                digest=bag_digest(path),
-            )
-        )
+    options = {
+        "period": period,
+        "max_gap": max_gap,
+        "tolerance": tolerance,
+        "clock": clock,
+        "sort": sort,
+        "drop_duplicates": drop_duplicates,
+        "split_gaps": split_gaps,
+        "unfinished": unfinished,
+    }
+    signals = {"responses": list(responses), "excitations": list(excitations)}
+    read = partial(_read_trials, signals=signals, options=options)
+    trajectories: list[Trajectory] = []
+    found = (map if executor is None else executor.map)(read, paths, names)
+    for done, trials in enumerate(found, start=1):
+        trajectories += trials
         if progress is not None:
             progress(done, len(paths))
     return Dataset(tuple(trajectories))
+
+
+def _read_trials(
+    path: Path, name: str, *, signals: Mapping[str, list[str]], options: Json
+) -> list[Trajectory]:
+    """The trajectories of one bag."""
+    read = read_signals(
+        path,
+        [*signals["responses"], *signals["excitations"]],
+        clock=options["clock"],
+        sort=options["sort"],
+        drop_duplicates=options["drop_duplicates"],
+        unfinished=options["unfinished"],
+    )
+    origin = bag_origin(path, unfinished=options["unfinished"])
+    responses = [read[response] for response in signals["responses"]]
+    excitations = [read[excitation] for excitation in signals["excitations"]]
+    parts = [(responses, excitations)]
+    if options["split_gaps"]:
+        parts = list(_stretches(responses, excitations, options["max_gap"]))
+    provenance = canonical({"bag": origin, "signals": signals, "options": options}).decode()
+    return [
+        to_trajectory(
+            *part,
+            period=options["period"],
+            max_gap=options["max_gap"],
+            tolerance=options["tolerance"],
+            name=name if len(parts) == 1 else f"{name}.{k}",
+            group=origin["custom"].get(REPEAT_GROUP, ""),
+            digest=origin["digest"],
+            provenance=provenance,
+        )
+        for k, part in enumerate(parts, start=1)
+    ]
+
+
+def _stretches(
+    responses: Sequence[Samples], excitations: Sequence[Samples], max_gap: float | None
+) -> Iterator[tuple[list[Samples], list[Samples]]]:
+    """The signals cut where a response is missing; stretches of a few samples are left out."""
+    starts: list[int] = []
+    stops: list[int] = []
+    for samples in responses:
+        steps = np.diff(samples.stamp_ns)
+        gap = DEFAULT_MAX_GAP * np.median(steps) / 1e9 if max_gap is None else max_gap
+        runs = segments(samples.stamp_ns, gap)
+        starts += [int(samples.stamp_ns[first]) for first, _ in runs[1:]]
+        stops += [int(samples.stamp_ns[end - 1]) for _, end in runs[:-1]]
+    starts = [min(int(s.stamp_ns[0]) for s in responses), *sorted(starts)]
+    stops = [*sorted(stops), max(int(s.stamp_ns[-1]) for s in responses)]
+    for start, stop in zip(starts, stops, strict=True):
+        cut = [_between(samples, start, stop, held=False) for samples in responses]
+        if min(map(len, cut)) >= MIN_STRETCH:
+            yield cut, [_between(samples, start, stop, held=True) for samples in excitations]
+
+
+def _between(samples: Samples, start: int, stop: int, *, held: bool) -> Samples:
+    """The samples from start to stop; with `held`, also the one in force at the start."""
+    low = int(np.searchsorted(samples.stamp_ns, start, side="right" if held else "left"))
+    low = max(0, low - 1) if held else low
+    high = int(np.searchsorted(samples.stamp_ns, stop, side="right"))
+    return replace(samples, stamp_ns=samples.stamp_ns[low:high], values=samples.values[low:high])
 
 
 def require_excitation(dataset: Dataset) -> None:

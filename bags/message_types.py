@@ -6,7 +6,8 @@ A bag's own definition is used where it differs: the data were written with it.
 
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from typing import Final
 
@@ -25,7 +26,10 @@ from nlsid_core.errors import BagError
 
 HEADER: Final = "std_msgs/msg/Header"
 IDL_SEPARATOR: Final = "=" * 80 + "\n"
-MAX_FIXED_ARRAY: Final = 2**16  # rosbags writes a line of code per element; none in use is near it
+ROS1_DIFFERS: Final = (HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+MAX_FIXED_ARRAY: Final = 2**16  # numbers
+MAX_UNROLLED: Final = 1024  # strings or messages: rosbags writes lines of code for each of them
+MAX_ELEMENTS: Final = 2**16  # of a whole message, arrays in arrays multiplied out
 
 _TYPE_NAME: Final = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*){1,3}", re.ASCII)
 _FIELD_NAME: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -82,7 +86,22 @@ def definition(msgtype: str) -> tuple[str, str]:
     return types.generate_msgdef(msgtype, ros_version=2)[0], types.hash_rihs01(msgtype)
 
 
-@lru_cache(maxsize=64)
+def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinition:
+    """A ROS 1 definition as ROS 2 writes it: no `seq` in the header, `time` as a message.
+
+    Raises BagError if it cannot be used.
+    """
+    standard = standard_types().fielddefs
+    with _defining(msgtype):
+        parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
+        _refuse_what_code_cannot_be(parsed)
+        types = get_typestore(Stores.EMPTY)
+        types.register(parsed)
+        text, _ = types.generate_msgdef(msgtype, ros_version=2)
+    return MessageDefinition(MessageDefinitionFormat.MSG, text)
+
+
+@lru_cache(maxsize=256)
 def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     """The types a bag's messages of `msgtype` were written with.
 
@@ -93,23 +112,34 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     if embedded.format == MessageDefinitionFormat.NONE:
         fields_of(msgtype, standard)
         return standard
-    try:
-        parsed = _parse(msgtype, embedded)
+    with _defining(msgtype):
+        parsed = _completed(_parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
             for name, (_, fields) in parsed.items()
         ):
             return standard
-        _refuse_odd_names(parsed)
+        _refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(msgtype)
+    return types
+
+
+def are_same(first: Typestore, second: Typestore) -> bool:
+    """Whether two results of `types_in_bag` define the same, however their texts differ."""
+    return first is second or first.fielddefs == second.fielddefs
+
+
+@contextmanager
+def _defining(msgtype: str) -> Iterator[None]:
+    try:
+        yield
     except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
         raise BagError(
             f"the definition of '{msgtype}' in the bag cannot be used: {type(error).__name__}: "
             f"{str(error)[:200]}"
         ) from error
-    return types
 
 
 def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
@@ -124,8 +154,40 @@ def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
     return types
 
 
-def _refuse_odd_names(types: Typesdict) -> None:
-    """rosbags turns definitions into code, so from a bag only plain names may reach it."""
+def _completed(parsed: Typesdict) -> Typesdict:
+    """With the standard types that the definition uses and leaves out."""
+    standard = standard_types().fielddefs
+    todo, complete = list(parsed), dict(parsed)
+    while todo:
+        for _, description in complete[todo.pop()][1]:
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            name = str(description[1])
+            if description[0] == Nodetype.NAME and name not in complete and name in standard:
+                complete[name] = standard[name]
+                todo.append(name)
+    return complete
+
+
+def _elements(name: str, types: Typesdict, sizes: dict[str, int]) -> int:
+    """How many fields a message has, those of messages in it and in fixed arrays multiplied out."""
+    if name not in sizes:
+        total = 0
+        for _, description in types[name][1] if name in types else ():
+            times = int(str(description[1][1])) if description[0] == Nodetype.ARRAY else 1
+            if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            if description[0] == Nodetype.NAME:
+                total += times * _elements(str(description[1]), types, sizes)
+            total += 1
+        if total > MAX_ELEMENTS:
+            raise ValueError(f"'{name}' has more than {MAX_ELEMENTS} fields")
+        sizes[name] = total
+    return sizes[name]
+
+
+def _refuse_what_code_cannot_be(types: Typesdict) -> None:
+    """rosbags turns definitions into code: from a bag only plain names and sane sizes reach it."""
     for name, (constants, fields) in types.items():
         if not _TYPE_NAME.fullmatch(name):
             raise ValueError(f"{name!r} is not a type name")
@@ -134,9 +196,14 @@ def _refuse_odd_names(types: Typesdict) -> None:
                 raise ValueError(f"{field!r} is not a field name")
         for _, description in fields:
             if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-                length = description[1][1]
-                if not isinstance(length, int) or not 0 <= length <= MAX_FIXED_ARRAY:
-                    raise ValueError(f"an array of {length} elements")
-                description = description[1][0]
+                is_array, (element, length) = description[0] == Nodetype.ARRAY, description[1]
+                numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
+                most = MAX_FIXED_ARRAY if numbers else MAX_UNROLLED
+                if is_array and not (isinstance(length, int) and 0 <= length <= most):
+                    raise ValueError(f"an array of {length} elements; at most {most} are read")
+                description = element
             if description[0] == Nodetype.NAME and not _TYPE_NAME.fullmatch(str(description[1])):
                 raise ValueError(f"{description[1]!r} is not a type name")
+    sizes: dict[str, int] = {}
+    for name in types:
+        _elements(name, types, sizes)

@@ -9,13 +9,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from bags.replay import Replay
-from nlsid_core.identification import Candidate
+from nlsid_core.identification import AnyCandidate, Candidate, simulate_trial
+from nlsid_core.identification.prediction import one_step_residual
+from nlsid_core.identification.validation import NORMAL_99
+from nlsid_core.models import DifferenceEquation
 from nlsid_core.monitor import Reading, Status
 from nlsid_core.trajectory import Dataset, Trajectory
 
 INK, BLUE, ORANGE, RED, GREY = "#222222", "#1f6fb4", "#d9822b", "#c23b3b", "#9aa0a6"
 LINE = 1.2
-WHITENESS_99 = 2.576  # two-sided 99 % of a standard normal
 
 
 def svg(figure: Figure) -> str:
@@ -33,7 +35,7 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
-def simulations(chosen: Candidate, first: Candidate, test: Dataset) -> Figure:
+def simulations(chosen: AnyCandidate, first: AnyCandidate, test: Dataset) -> Figure:
     """Measured against simulated on every test trial, with the input that drove it."""
     figure, panels = _grid(len(test))
     for axes, trial in zip(panels, test, strict=False):
@@ -41,29 +43,29 @@ def simulations(chosen: Candidate, first: Candidate, test: Dataset) -> Figure:
         axes.step(t, trial.u[:, 0], where="post", color=GREY, lw=LINE, label=trial.u_names[0])
         axes.plot(t, trial.y[:, 0], color=INK, lw=LINE, label="measured")
         for candidate, color in ((first, ORANGE), (chosen, BLUE)):
-            simulated = candidate.model.simulate(trial.u[:, 0], trial.y[: len(candidate.model), 0])
-            axes.plot(t, simulated, color=color, lw=LINE, label=candidate.method)
+            simulated = simulate_trial(candidate.model, trial)
+            axes.plot(t, simulated[:, 0], color=color, lw=LINE, label=candidate.method)
         axes.set_title(trial.name, fontsize=9, loc="left")
     _label_outer(figure, panels, "time [s]", _axis_name(test.trajectories[0]))
     _shared_legend(figure, panels[0])
     return figure
 
 
-def residuals(chosen: Candidate, test: Dataset) -> Figure:
+def residuals(chosen: AnyCandidate, test: Dataset) -> Figure:
     """Simulation residuals over time, and the one-step residual's autocorrelation (99 % band)."""
     figure = Figure(figsize=(9.5, 3.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     n = len(chosen.model)
     correlations = []
     for trial in test:
-        simulated = chosen.model.simulate(trial.u[:, 0], trial.y[:n, 0])
-        left.plot(trial.t - trial.t[0], trial.y[:, 0] - simulated, lw=0.9, label=trial.name)
-        correlations.append(_autocorrelation(_one_step(chosen, trial), 20))
+        simulated = simulate_trial(chosen.model, trial)
+        left.plot(trial.t - trial.t[0], trial.y[:, 0] - simulated[:, 0], lw=0.9, label=trial.name)
+        correlations.append(_autocorrelation(one_step_residual(chosen.model, trial)[:, 0], 20))
     left.set_xlabel("time [s]")
     left.set_ylabel(f"measured - simulated [{test.trajectories[0].y_units[0]}]")
     left.legend(fontsize=7, ncols=2, frameon=False)
     rows = sum(len(trial) - n for trial in test)
-    band = WHITENESS_99 / np.sqrt(rows)
+    band = NORMAL_99 / np.sqrt(rows)
     right.axhspan(-band, band, color=GREY, alpha=0.3, lw=0)
     right.stem(
         np.arange(1, 21),
@@ -78,7 +80,7 @@ def residuals(chosen: Candidate, test: Dataset) -> Figure:
     return figure
 
 
-def poles(chosen: Candidate) -> Figure:
+def poles(chosen: Candidate[DifferenceEquation]) -> Figure:
     """The model's poles in the unit circle, and the circle of the certified rate."""
     figure = Figure(figsize=(3.6, 3.6), layout="constrained")
     axes = figure.subplots()
@@ -124,11 +126,12 @@ def margins(replays: Sequence[Replay]) -> Figure:
         lower.set_visible(True)
         _tube(upper, replay)
         _margin(lower, replay)
-        upper.sharey(panels[0, 0])
         lower.set_xlabel("time [s]", fontsize=8)
         if index % columns == 0:
             upper.set_ylabel(f"{replay.axis} [{replay.unit}]", fontsize=8)
             lower.set_ylabel("margin, budget spent", fontsize=8)
+    for kind in (0, 1):
+        _same_limits([axes for axes in panels[kind::2].flat if axes.get_visible()])
     _tidy([axes for axes in panels.flat if axes.get_visible()])
     handles, labels = [], []
     for axes in (panels[0, 0], panels[1, 0]):
@@ -154,9 +157,11 @@ def _tube(axes: Axes, replay: Replay) -> None:
     axes.plot([r.t for r in everything], [r.measured for r in everything], color=INK, lw=LINE,
               label="measured")  # fmt: skip
     bad = [r for r in judged if r.status is not Status.INSIDE]
-    axes.plot([r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3,
-              label="not inside" if not bad else f"not inside from {bad[0].t:.3f} s")  # fmt: skip
-    axes.set_title(f"{replay.name}: {replay.verdict}", fontsize=8, loc="left")
+    axes.plot(
+        [r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3, label="not inside"
+    )
+    since = f" from {bad[0].t:.3f} s" if bad else ""
+    axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
 
 
 def _margin(axes: Axes, replay: Replay) -> None:
@@ -169,11 +174,10 @@ def _margin(axes: Axes, replay: Replay) -> None:
     axes.set_ylim(max(-1.0, min(0.0, lowest)) - 0.08, 1.3)
 
 
-def _one_step(candidate: Candidate, trial: Trajectory) -> np.ndarray:
-    model, y, u = candidate.model, trial.y[:, 0], trial.u[:, 0]
-    n = len(model)
-    left = np.convolve(y, np.concatenate([[1.0], -model.a]))[n : len(y)]
-    return np.asarray(left - np.convolve(u, model.b)[n : len(u)] - model.c)
+def _same_limits(panels: list[Axes]) -> None:
+    limits = [axes.get_ylim() for axes in panels]
+    for axes in panels:
+        axes.set_ylim(min(lo for lo, _ in limits), max(hi for _, hi in limits))
 
 
 def _autocorrelation(values: np.ndarray, lags: int) -> np.ndarray:

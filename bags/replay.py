@@ -84,7 +84,7 @@ def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Re
         stamps_ns=tuple(stamp_ns for stamp_ns, _ in stamped),
         axis=model.y.name,
         unit=model.y.unit,
-        half_width=proved.funnel.output_half_width,
+        half_width=proved.funnel.half_width,
     )
 
 

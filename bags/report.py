@@ -8,7 +8,8 @@ from pathlib import Path
 
 from bags.replay import Replay
 from nlsid_core import _json
-from nlsid_core.identification import FIRST, Candidate, Fit
+from nlsid_core.identification import FIRST, AnyCandidate, AnyFit, Candidate
+from nlsid_core.models import DifferenceEquation
 from nlsid_core.trajectory import Dataset
 
 STYLE = """
@@ -29,7 +30,7 @@ def report_available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def write_report(path: Path, fit: Fit, train: Dataset, test: Dataset, *, robot: str) -> None:
+def write_report(path: Path, fit: AnyFit, train: Dataset, test: Dataset, *, robot: str) -> None:
     """Write the page; needs the extra `report`."""
     _json.write_atomically(path, page(fit, train, test, robot=robot).encode())
 
@@ -41,7 +42,7 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
     _json.write_atomically(path, plots.png(plots.margins(replays)))
 
 
-def page(fit: Fit, train: Dataset, test: Dataset, *, robot: str) -> str:
+def page(fit: AnyFit, train: Dataset, test: Dataset, *, robot: str) -> str:
     """The whole HTML page as text."""
     from bags import plots  # matplotlib only where a report is drawn
 
@@ -66,7 +67,7 @@ table and the pictures below.</p>
 <h2>Residuals, test trials</h2>{plots.svg(plots.residuals(chosen, test))}
 <p class="note">Shaded: where 99 % of a white residual's autocorrelation would lie. Outside it the
 model leaves something unexplained.</p>
-<h2>Poles</h2>{plots.svg(plots.poles(chosen))}
+{_poles(chosen)}
 <h2>Recordings</h2>
 <table class="left">
 <thead><tr><th>trial</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
@@ -76,7 +77,7 @@ model leaves something unexplained.</p>
 """
 
 
-def _row(candidate: Candidate, train: Dataset, test: Dataset, chosen: bool) -> str:
+def _row(candidate: AnyCandidate, train: Dataset, test: Dataset, chosen: bool) -> str:
     proved = (
         '<span class="proved">proved</span>'
         if candidate.proof is not None
@@ -93,14 +94,32 @@ def _row(candidate: Candidate, train: Dataset, test: Dataset, chosen: bool) -> s
     return tag + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
-def _equation(candidate: Candidate) -> str:
+def _equation(candidate: AnyCandidate) -> str:
     m = candidate.model
+    if not isinstance(m, DifferenceEquation):
+        terms = sum(len(g.exponents) for g in m.G) + len(m.p.exponents)
+        outputs, inputs = (", ".join(f"{s.name} [{s.unit}]" for s in part) for part in (m.y, m.u))
+        return (
+            f"0 = sum G_k(w) y(t-k) + p(w), {len(m)} lags, {terms} terms in w = the last "
+            f"{len(m.window)} inputs; y = {outputs}, u = {inputs}, one sample = {m.period:g} s"
+        )
     past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
     drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
     return (
         f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, "
         f"y = {m.y.name} [{m.y.unit}], u = {m.u.name} [{m.u.unit}], one sample = {m.period:g} s"
     )
+
+
+def _poles(candidate: AnyCandidate) -> str:
+    """The pole plot of a linear model; a nonlinear one has none."""
+    from bags import plots
+
+    model = candidate.model
+    if not isinstance(model, DifferenceEquation):
+        return ""
+    linear = Candidate(candidate.method, model, candidate.proof, candidate.seconds)
+    return f"<h2>Poles</h2>{plots.svg(plots.poles(linear))}"
 
 
 def _recordings(dataset: Dataset, use: str) -> str:

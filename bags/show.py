@@ -6,8 +6,9 @@ from rich.table import Table
 
 from bags.config import Config
 from bags.replay import Replay
+from bags.steps import Compared
 from nlsid_core.funnels import TubeDesign
-from nlsid_core.identification import Fit
+from nlsid_core.identification import AnyFit
 from nlsid_core.monitor import Nominal, Status
 from nlsid_core.trajectory import Dataset
 
@@ -19,7 +20,7 @@ COLOURS = {
 }
 
 
-def methods_table(fit: Fit, test: Dataset) -> Table:
+def methods_table(fit: AnyFit, test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{len(fit.model)} lags, {len(test)} test trials", title_justify="left")
     table.add_column("method")
@@ -38,6 +39,33 @@ def methods_table(fit: Fit, test: Dataset) -> Table:
     return table
 
 
+def comparison_table(compared: Compared) -> Table:
+    """Every method at every number of lags, scored on the same test trials."""
+    table = Table(title=f"{len(compared.test)} test trials", title_justify="left")
+    table.add_column("lags", justify="right")
+    table.add_column("method")
+    table.add_column("simulation", justify="right")
+    horizons = list(compared.rows[0][1].prediction_percent)
+    for horizon in horizons:
+        table.add_column(f"{horizon} ahead", justify="right")
+    for name in ("residual", "stability"):
+        table.add_column(name)
+    table.add_column("time", justify="right")
+    for candidate, scores in compared.rows:
+        flaws = [] if scores.white else ["not white"]
+        flaws += [] if scores.independent else ["follows the input"]
+        table.add_row(
+            str(len(candidate.model)),
+            candidate.method,
+            f"{scores.simulation_percent:.2f} %",
+            *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),
+            ", ".join(flaws) or "white, independent",
+            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
+            f"{candidate.seconds * 1e3:.0f} ms",
+        )
+    return table
+
+
 def funnel_table(design: TubeDesign) -> Table:
     """What the tube promises and on what."""
     model, funnel, assumption = design.model, design.funnel, design.funnel.assumption
@@ -47,7 +75,10 @@ def funnel_table(design: TubeDesign) -> Table:
     table.add_column()
     tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
     table.add_row("policy", tracking)
-    table.add_row("half-width", f"{funnel.output_half_width:.3f} {unit} of {model.y.name}")
+    table.add_row(
+        "half-width",
+        f"{funnel.half_width:g} {unit} of {model.y.name}",
+    )
     table.add_row("horizon", f"{assumption.samples * model.period:g} s")
     table.add_row(
         "assuming",
@@ -61,8 +92,10 @@ def funnel_table(design: TubeDesign) -> Table:
 def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, budget, first bad sample."""
     table = Table(
-        title="worst margin (1 on the nominal, 0 on the boundary) and disturbance budget spent",
+        title="held against the funnel",
+        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube",
         title_justify="left",
+        caption_justify="left",
     )
     for column, justify in (
         ("bag", "left"),
@@ -85,6 +118,25 @@ def replay_table(replays: Sequence[Replay]) -> Table:
             "-" if worst is None else worst.worst_axis,
             "-" if worst is None else f"{100 * replay.budget_spent:.0f} %",
             "-" if bad is None else f"{bad.t:.3f} s",
+        )
+    return table
+
+
+def caught_table(replays: Sequence[Replay]) -> Table:
+    """One row per bag that should be caught: verdict, first bad sample, budget spent in the end."""
+    table = Table(title="the same trials with a broken sensor", title_justify="left")
+    table.add_column("bag", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("bad from", justify="right", no_wrap=True)
+    table.add_column("budget", justify="right", no_wrap=True)
+    for replay in replays:
+        bad = replay.first_bad
+        colour = COLOURS[replay.verdict]
+        table.add_row(
+            replay.name,
+            f"[{colour}]{replay.verdict}[/{colour}]",
+            "-" if bad is None else f"{bad.t:.3f} s",
+            f"{100 * replay.budget_spent:.0f} %",
         )
     return table
 

@@ -12,7 +12,14 @@ from bags.training import load_training, save_training
 from nlsid_core import _json
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign, design_tube
-from nlsid_core.identification import Fit, identify
+from nlsid_core.identification import (
+    AnyCandidate,
+    AnyFit,
+    Model,
+    Validation,
+    identify,
+    validate,
+)
 from nlsid_core.trajectory import Dataset
 
 Progress = Callable[[str, float], None]
@@ -22,7 +29,7 @@ Progress = Callable[[str, float], None]
 class Identified:
     """A fit with the data it was made and scored on, and the files written."""
 
-    fit: Fit
+    fit: AnyFit
     train: Dataset
     test: Dataset
     files: tuple[Path, ...]
@@ -35,25 +42,20 @@ def identify_bags(
 
     Raises DataError (BagError for bags) before anything is written.
     """
-    response, excitation = config.signals.response, config.signals.excitation
-    dataset = read_dataset(
-        bags,
-        responses=[response.path],
-        excitations=[excitation.path],
-        period=config.grid.period,
-        max_gap=config.grid.max_gap,
-        progress=lambda done, total: progress("reading bags", 0.5 * done / total),
+    train, test = read_split(
+        bags, config, progress=lambda what, fraction: progress(what, 0.5 * fraction)
     )
-    train, test = split(_labelled(dataset, response, excitation), config.split.test)
     fit = identify(
         train,
-        lags=config.identification.lags,
+        config.identification.model_class,
+        method=config.identification.method,
+        test=test,
         iterations=config.identification.iterations,
         progress=lambda what, fraction: progress(what, 0.5 + 0.4 * fraction),
     )
     out.mkdir(parents=True, exist_ok=True)
     training = out / documents.TRAINING
-    model = replace(fit.model, training=save_training(training, train))
+    model: Model = replace(fit.model, training=save_training(training, train))
     _json.write_document(out / documents.MODEL, model.document())
     proof = fit.proof.document(model, documents.MODEL)
     _json.write_document(out / documents.MODEL_PROOF, proof)
@@ -64,6 +66,60 @@ def identify_bags(
         write_report(files[-1], fit, train, test, robot=config.robot)
     progress("done", 1.0)
     return Identified(fit, train, test, tuple(files))
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Every method's candidate with its scores on the test trials."""
+
+    rows: tuple[tuple[AnyCandidate, Validation], ...]
+    test: Dataset
+
+
+def compare_bags(
+    bags: Sequence[Path], config: Config, lags: Sequence[int], *, progress: Progress
+) -> Compared:
+    """Every method of the configured model class at each number of lags, on the same test trials.
+
+    Writes nothing. Raises DataError as `identify_bags` does.
+    """
+    train, test = read_split(
+        bags, config, progress=lambda what, fraction: progress(what, 0.3 * fraction)
+    )
+    options = config.identification
+    rows: list[tuple[AnyCandidate, Validation]] = []
+    for number, n in enumerate(lags):
+        model_class = options.model_copy(update={"lags": n}).model_class
+        affine = options.model == "state_affine" and options.lagged_degree == 0
+        certifiable = affine and options.leading_degree <= 2
+        fit = identify(
+            train,
+            model_class,
+            method="rse_certified" if certifiable else "rse",
+            iterations=options.iterations,
+            allow_unproved=True,
+            progress=lambda what, fraction, done=number: progress(
+                what, 0.3 + 0.7 * (done + fraction) / len(lags)
+            ),
+        )
+        rows += [(candidate, validate(candidate.model, test)) for candidate in fit.candidates]
+    return Compared(tuple(rows), test)
+
+
+def read_split(
+    bags: Sequence[Path], config: Config, *, progress: Progress
+) -> tuple[Dataset, Dataset]:
+    """(training, test) trials of the configured signals on the configured grid."""
+    response, excitation = config.signals.response, config.signals.excitation
+    dataset = read_dataset(
+        bags,
+        responses=[response.path],
+        excitations=[excitation.path],
+        period=config.grid.period,
+        max_gap=config.grid.max_gap,
+        progress=lambda done, total: progress("reading bags", done / total),
+    )
+    return split(_labelled(dataset, response, excitation), config.split.test)
 
 
 def _labelled(dataset: Dataset, response: SignalConfig, excitation: SignalConfig) -> Dataset:

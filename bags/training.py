@@ -14,7 +14,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.trajectory import Dataset, Trajectory
 
 LABELS = ("y_names", "u_names", "y_units", "u_units", "y_paths", "u_paths")
-NAMES = ("name", "group", "digest")
+NAMES = ("name", "group", "digest", "provenance")
 
 
 def save_training(path: Path | str, dataset: Dataset) -> str:

@@ -12,7 +12,8 @@ from typing import Any, BinaryIO, Final
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from bags.message_types import definition
+from bags.message_types import are_same, definition, types_in_bag
+from bags.storage import FORMATS, Channel
 from nlsid_core._json import write_atomically
 from nlsid_core.errors import BagError
 
@@ -21,6 +22,7 @@ LIBRARY: Final = "nlsid"
 CUSTOM_DATA: Final = "custom_data"  # the MCAP Metadata record with the bag's own key-value pairs
 METADATA_VERSION: Final = 9  # the rosbag2 metadata of ROS 2 Jazzy
 CHUNK_BYTES: Final = 2**20
+SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
 
 
 class BagWriter:
@@ -51,7 +53,9 @@ class BagWriter:
         self.counts: dict[str, int] = {}
         self._types: dict[str, str] = {}
         self._hashes: dict[str, str] = {}
-        self._schemas: dict[str, int] = {}
+        self._encodings: dict[str, str] = {}
+        self._like: dict[str, Channel] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
         self._channels: dict[str, int] = {}
         self._custom = dict(custom or {})
         self._first_ns: int | None = None
@@ -80,10 +84,12 @@ class BagWriter:
             self._mcap.add_metadata(CUSTOM_DATA, self._custom)
         self.close_chunk()
 
-    def add_topic(self, topic: str, msgtype: str) -> None:
+    def add_topic(self, topic: str, msgtype: str, *, like: Channel | None = None) -> None:
         """Announce a topic, so that the bag lists it even if no message comes.
 
-        Raises BagError for a type that is not known and for a second type on one topic.
+        `like`: the channel of another bag that it is a copy of, with its own definition of its
+        type; without one the type is a standard one. Raises BagError for a type that is not known
+        and for a second type on one topic.
         """
         if topic in self._types:
             if self._types[topic] != msgtype:
@@ -91,31 +97,74 @@ class BagWriter:
                     f"{self.path}: {topic} holds '{self._types[topic]}', not '{msgtype}'; "
                     "a topic has one type"
                 )
+            if like is not None and self._like.setdefault(topic, like) is not like:
+                self._refuse_another(self._like[topic], like)
             return
-        if msgtype not in self._schemas:
-            text, self._hashes[msgtype] = definition(msgtype)
-            self._schemas[msgtype] = self._mcap.register_schema(msgtype, "ros2msg", text.encode())
-        self._channels[topic] = self._mcap.register_channel(
-            topic,
-            "cdr",
-            self._schemas[msgtype],
-            {"offered_qos_profiles": "[]", "topic_type_hash": self._hashes[msgtype]},
-        )
+        if like is None:
+            text, type_hash = definition(msgtype)
+            schema, encoding = self._schema(msgtype, "ros2msg", text), "cdr"
+            metadata = {"offered_qos_profiles": "[]", "topic_type_hash": type_hash}
+        else:
+            schema, encoding = self._schema_like(like), like.encoding
+            metadata = dict(like.metadata)
+            self._like[topic] = like
+        self._channels[topic] = self._mcap.register_channel(topic, encoding, schema, metadata)
         self._types[topic] = msgtype
+        self._hashes[topic] = metadata.get("topic_type_hash", "")
+        self._encodings[topic] = encoding
         self.counts[topic] = 0
 
+    def _refuse_another(self, first: Channel, second: Channel) -> None:
+        """BagError if two channels copied to one topic were written with different definitions."""
+        if first.encoding == second.encoding and (
+            first.definition == second.definition
+            or are_same(*(types_in_bag(c.msgtype, c.definition) for c in (first, second)))
+        ):
+            return
+        raise BagError(
+            f"{self.path}: {first.topic} comes with two definitions of '{first.msgtype}'; keep "
+            "them in two bags"
+        )
+
+    def _schema_like(self, like: Channel) -> int:
+        if not like.definition.data and like.encoding == "cdr":
+            try:
+                return self._schema(like.msgtype, "ros2msg", definition(like.msgtype)[0])
+            except BagError:
+                pass  # not a standard type either: copied as it came, without its definition
+        encoding = SCHEMA_ENCODINGS.get(like.definition.format, "")
+        return self._schema(like.msgtype, encoding, like.definition.data)
+
+    def _schema(self, msgtype: str, encoding: str, text: str) -> int:
+        key = (msgtype, text)
+        if key not in self._schemas:
+            self._schemas[key] = self._mcap.register_schema(msgtype, encoding, text.encode())
+        return self._schemas[key]
+
     def write(
-        self, topic: str, msgtype: str, data: bytes, *, log_time_ns: int, publish_time_ns: int
+        self,
+        topic: str,
+        msgtype: str,
+        data: bytes,
+        *,
+        log_time_ns: int,
+        publish_time_ns: int,
+        sequence: int | None = None,
     ) -> None:
         """Append one serialised (CDR) message; times are ns since the epoch.
 
-        Raises BagError as `add_topic`, and for a time that is negative or beyond 64 bits.
+        sequence: the publisher's count (None: the place on the topic). Raises BagError as
+        `add_topic`, and for a time that is negative or beyond 64 bits.
         """
         if not (0 <= log_time_ns < 2**63 and 0 <= publish_time_ns < 2**63):
             raise BagError(f"{self.path}: {topic}: times {log_time_ns}, {publish_time_ns} ns")
         self.add_topic(topic, msgtype)
         self._mcap.add_message(
-            self._channels[topic], log_time_ns, data, publish_time_ns, sequence=self.counts[topic]
+            self._channels[topic],
+            log_time_ns,
+            data,
+            publish_time_ns,
+            sequence=self.counts[topic] if sequence is None else sequence,
         )
         self.counts[topic] += 1
         first = log_time_ns if self._first_ns is None else self._first_ns
@@ -190,9 +239,9 @@ class BagWriter:
                     "topic_metadata": {
                         "name": topic,
                         "type": msgtype,
-                        "serialization_format": "cdr",
+                        "serialization_format": self._encodings[topic],
                         "offered_qos_profiles": [],
-                        "type_description_hash": self._hashes[msgtype],
+                        "type_description_hash": self._hashes[topic],
                     },
                     "message_count": self.counts[topic],
                 }

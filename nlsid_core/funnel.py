@@ -32,7 +32,9 @@ class Funnel:
     """{(x̄, e) : x̄'Px̄ + e² ≤ level} around a trajectory (x_k, u_k) of the model, x̄ = x̂ - x_k.
 
     Starts with x̄'Px̄ ≤ inlet stay inside while the assumption holds. P: (n, n) symmetric,
-    so that V = x̄'Px̄ and `level` carry the output's unit squared. `model` and `policy` are digests.
+    so that V = x̄'Px̄ and `level` carry the output's unit squared. half_width: the most |y - y_k| can
+    be in it, in the output's unit, whatever part of the policy is engaged. `model` and `policy` are
+    digests.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -40,6 +42,7 @@ class Funnel:
     P: FloatArray
     level: float
     inlet: float
+    half_width: float
     assumption: EnergyAssumption
     model: str
     policy: str
@@ -50,23 +53,22 @@ class Funnel:
         object.__setattr__(self, "P", P)
         if P.ndim != 2 or P.shape[0] != P.shape[1]:
             raise ShapeError(f"funnel: P should be square, has shape {P.shape}")
-        if not np.isfinite(P).all() or not (self.level > 0 and 0 <= self.inlet <= self.level):
-            raise DataError(f"funnel: P, level {self.level}, inlet {self.inlet} are not a tube")
+        sizes = self.level > 0 and 0 <= self.inlet <= self.level and self.half_width > 0
+        if not np.isfinite(P).all() or not sizes:
+            raise DataError(
+                f"funnel: P, level {self.level}, inlet {self.inlet}, half-width {self.half_width} "
+                "are not a tube"
+            )
 
     def value(self, x_bar: FloatArray, innovation: float) -> float:
         """V(x̄) + e², to be held against `level`."""
         return float(x_bar @ self.P @ x_bar + innovation**2)
 
     @property
-    def half_widths(self) -> FloatArray:
+    def axis_half_widths(self) -> FloatArray:
         """(n+1,): the largest |x̄_i| in the tube, then the largest |e|, in the output's unit."""
         shape = np.concatenate([np.diag(np.linalg.inv(self.P)), [1.0]])
         return np.sqrt(self.level * shape)
-
-    @property
-    def output_half_width(self) -> float:
-        """The largest |y - y_k| = |x̄₁ + e| in the tube, in the output's unit."""
-        return float(np.sqrt(self.level * (1.0 + np.linalg.inv(self.P)[0, 0])))
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -79,6 +81,7 @@ class Funnel:
             "policy": self.policy,
             "level": self.level,
             "inlet": self.inlet,
+            "half_width": self.half_width,
             "assumption": {
                 "kind": "energy",
                 "budget": a.budget,
@@ -104,6 +107,7 @@ class Funnel:
             P=_json.array(document, "P", (None, None), source=source),
             level=_json.number(document, "level", source=source),
             inlet=_json.number(document, "inlet", source=source),
+            half_width=_json.number(document, "half_width", source=source),
             assumption=EnergyAssumption(
                 budget=_json.number(nested, "budget", source=where),
                 samples=_json.member(nested, "samples", int, source=where),

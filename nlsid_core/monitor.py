@@ -88,7 +88,7 @@ class Monitor:
         n = len(model)
         ahead = (f"{model.y.name} +{i}" for i in range(n))
         self.axes = (*ahead, "innovation")
-        self._half_widths = funnel.half_widths
+        self._half_widths = funnel.axis_half_widths
         self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset
         self.restart()
 

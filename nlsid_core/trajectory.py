@@ -19,7 +19,7 @@ class Trajectory:
     until the next sample. x: (N, n_x) states where they are known, else None.
     Names, units and paths (`topic:field`, empty: not from a topic) go with the columns. `group` is
     the same for repeats of one excitation (empty: not a repeat). `digest` names the recording it
-    came from (empty: none).
+    came from (empty: none), `provenance` is JSON text that says how it was read from it.
 
     Raises ShapeError on mismatched lengths, DataError on NaN or on time that does not increase.
     """
@@ -37,6 +37,7 @@ class Trajectory:
     name: str = ""
     group: str = ""
     digest: str = ""
+    provenance: str = ""
 
     def __post_init__(self) -> None:
         t = _frozen(self.t)

@@ -9,18 +9,17 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-import rclpy
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.utilities import ok, try_shutdown
+from rclpy.utilities import ok
 
 from bags.bag import Bag
 from bags.grid import seconds
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import declare
+from nlsid_ros.running import declare, run
 
 NAME = "bag_player"
 SLICE = 0.05  # s: longest sleep, so that an interrupt is noticed
@@ -36,13 +35,13 @@ class BagPlayer(Node):
         topics: Any = declare(self, "topics", [""], "topics to play; none named: all")
         rate: Any = declare(self, "rate", 1.0, "speed, 1: as recorded", between=(0.01, 100.0))
         wait_for: Any = declare(
-            self, "wait_for", 1.0, "subscribers each topic must have first", between=(0.0, 100.0)
+            self, "wait_for", 1, "subscribers each topic must have first", between=(0, 100)
         )
         timeout: Any = declare(
             self, "wait_timeout", 10.0, "s to wait for subscribers", between=(0.0, 3600.0)
         )
         self._topics = [topic for topic in topics if topic]
-        self._rate, self._wait_for, self._timeout = float(rate), int(wait_for), float(timeout)
+        self._rate, self._wait_for, self._timeout = rate, wait_for, timeout
         if not self._path:
             raise DataError("no bag to play; set the parameter bag")
 
@@ -93,19 +92,10 @@ class BagPlayer(Node):
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid bag_player`."""
-    rclpy.init(args=args)
-    node: BagPlayer | None = None
     try:
-        node = BagPlayer()
-        node.play()
-    except KeyboardInterrupt:
-        pass
+        run(BagPlayer, args, work=BagPlayer.play)
     except (NlsidError, OSError) as error:
         sys.exit(f"{NAME}: {error}")
-    finally:
-        if node is not None:
-            node.destroy_node()
-        try_shutdown()
 
 
 if __name__ == "__main__":

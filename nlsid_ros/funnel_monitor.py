@@ -6,6 +6,7 @@ every sample, and /diagnostics at once when the status changes, otherwise once a
 Missing, stale or NaN state is unknown (STALE), never inside. `~/restart` begins a new run.
 """
 
+import sys
 import time
 from collections.abc import Iterable
 from functools import partial
@@ -195,7 +196,10 @@ class FunnelMonitor(Node):
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid funnel_monitor`."""
-    run(FunnelMonitor, args)
+    try:
+        run(FunnelMonitor, args)
+    except NlsidError as error:
+        sys.exit(f"{NAME}: {error}")
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ def _contents(bag: Path, topics: list[str]) -> list[tuple[str, int, bytes]]:
 
 
 def _play(bag: Path, topics: list[str], *, listeners: int) -> None:
-    with _process("bag_player", bag=str(bag), topics=topics, wait_for=float(listeners)) as player:
+    with _process("bag_player", bag=str(bag), topics=topics, wait_for=listeners) as player:
         if player.wait(timeout=PATIENCE + 60.0):
             raise NlsidError(f"bag_player ended with status {player.returncode}")
 

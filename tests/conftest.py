@@ -9,7 +9,8 @@ import pytest
 from bags.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
 from nlsid_core import _json
 from nlsid_core.funnels import TubeDesign, design_tube
-from nlsid_core.identification import Fit, identify
+from nlsid_core.identification import Fit, LinearClass, identify
+from nlsid_core.models import DifferenceEquation
 from nlsid_core.trajectory import Dataset, Trajectory
 
 TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
@@ -57,13 +58,13 @@ def train() -> Dataset:
 
 
 @pytest.fixture(scope="session")
-def fit(train: Dataset) -> Fit:
+def fit(train: Dataset) -> Fit[DifferenceEquation]:
     """A model with two lags of the synthetic robot."""
-    return identify(train, lags=2)
+    return identify(train, LinearClass(2))
 
 
 @pytest.fixture(scope="session")
-def design(fit: Fit, train: Dataset) -> TubeDesign:
+def design(fit: Fit[DifferenceEquation], train: Dataset) -> TubeDesign:
     """A tube for it, policy engaged or not."""
     model = replace(fit.model, training="sha256:0")
     return design_tube(
@@ -76,7 +77,7 @@ def design(fit: Fit, train: Dataset) -> TubeDesign:
 
 
 @pytest.fixture
-def design_folder(tmp_path: Path, fit: Fit, design: TubeDesign) -> Path:
+def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: TubeDesign) -> Path:
     """Model, policy, funnel and both proofs as files, as the command line writes them."""
     model = design.model
     for name, document in (

@@ -210,7 +210,7 @@ def test_a_dynamic_array_that_becomes_too_short(tmp_path: Path) -> None:
             data = joints(START_NS + k, position)
             bag.write("/arm", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
     message = refused(tmp_path / "arm", "/arm:position[1]")
-    assert "/arm: message 1 cannot be read: /arm:position[1]: 'position' has 1 elements" in message
+    assert "/arm: message 1 cannot be read: position[1]: 'position' has 1 elements" in message
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from nlsid_core.certificate import check, proof_document
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.funnels import TubeDesign
 from nlsid_core.identification import Fit
+from nlsid_core.models import DifferenceEquation
 
 
 def rewrite(path: Path, document: Json) -> None:
@@ -45,7 +46,9 @@ def rebind(folder: Path) -> tuple[Json, Json, Json]:
     return model, policy, funnel
 
 
-def test_both_proofs_are_proved_and_say_of_what(design_folder: Path, fit: Fit) -> None:
+def test_both_proofs_are_proved_and_say_of_what(
+    design_folder: Path, fit: Fit[DifferenceEquation]
+) -> None:
     stability = check(design_folder / MODEL_PROOF)
     assert str(stability).startswith("PROVED incremental stability")
     assert stability.margin == pytest.approx(1 - fit.proof.rate)
@@ -54,9 +57,22 @@ def test_both_proofs_are_proved_and_say_of_what(design_folder: Path, fit: Fit) -
     assert "innovation energy" in tube.assumptions[0]
 
 
-def test_the_stated_half_width_is_an_upper_bound(design_folder: Path, design: TubeDesign) -> None:
-    stated = float(check(design_folder / FUNNEL_PROOF).statement.split()[4])
-    assert design.funnel.output_half_width <= stated <= 1.01 * design.funnel.output_half_width
+@pytest.mark.parametrize("engaged", [0, 1])
+def test_the_half_width_bounds_the_output_in_the_tube(design: TubeDesign, engaged: int) -> None:
+    model, funnel, rng = design.model, design.funnel, np.random.default_rng(0)
+    c = model.C[0] - engaged * model.D * design.policy.K
+    root = np.linalg.cholesky(np.linalg.inv(funnel.P))
+    direction = rng.standard_normal((20_000, len(model) + 1))
+    direction *= np.sqrt(funnel.level) / np.linalg.norm(direction, axis=1, keepdims=True)
+    outputs = direction[:, :-1] @ root.T @ c + direction[:, -1]
+    assert np.abs(outputs).max() <= funnel.half_width
+
+
+def test_a_half_width_that_is_too_small_is_rejected(design_folder: Path) -> None:
+    funnel = _json.load_document(design_folder / FUNNEL)
+    forge(design_folder, funnel=funnel | {"half_width": 0.98 * funnel["half_width"]})
+    with pytest.raises(CertificateRejected, match="half-width"):
+        check(design_folder / FUNNEL_PROOF)
 
 
 @pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
@@ -141,7 +157,9 @@ def test_a_rate_that_is_no_decay_is_rejected(design_folder: Path, rate: float) -
         check(design_folder / MODEL_PROOF)
 
 
-def test_a_rate_below_the_slowest_pole_is_rejected(design_folder: Path, fit: Fit) -> None:
+def test_a_rate_below_the_slowest_pole_is_rejected(
+    design_folder: Path, fit: Fit[DifferenceEquation]
+) -> None:
     document = _json.load_document(design_folder / MODEL_PROOF)
     radius = float(np.abs(fit.model.poles).max())
     for factor, proved in ((1.0 + 1e-3, None), (1.0 - 1e-9, False)):

@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import FINAL, FIRST, SEM, Fit, identify, prove_stability
+from nlsid_core.identification import (
+    FINAL,
+    FIRST,
+    SEM,
+    Fit,
+    LinearClass,
+    identify,
+    prove_stability,
+    simulation_percent,
+)
 from nlsid_core.identification.least_squares import least_squares
-from nlsid_core.identification.regression import Regression, build_regression
-from nlsid_core.identification.rse import _Band, _Bound, robust_simulation_error
-from nlsid_core.identification.simulation_error import simulation_error_percent
+from nlsid_core.identification.regression import build_regression
+from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.trajectory import Dataset, Trajectory
 from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
@@ -18,77 +26,22 @@ from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
 EXACT = 1e-10  # agreement of two floating-point routes to the same number
 
 
-def dense(regression: Regression, g: np.ndarray) -> np.ndarray:
-    """G(g) as a full matrix."""
-    N = len(regression.row)
-    G = np.zeros((N, N))
-    for t in range(N):
-        for k, coefficient in enumerate(g):
-            if regression.row[t] >= k:
-                G[t, t - k] = coefficient
-    return G
-
-
-def small_regression() -> Regression:
-    return build_regression(synthetic_dataset(0.02, trials=3, samples=24), 2)
-
-
-@pytest.mark.parametrize("first", [True, False])
-def test_banded_value_gradient_and_hessian_equal_the_dense_formula(first: bool) -> None:
-    regression = small_regression()
-    rng = np.random.default_rng(0)
-    g_m = None if first else np.array([1.1, -0.5, 0.2])
-    errors = np.column_stack([regression.Y, -regression.Q])
-    theta = np.concatenate([[1.05, -0.4, 0.1], 0.3 * rng.standard_normal(errors.shape[1] - 3)])
-    bound = _Bound(_Band(regression.row, 2), errors, g_m)
-    J, x, factor = bound.value(theta)
-    gradient, hessian = bound.derivatives(x, factor)
-
-    unit = np.eye(3)
-    H = np.eye(len(errors)) if g_m is None else dense(regression, g_m)
-    slopes = [dense(regression, unit[k]) @ H.T for k in range(3)]
-    slopes = [S + S.T for S in slopes] + [np.zeros_like(H)] * (len(theta) - 3)
-    K = sum(t * S for t, S in zip(theta, slopes, strict=True)) - H @ H.T
-    inverse = np.linalg.inv(K)
-    e = errors @ theta
-    V = np.column_stack([errors[:, i] - slopes[i] @ inverse @ e for i in range(len(theta))])
-    expected = errors.T @ inverse @ e + V.T @ inverse @ e
-    assert pytest.approx(e @ inverse @ e, rel=EXACT) == J
-    np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=EXACT * np.abs(expected).max())
-    full = 2.0 * V.T @ inverse @ V
-    np.testing.assert_allclose(hessian, full, rtol=1e-8, atol=EXACT * np.abs(full).max())
-
-
-def test_bound_is_above_the_simulation_error_and_equal_where_it_was_linearised() -> None:
-    regression = small_regression()
-    errors = np.column_stack([regression.Y, -regression.Q])
-    rng = np.random.default_rng(1)
-    theta_m = np.concatenate([[1.0, -0.9, 0.2], 0.3 * rng.standard_normal(errors.shape[1] - 3)])
-    bound = _Bound(_Band(regression.row, 2), errors, theta_m[:3])
-
-    def simulation_error(theta: np.ndarray) -> float:
-        return float(np.sum(np.linalg.solve(dense(regression, theta[:3]), errors @ theta) ** 2))
-
-    assert bound.value(theta_m)[0] == pytest.approx(simulation_error(theta_m), rel=EXACT)
-    for _ in range(20):
-        theta = theta_m + 0.02 * rng.standard_normal(len(theta_m))
-        assert bound.value(theta)[0] >= simulation_error(theta) * (1 - EXACT)
-
-
 def test_the_bound_never_goes_up_over_the_iterates(train: Dataset) -> None:
     regression = build_regression(train, 3)
-    bounds = [iterate.J for iterate, _ in robust_simulation_error(regression)]
+    bounds = [iterate.J for iterate in robust_simulation_error(regression.rows)]
     assert len(bounds) > 2
     assert all(after <= before for before, after in pairwise(bounds))
 
 
 def test_noise_free_data_give_the_true_coefficients_back() -> None:
-    model = identify(synthetic_dataset(0.0), lags=2).model
+    model = identify(synthetic_dataset(0.0), LinearClass(2)).model
     np.testing.assert_allclose(model.a, TRUE_A, atol=1e-6)
     np.testing.assert_allclose(model.b, TRUE_B, atol=1e-6)
 
 
-def test_final_iterate_simulates_as_well_as_direct_minimisation(fit: Fit, train: Dataset) -> None:
+def test_final_iterate_simulates_as_well_as_direct_minimisation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
     assert fit[FINAL].error_percent(train) <= 1.001 * fit[SEM].error_percent(train)
     assert fit[FINAL].error_percent(train) < fit[FIRST].error_percent(train)
 
@@ -107,7 +60,9 @@ def test_every_recorded_sample_scale_is_undone_once(train: Dataset) -> None:
     np.testing.assert_allclose([*model.a, *model.b, model.c], expected, atol=1e-9)
 
 
-def test_observer_form_simulates_the_difference_equation(fit: Fit, train: Dataset) -> None:
+def test_observer_form_simulates_the_difference_equation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
     model = fit.model
     trial = train.trajectories[0]
     y, u, n = trial.y[:, 0], trial.u[:, 0], len(model)
@@ -145,31 +100,31 @@ def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
 def test_a_constant_input_is_refused_with_the_reason() -> None:
     y = np.random.default_rng(0).standard_normal(100)
     with pytest.raises(DataError, match=r"excitation is constant \(0.4\)"):
-        identify(_dataset(np.full(100, 0.4), y), lags=2)
+        identify(_dataset(np.full(100, 0.4), y), LinearClass(2))
 
 
 def test_an_input_that_excites_too_few_lags_is_refused() -> None:
     u = np.tile([0.0, 1.0], 50)
     with pytest.raises(DataError, match="does not excite 4 lags"):
-        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), lags=4)
+        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), LinearClass(4))
 
 
 def test_too_few_rows_are_refused_with_how_many_are_needed() -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(DataError, match="28 rows for 6 parameters; give at least 30"):
-        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), lags=2)
+        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), LinearClass(2))
 
 
 def test_several_outputs_are_refused() -> None:
     rng = np.random.default_rng(0)
     trial = Trajectory(t=np.arange(50.0), y=rng.standard_normal((50, 2)), u=rng.random(50))
     with pytest.raises(ShapeError, match="there are 2 and 1"):
-        identify(Dataset((trial,)), lags=2)
+        identify(Dataset((trial,)), LinearClass(2))
 
 
-def test_error_percent_is_zero_for_the_truth(fit: Fit) -> None:
+def test_error_percent_is_zero_for_the_truth(fit: Fit[DifferenceEquation]) -> None:
     clean = synthetic_dataset(0.0, trials=2)
     truth = DifferenceEquation(
         a=TRUE_A, b=TRUE_B, c=0.0, period=PERIOD, y=fit.model.y, u=fit.model.u, u_range=(0.0, 1.0)
     )
-    assert simulation_error_percent(truth, clean) < 1e-9
+    assert simulation_percent(truth, clean) < 1e-9

@@ -112,7 +112,7 @@ def test_clarabel_steps_in_when_the_interior_point_gives_up(
     monkeypatch.setattr(sphere_module, "_interior_point", gives_up)
     found = program.solve(values, start=expected)
     assert found.iterations == 0
-    assert found.m == pytest.approx(expected.m, abs=1e-6 * np.ptp(values))
+    assert found.m == pytest.approx(expected.m, abs=1e-6 * float(np.ptp(values)))
     proof = sphere_proof(program, found, g)
     assert prove(g, proof.bound, proof, "exact") > 0
 

@@ -7,7 +7,17 @@ from types import MappingProxyType
 
 from nlsid_core import _json
 from nlsid_core._types import Json
-from nlsid_core.certificate import attraction, nonnegative, stability, tube
+from nlsid_core.certificate import (
+    attraction,
+    block_cascade,
+    discrete_funnel,
+    implicit,
+    monotone_equation,
+    nonnegative,
+    stability,
+    state_affine,
+    tube,
+)
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision, Verdict
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Undecided
@@ -38,9 +48,14 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
         "energy_tube": _exact_only(tube.decide),
+        "discrete_funnel": discrete_funnel.decide,
+        "state_affine_stability": _exact_only(state_affine.decide),
+        "block_cascade_stability": _exact_only(block_cascade.decide),
+        "monotone_equation_stability": _exact_only(monotone_equation.decide),
         "polynomial_bound": nonnegative.decide_lower_bound,
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,
+        "implicit_stability": implicit.decide,
         "trajectory_funnel": _trajectory_funnel,
     }
 )

@@ -64,23 +64,5 @@ def is_positive_definite(A: Matrix) -> bool:
     return True
 
 
-def inverse_entry(A: Matrix, i: int) -> Fraction:
-    """(A⁻¹)_ii of a positive definite matrix: the ratio of two determinants."""
-    minor = [[v for c, v in enumerate(row) if c != i] for r, row in enumerate(A) if r != i]
-    return determinant(minor) / determinant(A)
-
-
-def determinant(A: Matrix) -> Fraction:
-    """det A of a positive definite matrix, by elimination without pivoting; 1 if it is empty."""
-    M, result = [list(row) for row in A], Fraction(1)
-    for k, row in enumerate(M):
-        result *= row[k]
-        for below in M[k + 1 :]:
-            ratio = below[k] / row[k]
-            for j in range(k, len(M)):
-                below[j] -= ratio * row[j]
-    return result
-
-
 def _times(a: Fraction, b: Fraction) -> Fraction:
     return a * b

@@ -6,11 +6,11 @@ V(x̄⁺) ≤ V(x̄) + e², V = x̄'Px̄, as
     diag(P, 1) - [A - κBK, L]' P [A - κBK, L] ≻ 0   for κ = 0 and κ = 1,
 hence for every κ in between (it is convex in κ), at every sample, around every trajectory of
 the model. Summed: V(x̄_k) + e_k² ≤ V(x̄_0) + Σ e² ≤ inlet + budget ≤ level.
-The stored nominal obeys the model up to rounding; what is left is bounded and added, exactly.
+The stored nominal obeys the model up to rounding; what is left is bounded and added, exactly. The
+output is within the stated half-width: y - y_k = (C - κDK)x̄ + e.
 Source: thesis Section 5.1 in discrete time; energy form of a disturbance bound.
 """
 
-import math
 from collections.abc import Mapping
 from fractions import Fraction
 
@@ -41,6 +41,7 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
     if refusal is not None:
         raise CertificateRejected(refusal)
     _refuse_level(model, policy, funnel)
+    _refuse_half_width(model, policy, funnel)
     return _statement(model, policy, funnel, slack)
 
 
@@ -127,14 +128,31 @@ def _refuse_level(model: DifferenceEquation, policy: Policy, funnel: Funnel) -> 
         )
 
 
+def _refuse_half_width(model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+    """y - y_k = cx̄ + e with c = C - κDK: |cx̄ + e|² ≤ level (1 + cP⁻¹c') ≤ half_width².
+
+    Decided as [[P, c'], [c, half_width²/level - 1]] ≻ 0 for κ = 0 and 1 (convex in between).
+    """
+    P = exact.rational(funnel.P.tolist())
+    room = Fraction(funnel.half_width) ** 2 / Fraction(funnel.level) - 1
+    direct = Fraction(float(model.b[0]))
+    for engaged in (0, 1):
+        c = [-engaged * direct * Fraction(float(k)) for k in policy.K]
+        c[0] += 1
+        bordered = [[*row, entry] for row, entry in zip(P, c, strict=True)] + [[*c, room]]
+        if not exact.is_positive_definite(bordered):
+            raise CertificateRejected(
+                f"the output can leave the stated half-width {funnel.half_width:g}"
+            )
+
+
 def _statement(model: DifferenceEquation, policy: Policy, funnel: Funnel, slack: float) -> Decision:
     a = funnel.assumption
     unit = model.y.unit
-    width = _output_half_width(funnel)
     modes = "policy engaged or not" if policy.K.any() else "prediction tube, no feedback"
     return Decision(
         statement=(
-            f"tube: {model.y.name} stays within {width:g} {unit} of every "
+            f"tube: {model.y.name} stays within {funnel.half_width:g} {unit} of every "
             f"trajectory of the model for {a.samples * model.period:g} s ({modes})"
         ),
         margin=slack,
@@ -144,14 +162,3 @@ def _statement(model: DifferenceEquation, policy: Policy, funnel: Funnel, slack:
             f"{a.safety_factor:g} in amplitude)",
         ),
     )
-
-
-def _output_half_width(funnel: Funnel) -> float:
-    """A three-digit bound on |y - y_k| = |x̄₁ + e|, decided as width² ≥ level (1 + (P⁻¹)₁₁)."""
-    inverse = exact.inverse_entry(exact.rational(funnel.P.tolist()), 0)
-    squared = Fraction(funnel.level) * (1 + inverse)
-    digits = 2 - math.floor(math.log10(funnel.output_half_width))
-    width = round(funnel.output_half_width, digits)
-    while Fraction(width) ** 2 < squared:
-        width = round(width + 10.0**-digits, digits)
-    return width

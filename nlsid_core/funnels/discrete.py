@@ -101,11 +101,14 @@ def design_tube(
     budget = safety_factor**2 * energy
     inlet_level = inlet**2 / float(np.linalg.inv(P)[0, 0])
     x, u = track_profile(model, profile, samples)
+    level = (budget + inlet_level) * (1.0 + LEVEL_ROOM)
+    reach = max(float(c @ np.linalg.solve(P, c)) for c in _output_rows(model, K))
     policy = Policy(x=x, u=u, K=K, L=L, period=model.period, model=_json.digest(model.document()))
     funnel = Funnel(
         P=P,
-        level=(budget + inlet_level) * (1.0 + LEVEL_ROOM),
+        level=level,
         inlet=inlet_level,
+        half_width=_rounded_up(float(np.sqrt(level * (1.0 + reach)))),
         assumption=EnergyAssumption(
             budget=budget,
             samples=samples,
@@ -126,7 +129,10 @@ def open_loop_covariance(model: DifferenceEquation, L: FloatArray) -> FloatArray
 
 
 def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray) -> FloatArray:
-    """W of least W_11 with W ⪰ (1 + room)(A_κ W A_κ' + L L') for κ = 0 and 1, A_κ = A - κBK."""
+    """W of least reach max c_κ W c_κ' with W ⪰ (1 + room)(A_κ W A_κ' + L L') for κ = 0 and 1.
+
+    A_κ = A - κBK, c_κ = C - κDK.
+    """
     n = len(model)
     grow = 1.0 + DECREASE_ROOM
     floor = REGULARISATION * float(np.trace(open_loop_covariance(model, L))) * np.eye(n)
@@ -136,11 +142,12 @@ def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray)
         return W
     scale = float(np.trace(open_loop_covariance(model, L)))
     variable = cp.Variable((n, n), symmetric=True)
-    constraints = []
+    reach = cp.Variable()
+    constraints: list[cp.Constraint] = [(variable @ c) @ c <= reach for c in _output_rows(model, K)]
     for closed in (model.A, model.A - model.B @ K[None, :]):
         decrease = variable - grow * closed @ variable @ closed.T - noise / scale
         constraints.append(decrease >> 0)
-    problem = cp.Problem(cp.Minimize(variable[0, 0]), constraints)
+    problem = cp.Problem(cp.Minimize(reach), constraints)
     problem.solve(solver=cp.CLARABEL)
     if variable.value is None:
         raise Infeasible(
@@ -148,3 +155,14 @@ def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray)
             "try a larger input weight"
         )
     return np.asarray(variable.value) * scale
+
+
+def _output_rows(model: DifferenceEquation, K: FloatArray) -> list[FloatArray]:
+    """c_κ of y - y_k = c_κ x̄ + e for κ = 0 and 1: with the policy engaged, ū = -Kx̄ adds -DK."""
+    return [model.C[0], model.C[0] - model.D * K]
+
+
+def _rounded_up(width: float) -> float:
+    """The next number of three significant digits, to be printed and proved as it is."""
+    digits = 2 - int(np.floor(np.log10(width)))
+    return float(np.round(np.ceil(width * 10.0**digits) / 10.0**digits, digits))

@@ -1,16 +1,25 @@
 """The linear regression all identification methods share: a dataset as rows of lagged signals."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification.rows import Rows
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.trajectory import Dataset
 
 MIN_ROWS_PER_PARAMETER = 5  # fewer and the fit is an interpolation, not an estimate
 RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeats the others
+
+
+@dataclass(frozen=True)
+class LinearClass:
+    """Linear difference equations with `lags` n lags of one output and of one input."""
+
+    lags: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +38,18 @@ class Regression:
     y_scale: tuple[float, float]
     u_scale: tuple[float, float]
     dataset: Dataset
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The same rows for the robust simulation error."""
+        inside = [self.row >= k for k in range(self.lags + 1)]
+        return Rows(
+            offsets=tuple(range(self.lags + 1)),
+            weights=np.asfortranarray(np.column_stack(inside).astype(np.float64)),
+            errors=np.asfortranarray(self.Y),
+            Q=np.asfortranarray(self.Q),
+            identity=np.eye(self.lags + 1)[0],
+        )
 
     @property
     def lags(self) -> int:

@@ -1,4 +1,4 @@
-"""Simulation error: how it is scored, and its direct minimisation (SEM), the usual comparator."""
+"""Simulation error minimisation (SEM), the usual comparator."""
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -7,25 +7,10 @@ from scipy.signal import lfilter, lfiltic
 from nlsid_core._types import FloatArray
 from nlsid_core.identification.regression import Regression
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.trajectory import Dataset
 
 UNSTABLE_RESIDUAL = 1e6  # in units of the signal's spread: a diverged simulation, kept finite
 LM_TOLERANCE = 1e-12  # relative decrease of the cost at which the minimiser stops
 LM_EVALUATIONS = 300
-
-
-def simulation_error_percent(model: DifferenceEquation, dataset: Dataset) -> float:
-    """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial.
-
-    ŷ is simulated from the first n measured outputs with the recorded inputs.
-    """
-    n = len(model)
-    measured = np.concatenate([trial.y[n:, 0] for trial in dataset])
-    simulated = np.concatenate(
-        [model.simulate(trial.u[:, 0], trial.y[:n, 0])[n:] for trial in dataset]
-    )
-    spread = np.linalg.norm(measured - measured.mean())
-    return float(100.0 * np.linalg.norm(measured - simulated) / spread)
 
 
 def minimise_simulation_error(

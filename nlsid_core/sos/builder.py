@@ -270,10 +270,9 @@ class Builder:
     def finish(self) -> "Layout":
         """The cone data as a function of the parameters."""
         sizes = self._column_sizes()
-        scaled = [
+        self.equality.value = [
             v * sizes[c] for v, c in zip(self.equality.value, self.equality.column, strict=True)
         ]
-        self.equality.value = scaled
         shift = _Entries(
             [row + self.equality_rows for row in self.cone.row],
             self.cone.column,

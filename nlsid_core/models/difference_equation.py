@@ -1,4 +1,4 @@
-"""Identified models: frozen numbers, a document form, and simulation."""
+"""`DifferenceEquation`: a linear model with one input and one output."""
 
 from dataclasses import dataclass
 
@@ -8,30 +8,9 @@ from numpy.typing import NDArray
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.models.signal import FORMAT, VERSION, Signal
 
-FORMAT = "nlsid/model"
-VERSION = 1
 KIND = "difference_equation"
-
-
-@dataclass(frozen=True)
-class Signal:
-    """A signal's name, unit, and `topic:field.path` it is read from (empty: not from a topic)."""
-
-    name: str
-    unit: str = ""
-    path: str = ""
-
-    def document(self) -> Json:
-        """The JSON form."""
-        return {"name": self.name, "unit": self.unit, "path": self.path}
-
-    @classmethod
-    def from_document(cls, document: Json, *, source: str) -> "Signal":
-        """Raises DocumentError if a part is missing."""
-        return cls(
-            *(_json.member(document, key, str, source=source) for key in ("name", "unit", "path"))
-        )
 
 
 @dataclass(frozen=True, eq=False)

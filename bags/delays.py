@@ -1,0 +1,46 @@
+"""The delay between a command and the response to it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import correlate, correlation_lags
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError
+
+
+@dataclass(frozen=True)
+class Delay:
+    """seconds: by which the response follows the command. correlation: there, -1 to 1."""
+
+    seconds: float
+    correlation: float
+
+
+def delay(command: FloatArray, response: FloatArray, period: float, max_delay: float) -> Delay:
+    """The delay (N,) samples `period` s apart show: where command and response correlate most.
+
+    Of two signals on one grid the normalised cross-correlation about their means, over delays from
+    0 to `max_delay` s, refined by a parabola through its peak. A lag in the response counts as
+    part of the delay. Raises DataError if either is constant or `max_delay` leaves no overlap.
+
+    Source: C. Knapp, G. Carter, IEEE Trans. ASSP 24 (1976) 320, the unweighted correlator.
+    """
+    most = min(round(max_delay / period), len(command) - 2)
+    if most < 1 or len(command) != len(response):
+        raise DataError(f"{len(command)} samples leave no delay of up to {max_delay:g} s to find")
+    u, y = command - command.mean(), response - response.mean()
+    if not (u @ u > 0 and y @ y > 0):
+        raise DataError("a constant signal has no delay")
+    lags = correlation_lags(len(y), len(u))
+    wanted = (lags >= 0) & (lags <= most)
+    overlap = len(u) - lags[wanted]
+    found = correlate(y, u, method="fft")[wanted] * (len(u) / overlap)
+    found = found / np.sqrt((u @ u) * (y @ y))
+    k = int(np.argmax(np.abs(found)))
+    shift = 0.0
+    if 0 < k < len(found) - 1:
+        before, here, after = np.abs(found[k - 1 : k + 2])
+        bend = before - 2 * here + after
+        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return Delay((k + shift) * period, float(np.clip(found[k], -1.0, 1.0)))

@@ -1,0 +1,94 @@
+"""The clocks of a recording: offset and drift between them, gaps, duplicates."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.errors import DataError
+
+SEGMENTS: Final = 50  # of the recording, each giving its least latency to the line of the drift
+SAME_CLOCK: Final = 1.0  # s; latencies stay below, an offset between clocks rarely does
+DRIFT_SIGNIFICANT: Final = 5.0  # times the scatter of the segments about the line
+OWN_PACE: Final = 1e-3  # s per s; two real clocks differ by less
+DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency says nothing
+
+
+@dataclass(frozen=True)
+class ClockRelation:
+    """Header stamps against log times.
+
+    offset: s, stamp minus log time at the start, for the message that came through fastest.
+    drift: s per s, by which the stamps' clock runs faster; 0 if none can be told from the scatter.
+    latency: s, median time from stamp to log beyond the fastest message's. spread: s, its 95 %.
+    """
+
+    offset: float
+    drift: float
+    latency: float
+    spread: float
+
+    @property
+    def same_clock(self) -> bool:
+        """Whether stamps and log times can be of one clock."""
+        return abs(self.offset) < SAME_CLOCK and not self.drift
+
+    def __str__(self) -> str:
+        if self.same_clock:
+            return (
+                f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
+            )
+        if abs(self.drift) > OWN_PACE:
+            return f"stamps run at {1 + self.drift:.3g} times the pace of log time: simulated time?"
+        drift = f", drifting {1e6 * self.drift:+.3g} ppm" if self.drift else ", constant"
+        return f"stamps {self.offset:+.3f} s from log time{drift}"
+
+
+def clock_relation(stamp_ns: IntArray, log_ns: IntArray) -> ClockRelation:
+    """How the header stamps (N,) relate to the log times (N,) of the same messages, N > 0.
+
+    A message is logged after it is stamped, by a latency that varies: the offset between the clocks
+    shows in the messages that came through fastest. The drift is the slope of a line through the
+    fastest of each of 50 parts.
+    """
+    if not len(stamp_ns):
+        raise DataError("no messages, so no relation between their clocks")
+    origin = int(stamp_ns[0]) - int(log_ns[0])
+    ahead = ((stamp_ns - log_ns) - origin) / 1e9
+    t = (log_ns - log_ns[0]) / 1e9
+    slope = _drift(t, ahead)
+    level = ahead - slope * t
+    offset = float(level.max())
+    late = offset - level
+    latency, spread = np.quantile(late, (0.5, 0.95))
+    return ClockRelation(origin / 1e9 + offset, slope, float(latency), float(spread))
+
+
+def _drift(t: FloatArray, ahead: FloatArray) -> float:
+    if len(t) < 2 * SEGMENTS or t[-1] <= t[0]:
+        return 0.0
+    parts = np.array_split(np.arange(len(t)), SEGMENTS)
+    best = [part[np.argmax(ahead[part])] for part in parts]
+    x, y = t[best], ahead[best]
+    slope, level = np.polyfit(x - x.mean(), y, 1)
+    scatter = float(np.std(y - slope * (x - x.mean()) - level))
+    total = abs(slope) * float(t[-1] - t[0])
+    if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter):
+        return 0.0
+    return float(slope)
+
+
+def segments(stamp_ns: IntArray, max_gap: float) -> list[tuple[int, int]]:
+    """[start, stop) of the runs of messages with at most `max_gap` s between neighbours."""
+    if not len(stamp_ns):
+        return []
+    breaks = np.flatnonzero(np.diff(stamp_ns) > max_gap * 1e9) + 1
+    edges = [0, *breaks.tolist(), len(stamp_ns)]
+    return list(pairwise(edges))
+
+
+def without_duplicates(stamp_ns: IntArray) -> IntArray:
+    """Indices of the first message of each stamp (stamps sorted)."""
+    return np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[:1] - 1) > 0).astype(np.int64)

@@ -1,0 +1,248 @@
+"""Reading selected numbers out of a large bag: messages per second and memory.
+
+python -m benchmarks.bag_reading [--json] [--messages 2000000] [--data DIR]
+
+The bag holds JointState (six joints), Odometry and Imu in equal parts, in zstd chunks; it is
+generated once and kept in DIR (default: the temporary folder). Beside ours run, on the first
+messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
+deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
+machine does not count; the memory is that process's.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import multiprocessing
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bags.message_types import standard_types
+from bags.reader import read_signals
+from bags.writer import BagWriter
+from benchmarks.machine import describe
+
+MESSAGES: Final = 2_000_000
+SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
+REPEATS: Final = 3
+JOINTS, ODOM, IMU = "/joint_states", "/odom", "/imu"
+TYPES: Final = {
+    JOINTS: "sensor_msgs/msg/JointState",
+    ODOM: "nav_msgs/msg/Odometry",
+    IMU: "sensor_msgs/msg/Imu",
+}
+SIGNALS: Final = (
+    *(f"{JOINTS}:position[{k}]" for k in range(6)),
+    *(f"{JOINTS}:velocity[{k}]" for k in range(6)),
+    f"{ODOM}:pose.pose.position.x",
+    f"{ODOM}:pose.pose.position.y",
+    f"{ODOM}:twist.twist.linear.x",
+    f"{ODOM}:twist.twist.angular.z",
+    f"{IMU}:angular_velocity.z",
+    f"{IMU}:linear_acceleration.x",
+    f"{IMU}:linear_acceleration.y",
+)
+START_NS: Final = 1_700_000_000 * 10**9
+PERIOD_NS: Final = 1_000_000
+
+
+def generated_bag(folder: Path, messages: int) -> Path:
+    """The bag of that many messages, made if it is not there yet."""
+    bag = folder / f"nlsid_bag_reading_{messages}"
+    if not bag.is_dir():
+        with BagWriter(bag) as writer:
+            for k, (topic, data) in zip(range(messages), _messages(), strict=False):
+                stamp_ns = START_NS + k * PERIOD_NS
+                times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
+                writer.write(topic, TYPES[topic], data, **times)
+    return bag
+
+
+def _messages() -> Iterator[tuple[str, bytes]]:
+    """The three topics in turn, with fresh noise and stamps in otherwise equal messages."""
+    rng = np.random.default_rng(0)
+    templates = {topic: bytearray(_template(topic)) for topic in TYPES}
+    places = {topic: _noisy_places(topic, bytes(data)) for topic, data in templates.items()}
+    k = 0
+    while True:
+        for topic, data in templates.items():
+            stamp_ns = START_NS + k * PERIOD_NS
+            data[4:12] = np.array([stamp_ns // 10**9, stamp_ns % 10**9], "<u4").tobytes()
+            for place, count in places[topic]:
+                noise = rng.standard_normal(count).round(4)
+                data[place : place + 8 * count] = noise.tobytes()
+            yield topic, bytes(data)
+            k += 1
+
+
+def _template(topic: str) -> bytes:
+    types = standard_types().types
+    stamp = types["builtin_interfaces/msg/Time"](0, 0)
+    header = types["std_msgs/msg/Header"](stamp, "base_link")
+    vector = types["geometry_msgs/msg/Vector3"](1.0, 1.0, 1.0)
+    quaternion = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    kind = types[TYPES[topic]]
+    message: Any
+    if topic == JOINTS:
+        names = [f"arm_joint_{k}" for k in range(1, 7)]
+        message = kind(header, names, *(np.ones(6) for _ in range(3)))
+    elif topic == IMU:
+        flat = np.zeros(9)
+        message = kind(header, quaternion, flat, vector, flat, vector, flat)
+    else:
+        point = types["geometry_msgs/msg/Point"](1.0, 1.0, 1.0)
+        pose = types["geometry_msgs/msg/Pose"](point, quaternion)
+        twist = types["geometry_msgs/msg/Twist"](vector, vector)
+        message = kind(
+            header,
+            "base_footprint",
+            types["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+            types["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36)),
+        )
+    return bytes(standard_types().serialize_cdr(message, TYPES[topic]))
+
+
+def _noisy_places(topic: str, data: bytes) -> list[tuple[int, int]]:
+    """(offset, count) of the runs of ones in a template: what a sensor would have measured."""
+    one = np.ones(1).tobytes()
+    runs: list[tuple[int, int]] = []
+    at = data.find(one)
+    while at >= 0:
+        if runs and runs[-1][0] + 8 * runs[-1][1] == at:
+            runs[-1] = (runs[-1][0], runs[-1][1] + 1)
+        else:
+            runs.append((at, 1))
+        at = data.find(one, at + 8)
+    assert runs, topic
+    return runs
+
+
+def read_ours(bag: Path, _messages: int) -> int:
+    """All of the bag, through the public reader."""
+    read = read_signals(bag, SIGNALS)
+    return sum(len(read[signal]) for signal in (SIGNALS[0], SIGNALS[12], SIGNALS[16]))
+
+
+def read_mcap_ros2(bag: Path, messages: int) -> int:
+    """The first messages with mcap-ros2-support: decode every message, take the numbers."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        decoded = (
+            (channel.topic, message)
+            for _, channel, _, message in reader.iter_decoded_messages(topics=list(TYPES))
+        )
+        return _take(decoded, messages)
+
+
+def read_rosbags(bag: Path, messages: int) -> int:
+    """The first messages with rosbags: deserialise every message, take the numbers."""
+    from rosbags.rosbag2 import Reader
+
+    types = standard_types()
+    with Reader(bag) as reader:
+        decoded = (
+            (connection.topic, types.deserialize_cdr(data, connection.msgtype))
+            for connection, _, data in reader.messages()
+        )
+        return _take(decoded, messages)
+
+
+def _take(decoded: Iterator[tuple[str, Any]], messages: int) -> int:
+    columns: dict[str, list[list[float]]] = {topic: [] for topic in TYPES}
+    done = 0
+    for topic, m in decoded:
+        if topic == JOINTS:
+            row = [*m.position, *m.velocity]
+        elif topic == ODOM:
+            p, v = m.pose.pose.position, m.twist.twist
+            row = [p.x, p.y, v.linear.x, v.angular.z]
+        else:
+            row = [m.angular_velocity.z, m.linear_acceleration.x, m.linear_acceleration.y]
+        columns[topic].append([m.header.stamp.sec * 1e9 + m.header.stamp.nanosec, *row])
+        done += 1
+        if done == messages:
+            break
+    for rows in columns.values():
+        np.array(rows)
+    return done
+
+
+def _timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[float, float]:
+    started = time.process_time()
+    done = read(bag, messages)
+    seconds = time.process_time() - started
+    return done / seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[float, float]:
+    """(messages/s, peak memory in MB) of one reading, in a fresh process."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=1, mp_context=context) as pool:
+        return pool.submit(_timed, read, bag, messages).result()
+
+
+def measure(folder: Path, messages: int) -> dict[str, float]:
+    """Run every reader side by side and return the promised keys."""
+    bag = generated_bag(folder, messages)
+    readers = {"ours": read_ours, "mcap_ros2": read_mcap_ros2, "rosbags": read_rosbags}
+    rates: dict[str, list[float]] = {name: [] for name in readers}
+    peaks: list[float] = []
+    for _ in range(REPEATS):
+        for name, read in readers.items():
+            rate, peak = timed(read, bag, min(SAMPLE, messages))
+            rates[name].append(rate)
+            if name == "ours":
+                peaks.append(peak)
+    median = {name: statistics.median(found) for name, found in rates.items()}
+    return {
+        "messages_per_s": median["ours"],
+        "mcap_ros2_per_s": median["mcap_ros2"],
+        "rosbags_per_s": median["rosbags"],
+        "ratio_mcap_ros2": median["ours"] / median["mcap_ros2"],
+        "ratio_rosbags": median["ours"] / median["rosbags"],
+        "peak_mb": max(peaks),
+        "bag_mb": sum(file.stat().st_size for file in bag.iterdir()) / 1e6,
+    }
+
+
+def main() -> None:
+    """Print the table, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
+    parser.add_argument("--messages", type=int, default=MESSAGES)
+    parser.add_argument("--data", type=Path, default=Path(tempfile.gettempdir()))
+    arguments = parser.parse_args()
+    keys = measure(arguments.data, arguments.messages)
+    print(
+        f"{arguments.messages} messages (JointState, Odometry, Imu), {len(SIGNALS)} numbers, "
+        f"{keys['bag_mb']:.0f} MB, {describe()}\n"
+    )
+    print(f"{'':44s}{'measured':>12s}{'wanted':>10s}")
+    for label, key, wanted in (
+        ("nlsid [messages/s]", "messages_per_s", "-"),
+        ("mcap-ros2-support [messages/s]", "mcap_ros2_per_s", "60000"),
+        ("rosbags, deserialise all [messages/s]", "rosbags_per_s", "90000"),
+        ("ratio to mcap-ros2-support", "ratio_mcap_ros2", ">= 30"),
+        ("ratio to rosbags", "ratio_rosbags", ">= 12"),
+        ("peak memory [MB]", "peak_mb", "<= 300"),
+    ):
+        print(f"{label:44s}{keys[key]:12.1f}{wanted:>10s}")
+    if arguments.json:
+        print(json.dumps(keys))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Short, complete programs; each has run() -> (computed, published), which a test compares."""

@@ -1,0 +1,35 @@
+"""The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
+
+from bags.grid import read_dataset
+from bags.samples import f1tenth
+from nlsid_core.funnels import design_tube
+from nlsid_core.identification import LinearClass, identify, simulation_percent
+from nlsid_core.monitor import Monitor, Status
+
+TEST = [f"trial_{k}" for k in ("05", "11", "16", "22", "27", "33", "38", "41")]
+SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+
+
+def run() -> tuple[dict[str, float], dict[str, float]]:
+    """(computed, published): the test error in % and how many test trials stay inside."""
+    dataset = read_dataset(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
+    train, test = dataset.without(TEST), dataset.select(TEST)
+
+    fit = identify(train, LinearClass(4))
+    design = design_tube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)], horizon=2.9)
+
+    inside = 0
+    for trial in test:
+        monitor = Monitor(fit.model, design.policy, design.funnel)
+        samples = zip(trial.t[:120], trial.y[:, 0], trial.u[:, 0], strict=False)
+        readings = [monitor.update(t, y, u) for t, y, u in samples]
+        inside += all(r.status in (Status.INSIDE, Status.UNKNOWN) for r in readings)
+
+    error = simulation_percent(fit.model, test)
+    return {"error": error, "inside": inside}, {"error": 8.5, "inside": 8}
+
+
+if __name__ == "__main__":
+    computed, published = run()
+    for key, value in computed.items():
+        print(f"{key:10s}{value:8.2f}   published {published[key]:g}")

@@ -1,0 +1,207 @@
+"""Least squares on the simulation error of a block cascade: exact sensitivities, damped steps.
+
+With r = ŷ - y and J = ∂ŷ/∂θ, minimise mean(r²) + smoothing·Σ(second differences of f)² by
+Levenberg-Marquardt steps (J'J + λ diag(J'J))δ = -J'r; steps to unstable filters are rejected.
+Source: Marquardt 1963; the sensitivities are those of linear filters, each a filter itself.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.signal import lfilter
+
+from nlsid_core._types import FloatArray
+from nlsid_core.models import Spline
+
+FIRST_DAMPING = 1e-1
+DAMPING_DOWN, DAMPING_UP = 0.2, 4.0
+GIVE_UP_DAMPING = 1e8
+PATIENCE = 3  # steps in a row that gain too little: the first ones may be damped, not done
+MAX_RADIUS = 1.0 - 1e-6  # of the poles: beyond it a step is refused
+RIDGE = 1e-10  # of the largest diagonal entry: a basis function without data has no curvature
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One record, scaled: u, y (N,). The first `transient` samples are simulated, not scored."""
+
+    u: FloatArray
+    y: FloatArray
+    transient: int
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """The numbers of a `BlockCascade`, in the scaled units of its trials."""
+
+    a1: FloatArray
+    b1: FloatArray
+    f: Spline
+    a2: FloatArray
+    b2: FloatArray
+
+    def vector(self) -> FloatArray:
+        """θ = [a1, b1, a2, b2, coefficients of f]."""
+        parts = (self.a1, self.b1.ravel(), self.a2, self.b2.ravel(), self.f.coefficients)
+        return np.concatenate(parts)
+
+    def moved(self, step: FloatArray) -> "Parameters":
+        """The parameters of θ + step."""
+        theta, start, parts = self.vector() + step, 0, []
+        for part in (self.a1, self.b1, self.a2, self.b2):
+            parts.append(theta[start : start + part.size].reshape(part.shape))
+            start += part.size
+        a1, b1, a2, b2 = parts
+        return Parameters(a1, b1, replace(self.f, coefficients=theta[start:]), a2, b2)
+
+    @property
+    def radius(self) -> float:
+        """The largest pole radius of the two filters."""
+        roots = [np.roots(np.concatenate([[1.0], -a])) for a in (self.a1, self.a2)]
+        return float(np.abs(np.concatenate([[0.0], *roots])).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the steps ended: parameters, mean squared residual without penalty, steps taken."""
+
+    parameters: Parameters
+    cost: float
+    steps: int
+
+
+def minimise(
+    trials: tuple[Trial, ...],
+    start: Parameters,
+    *,
+    smoothing: float,
+    steps: int,
+    tolerance: float,
+) -> Minimum:
+    """Damped Gauss-Newton from `start` until steps gain less than `tolerance` of the cost."""
+    D = _second_differences(start)
+    weight = smoothing / float(np.ptp(start.f.coefficients) ** 2 + np.finfo(float).tiny)
+    here, residual = start, _residual(trials, start)
+    cost = _cost(residual, here, D, weight)
+    damping, taken, small = FIRST_DAMPING, 0, 0
+    while taken < steps and small < PATIENCE and damping < GIVE_UP_DAMPING:
+        J = np.concatenate([sensitivities(trial, here) for trial in trials], axis=1)
+        gradient = J @ residual / len(residual) + weight * (D.T @ (D @ here.vector()))
+        H = J @ J.T / len(residual) + weight * (D.T @ D)
+        taken += 1
+        gain = 0.0
+        while damping < GIVE_UP_DAMPING:
+            candidate = _step(here, H, gradient, damping)
+            if candidate is not None:
+                trial_residual = _residual(trials, candidate)
+                reached = _cost(trial_residual, candidate, D, weight)
+                if reached < cost:
+                    gain = (cost - reached) / cost
+                    here, residual, cost = candidate, trial_residual, reached
+                    damping *= DAMPING_DOWN
+                    break
+            damping *= DAMPING_UP
+        small = small + 1 if gain < tolerance else 0
+    return Minimum(here, float(residual @ residual) / len(residual), taken)
+
+
+def simulate(parameters: Parameters, u: FloatArray) -> FloatArray:
+    """Outputs (N,) from rest, as `BlockCascade.simulate` and faster."""
+    forcing = np.zeros(len(u))
+    for b1, b2 in zip(parameters.b1, parameters.b2, strict=True):
+        forcing += lfilter(b2, [1.0], parameters.f(lfilter(b1, _monic(parameters.a1), u)))
+    outputs: FloatArray = lfilter([1.0], _monic(parameters.a2), forcing)
+    return outputs
+
+
+def second_inputs(parameters: Parameters, u: FloatArray) -> FloatArray:
+    """(M, N): x_j, what each phase of f sees."""
+    inputs = [lfilter(b1, _monic(parameters.a1), u) for b1 in parameters.b1]
+    return np.array(inputs)
+
+
+def basis_responses(parameters: Parameters, x: FloatArray) -> FloatArray:
+    """(K + 3, N): the output's part of each coefficient of f, for x (M, N)."""
+    A2, rows = _monic(parameters.a2), np.arange(x.shape[1])
+    responses = np.zeros((len(parameters.f.coefficients), x.shape[1]))
+    for x_j, b2 in zip(x, parameters.b2, strict=True):
+        index, weights = parameters.f.weights(x_j)
+        basis = np.zeros_like(responses)
+        for r in range(4):
+            basis[index + r, rows] = weights[r]
+        responses += lfilter(b2, A2, basis)
+    return responses
+
+
+def _residual(trials: tuple[Trial, ...], parameters: Parameters) -> FloatArray:
+    with np.errstate(all="ignore"):  # a wild candidate may overflow: its cost is not less
+        parts = [simulate(parameters, t.u)[t.transient :] - t.y[t.transient :] for t in trials]
+        return np.concatenate(parts)
+
+
+def _cost(residual: FloatArray, parameters: Parameters, D: FloatArray, weight: float) -> float:
+    with np.errstate(all="ignore"):
+        bend = D @ parameters.vector()
+        return float(residual @ residual) / len(residual) + weight * float(bend @ bend)
+
+
+def _step(
+    here: Parameters, H: FloatArray, gradient: FloatArray, damping: float
+) -> Parameters | None:
+    """The damped step, None if it leaves the stable filters."""
+    diagonal = np.diag(H)
+    try:
+        damped = H + np.diag(damping * diagonal + RIDGE * np.max(diagonal))
+        step = cho_solve(cho_factor(damped), -gradient)
+    except (LinAlgError, ValueError):
+        return None
+    candidate = here.moved(step)
+    return candidate if candidate.radius < MAX_RADIUS else None
+
+
+def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:
+    """(number of parameters, N - transient): ∂ŷ/∂θ, rows in the order of `Parameters.vector`."""
+    p = parameters
+    N = len(trial.u)
+    A1, A2 = _monic(p.a1), _monic(p.a2)
+    x = second_inputs(p, trial.u)
+    u_filtered = lfilter([1.0], A1, trial.u)
+    n1, m1, n2, m2, M = len(p.a1), p.b1.shape[1], len(p.a2), p.b2.shape[1], len(p.b1)
+    J = np.zeros((p.vector().size, N))
+    at_b1, at_a2 = n1, n1 + M * m1
+    at_b2, at_c = at_a2 + n2, at_a2 + n2 + M * m2
+    for j in range(M):
+        slope = p.f.slope(x[j])
+        # ∂x/∂b1[i] and ∂x/∂a1[k] are u and x, delayed and filtered by 1/A1.
+        for i in range(m1):
+            J[at_b1 + j * m1 + i] = lfilter(p.b2[j], A2, slope * _delayed(u_filtered, i))
+        x_filtered = lfilter([1.0], A1, x[j])
+        for k in range(n1):
+            J[k] += lfilter(p.b2[j], A2, slope * _delayed(x_filtered, k + 1))
+        w_filtered = lfilter([1.0], A2, p.f(x[j]))
+        for i in range(m2):
+            J[at_b2 + j * m2 + i] = _delayed(w_filtered, i)
+    y_filtered = lfilter([1.0], A2, simulate(p, trial.u))
+    for k in range(n2):
+        J[at_a2 + k] = _delayed(y_filtered, k + 1)
+    J[at_c:] = basis_responses(p, x)
+    return J[:, trial.transient :]
+
+
+def _delayed(signal: FloatArray, samples: int) -> FloatArray:
+    moved = np.zeros_like(signal)
+    moved[samples:] = signal[: len(signal) - samples]
+    return moved
+
+
+def _monic(a: FloatArray) -> FloatArray:
+    return np.concatenate([[1.0], -a])
+
+
+def _second_differences(parameters: Parameters) -> FloatArray:
+    """(K + 1, number of parameters): second differences of the coefficients of f."""
+    K = parameters.f.intervals
+    D = np.zeros((K + 1, parameters.vector().size))
+    D[:, -(K + 3) :] = np.diff(np.eye(K + 3), n=2, axis=0)
+    return D

@@ -1,0 +1,82 @@
+"""Small linear matrix inequalities: their barriers, and linear objectives over them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+
+CENTRED = 1e-6  # Newton decrement of -log det: the barrier has no unit
+NEWTON_STEPS = 100
+QUADRATIC = 0.1  # decrement below which a full Newton step stays inside
+MU_FALL = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixInequality:
+    """F₀ + Σ z_i F_i ⪰ 0 on z = [θ; extra unknowns]; F: (1 + n_z, m, m), F₀ first."""
+
+    F: FloatArray
+
+    def at(self, z: FloatArray) -> FloatArray:
+        """The matrix at z."""
+        return np.asarray(self.F[0] + np.tensordot(z, self.F[1:], axes=1))
+
+    def barrier(self, z: FloatArray) -> float:
+        """-log det; infinite outside."""
+        try:
+            return float(-2.0 * np.log(np.diag(np.linalg.cholesky(self.at(z)))).sum())
+        except np.linalg.LinAlgError:
+            return np.inf
+
+    def derivatives(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of the barrier."""
+        L = np.linalg.cholesky(self.at(z))
+        half = np.linalg.solve(L, self.F[1:])
+        scaled = np.linalg.solve(L, half.transpose(0, 2, 1))
+        flat = scaled.reshape(len(scaled), scaled.shape[1] ** 2)
+        return -np.trace(scaled, axis1=1, axis2=2), flat @ flat.T
+
+
+def centre(
+    inequalities: Sequence[MatrixInequality],
+    z: FloatArray,
+    *,
+    objective: FloatArray | None = None,
+    mu: float = 1.0,
+) -> FloatArray:
+    """Minimise objective'z/μ - Σ log det by damped Newton, from a z strictly inside."""
+    c = np.zeros(len(z)) if objective is None else objective / mu
+
+    def value(z: FloatArray) -> float:
+        return float(c @ z + sum(inequality.barrier(z) for inequality in inequalities))
+
+    for _ in range(NEWTON_STEPS if len(z) else 0):
+        parts = [inequality.derivatives(z) for inequality in inequalities]
+        gradient = c + np.sum([slope for slope, _ in parts], axis=0)
+        hessian = np.sum([curvature for _, curvature in parts], axis=0)
+        step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
+        decrement = -float(gradient @ step)
+        if decrement < CENTRED:
+            break
+        length = 1.0 if decrement < QUADRATIC else 1.0 / (1.0 + np.sqrt(decrement))
+        while not value(z + length * step) <= value(z):
+            length /= 2
+            if length < CENTRED:
+                return z
+        z = z + length * step
+    return z
+
+
+def minimise_linear(
+    objective: FloatArray, inequalities: Sequence[MatrixInequality], z: FloatArray, *, gap: float
+) -> FloatArray:
+    """Minimise objective'z to within `gap`, staying strictly inside, from z inside."""
+    size = sum(inequality.F.shape[1] for inequality in inequalities)
+    mu = max(abs(float(objective @ z)), gap) / size
+    while True:
+        z = centre(inequalities, z, objective=objective, mu=mu)
+        if mu * size <= gap:
+            return z
+        mu *= MU_FALL

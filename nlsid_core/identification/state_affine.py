@@ -1,0 +1,213 @@
+"""Datasets as rows of a `StateAffineModel`, and back: scaled once here, undone once in the model.
+
+Source: thesis (4.1)-(4.3).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.errors import DataError
+from nlsid_core.identification.rows import Rows
+from nlsid_core.models import Signal, StateAffineModel
+from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.polynomial import monomials
+from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.trajectory import Dataset, Trajectory
+
+CONSTANT = 1e-10  # relative spread below which a signal is constant
+RANK_TOLERANCE = 1e-13  # relative singular value of unit columns at which a basis repeats itself
+
+
+@dataclass(frozen=True)
+class StateAffineClass:
+    """Which state-affine models: n lags, the input's delays, polynomial degrees in w.
+
+    leading_degree: of G_0, lagged_degree: of G_1 … G_n, right_degree: of p. delays: None is 0 … n.
+    u_range: (low, high) of each input, to which the model clips it; None is the range in the data.
+    """
+
+    lags: int
+    delays: tuple[int, ...] | None = None
+    leading_degree: int = 0
+    lagged_degree: int = 0
+    right_degree: int = 1
+    u_range: tuple[tuple[float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.lags < 1:
+            raise DataError(f"lags is {self.lags}; a difference equation has at least 1")
+        if min(self.leading_degree, self.lagged_degree, self.right_degree) < 0:
+            raise DataError("degrees should not be negative")
+        if any(not 0 <= d <= self.lags for d in self.delays or ()):
+            raise DataError(f"delays {self.delays} should be between 0 and {self.lags}")
+
+    def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
+        """(input, delay) of each entry of w."""
+        delays = tuple(range(self.lags + 1)) if self.delays is None else self.delays
+        return tuple((i, d) for d in delays for i in range(inputs))
+
+
+@dataclass(frozen=True, eq=False)
+class StateAffineRows:
+    """The rows of a dataset, and the way back from parameters to a model."""
+
+    rows: Rows
+    dataset: Dataset
+    left: tuple[IntArray, ...]
+    right: IntArray
+    R: FloatArray  # of the right basis: values = Q R
+    window: tuple[tuple[int, int], ...]
+    y_scale: tuple[FloatArray, FloatArray]
+    u_scale: tuple[FloatArray, FloatArray]
+    u_range: FloatArray
+
+    @property
+    def has_constant_lags(self) -> bool:
+        """One output, and G_1 … G_n do not depend on the input."""
+        return bool(self.rows.identity.sum() == 1) and all(len(g) == 1 for g in self.left[1:])
+
+    def window_range(self) -> FloatArray:
+        """(n_w, 2): the box of normalised windows that the declared input range allows."""
+        box = (self.u_range - self.u_scale[0][:, None]) / self.u_scale[1][:, None]
+        return np.asarray(box[[i for i, _ in self.window]])
+
+    def model(self, theta: FloatArray, p: FloatArray) -> StateAffineModel:
+        """The model of left parameters θ and right parameters p of orthonormal columns."""
+        n_y = len(self.y_scale[0])
+        G, start = [], 0
+        for exponents in self.left:
+            size = len(exponents) * n_y**2
+            coefficients = theta[start : start + size].reshape(-1, n_y, n_y)
+            G.append(Polynomials(exponents, coefficients))
+            start += size
+        first = self.dataset.trajectories[0]
+        right = -np.linalg.solve(self.R, p.reshape(-1, n_y))
+        return StateAffineModel(
+            G=tuple(G),
+            p=Polynomials(self.right, right),
+            window=self.window,
+            y_offset=self.y_scale[0],
+            y_scale=self.y_scale[1],
+            u_offset=self.u_scale[0],
+            u_scale=self.u_scale[1],
+            u_range=self.u_range,
+            period=self.dataset.period,
+            y=_signals(first, "y"),
+            u=_signals(first, "u"),
+            bags=tuple((trial.name, trial.digest) for trial in self.dataset),
+        )
+
+
+def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> StateAffineRows:
+    """Stack the rows t = n … of every trajectory, signals scaled to zero mean and unit spread.
+
+    Raises DataError if there are too few rows, or the inputs do not excite the right basis.
+    """
+    n = model_class.lags
+    short = [trial for trial in dataset if len(trial) <= n]
+    if short:
+        raise DataError(f"{short[0].name}: {len(short[0])} samples, {n} lags need more")
+    y_scale = _scale(np.concatenate([trial.y for trial in dataset]), "response")
+    u_all = np.concatenate([trial.u for trial in dataset])
+    u_scale = _scale(u_all, "excitation")
+    n_y, n_u = len(y_scale[0]), len(u_scale[0])
+    window = model_class.window(n_u)
+    Y = np.concatenate([_lagged((t.y - y_scale[0]) / y_scale[1], n) for t in dataset])
+    U = np.concatenate([_lagged((t.u - u_scale[0]) / u_scale[1], n) for t in dataset])
+    row = np.concatenate([np.arange(len(trial) - n) for trial in dataset])
+    w = np.stack([U[:, d, i] for i, d in window], axis=1)
+    left = tuple(
+        _basis(model_class.lagged_degree if k else model_class.leading_degree, len(window))
+        for k in range(n + 1)
+    )
+    right = _basis(model_class.right_degree, len(window))
+    parameters = sum(map(len, left)) * n_y**2 + len(right) * n_y
+    if len(Y) * n_y < parameters:
+        raise DataError(f"{len(Y) * n_y} equations for {parameters} parameters; give more data")
+    Q, R = np.linalg.qr(monomial_values(right, w))
+    _refuse_rank(R, n)
+    blocks = [
+        _block(k, left[k], w, Y, row >= k)
+        for k in range(n + 1)
+    ]  # fmt: skip
+    offsets, weights, errors = (
+        [entry for block in blocks for entry in block[0]],
+        np.concatenate([block[1] for block in blocks], axis=1),
+        np.concatenate([block[2] for block in blocks], axis=1),
+    )
+    identity = np.zeros(len(offsets))
+    identity[: n_y**2] = np.eye(n_y).ravel()
+    rows = Rows(
+        offsets=tuple(offsets),
+        weights=np.asfortranarray(weights),
+        errors=np.asfortranarray(errors),
+        Q=np.asfortranarray(np.kron(Q, np.eye(n_y)) if n_y > 1 else Q),
+        identity=identity,
+    )
+    declared = np.column_stack([u_all.min(axis=0), u_all.max(axis=0)])
+    if model_class.u_range is not None:
+        if len(model_class.u_range) != n_u:
+            raise DataError(f"u_range has {len(model_class.u_range)} inputs, the data {n_u}")
+        declared = np.array(model_class.u_range, dtype=np.float64)
+    return StateAffineRows(rows, dataset, left, right, R, window, y_scale, u_scale, declared)
+
+
+def _basis(degree: int, variables: int) -> IntArray:
+    """Exponents of every monomial of total degree 0 … `degree`, lowest first."""
+    return monomials(variables, range(degree + 1))
+
+
+def _block(
+    k: int, exponents: IntArray, w: FloatArray, Y: FloatArray, inside: NDArray[np.bool_]
+) -> tuple[list[int], FloatArray, FloatArray]:
+    """Offsets, weights and errors of G_k's parameters (monomial j, output a, lagged output b).
+
+    Row t·n_y + a, monomial φ_j: weight φ_j(w(t)) on the diagonal k·n_y + a - b.
+    """
+    T, _, n_y = Y.shape
+    offsets, weights, errors = [], [], []
+    for values in monomial_values(exponents, w).T:
+        for a in range(n_y):
+            for b in range(n_y):
+                weight, error = np.zeros((T, n_y)), np.zeros((T, n_y))
+                weight[:, a] = values * inside
+                error[:, a] = values * Y[:, k, b]
+                offsets.append(k * n_y + a - b)
+                weights.append(weight.ravel())
+                errors.append(error.ravel())
+    return offsets, np.column_stack(weights), np.column_stack(errors)
+
+
+def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
+    mean, spread = values.mean(axis=0), values.std(axis=0)
+    for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
+        raise DataError(
+            f"the {role} {i} is constant ({mean[i]:g}) in all trials: nothing can be identified "
+            "from it"
+        )
+    return mean, spread
+
+
+def _refuse_rank(R: FloatArray, lags: int) -> None:
+    singular = np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
+    rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
+    if rank < len(R):
+        raise DataError(
+            f"the excitation does not excite {lags} lags: its polynomial basis of {len(R)} has "
+            f"rank {rank}; use richer inputs, fewer lags or a lower degree"
+        )
+
+
+def _lagged(signal: FloatArray, lags: int) -> FloatArray:
+    """(N - lags, lags + 1, columns): [:, k] holds signal(t - k), t = lags …."""
+    N = len(signal)
+    return np.stack([signal[lags - k : N - k] for k in range(lags + 1)], axis=1)
+
+
+def _signals(trial: Trajectory, letter: str) -> tuple[Signal, ...]:
+    columns = zip(*(getattr(trial, f"{letter}_{key}") for key in ("names", "units", "paths")),
+                  strict=True)  # fmt: skip
+    return tuple(Signal(*labels) for labels in columns)

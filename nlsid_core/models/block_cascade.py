@@ -1,0 +1,145 @@
+"""`BlockCascade`: a linear filter, a static nonlinearity, a linear filter (Wiener-Hammerstein).
+
+    v(t) = u(t) + Σ_{k=1..n₁} a1[k-1] v(t-k),   x_j(t) = Σ_i b1[j, i] v(t-i),   j = 0 … M-1
+    y(t) = Σ_{k=1..n₂} a2[k-1] y(t-k) + Σ_j Σ_i b2[j, i] f(x_j(t-i))
+
+The M phases see the signal between the filters at M instants a sample: f makes harmonics beyond
+the sampled band, and what folds back is then described rather than left over. One lag and f linear
+is a linear filter; n₁ = 0 a Hammerstein, n₂ = 0 a Wiener model.
+Source: Schoukens and Tiels, "Identification of block-oriented nonlinear systems", Automatica 2017.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core import _json
+from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.spline import Spline
+
+KIND = "block_cascade"
+MAX_PHASES = 8  # a proof visits 2^M vertices
+
+
+@dataclass(frozen=True, eq=False)
+class BlockCascade:
+    """a1: (n₁,), b1: (M, m₁+1), f: the nonlinearity, a2: (n₂,), b2: (M, m₂+1).
+
+    One input, one output; t counts samples of `period` s. bags, training as in
+    `DifferenceEquation`.
+    Raises ShapeError or DataError on arrays that do not fit or are not finite.
+    """
+
+    a1: FloatArray
+    b1: FloatArray
+    f: Spline
+    a2: FloatArray
+    b2: FloatArray
+    period: float
+    y: Signal
+    u: Signal
+    bags: tuple[tuple[str, str], ...] = ()
+    training: str = ""
+
+    def __post_init__(self) -> None:
+        for key, dimensions in (("a1", 1), ("b1", 2), ("a2", 1), ("b2", 2)):
+            values = np.array(getattr(self, key), dtype=np.float64)
+            if values.ndim != dimensions:
+                raise ShapeError(f"{key} should have {dimensions} axes; has shape {values.shape}")
+            if not np.isfinite(values).all():
+                raise DataError(f"{key} should be finite")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        if self.b1.size == 0 or self.b2.size == 0 or len(self.b1) != len(self.b2):
+            raise ShapeError(f"b1 {self.b1.shape} and b2 {self.b2.shape} should have equal phases")
+        if len(self.b1) > MAX_PHASES:
+            raise DataError(f"{len(self.b1)} phases; at most {MAX_PHASES}")
+        if not (np.isfinite(self.period) and self.period > 0):
+            raise DataError(f"period {self.period} s is not positive")
+
+    @property
+    def phases(self) -> int:
+        """M, the instants a sample at which f is evaluated."""
+        return len(self.b1)
+
+    @property
+    def poles(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Poles of the first and of the second filter."""
+        first, second = (
+            np.roots(np.concatenate([[1.0], -a])).astype(np.complex128) for a in (self.a1, self.a2)
+        )
+        return first, second
+
+    def simulate(self, u: ArrayLike) -> FloatArray:
+        """Outputs (N,) for inputs u (N,) from rest (no input before the first sample)."""
+        inputs = np.asarray(u, dtype=np.float64)
+        if inputs.ndim != 1:
+            raise ShapeError(f"u should be (N,); has shape {inputs.shape}")
+        v, forcing = _recursion(self.a1, inputs), np.zeros(len(inputs))
+        for b1, b2 in zip(self.b1, self.b2, strict=True):
+            forcing += _moving_sum(b2, self.f(_moving_sum(b1, v)))
+        return _recursion(self.a2, forcing)
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": KIND,
+            "period": self.period,
+            "y": self.y.document(),
+            "u": self.u.document(),
+            "a1": self.a1.tolist(),
+            "b1": self.b1.tolist(),
+            "f": self.f.document(),
+            "a2": self.a2.tolist(),
+            "b2": self.b2.tolist(),
+            "training": self.training,
+            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "model") -> "BlockCascade":
+        """Raises DocumentError if the document is not a block cascade."""
+        _json.header(document, FORMAT, VERSION, source=source)
+        kind = _json.member(document, "kind", str, source=source)
+        if kind != KIND:
+            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        bags = _json.member(document, "bags", list, source=source)
+        return cls(
+            a1=_json.array(document, "a1", (None,), source=source),
+            b1=_json.array(document, "b1", (None, None), source=source),
+            f=Spline.from_document(
+                _json.member(document, "f", dict, source=source), source=f"{source} f"
+            ),
+            a2=_json.array(document, "a2", (None,), source=source),
+            b2=_json.array(document, "b2", (None, None), source=source),
+            period=_json.number(document, "period", source=source),
+            y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
+            u=Signal.from_document(_json.member(document, "u", dict, source=source), source=source),
+            training=_json.member(document, "training", str, source=source),
+            bags=tuple(_json.named_digests(bags, source=source)),
+        )
+
+
+def _moving_sum(b: FloatArray, signal: FloatArray) -> FloatArray:
+    """Σ_i b[i] signal(t - i), the signal zero before its first sample."""
+    return np.asarray(np.convolve(signal, b)[: len(signal)])
+
+
+def _recursion(a: FloatArray, forcing: FloatArray) -> FloatArray:
+    """x(t) = Σ_k a[k-1] x(t-k) + forcing(t), x zero before the first sample."""
+    coefficients = a.tolist()
+    past = [0.0] * len(coefficients)
+    outputs = []
+    for value in forcing.tolist():
+        for coefficient, x in zip(coefficients, past, strict=True):
+            value += coefficient * x
+        outputs.append(value)
+        if past:
+            past.insert(0, value)
+            past.pop()
+    return np.array(outputs)

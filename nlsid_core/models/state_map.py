@@ -1,0 +1,171 @@
+"""`StateModel`: an identified polynomial map of a measured state, and the box of its data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core import _json
+from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.polynomial import Polynomial
+
+KIND = "state_map"
+
+
+@dataclass(frozen=True, eq=False)
+class StateModel:
+    """x⁺ = Σ_i coefficients[i]·(x, u)^exponents[i]: one sample of `period` s ahead.
+
+    exponents: (m, n + p) of the monomials in [x; u], coefficients: (m, n), both in the signals'
+    units. x_range (n, 2) and u_range (p, 2) are the box of the data it was fitted on: outside
+    it the model is not a claim about anything. noise (n,) and disturbance (n,) are standard
+    deviations, of the measurement and of what one step ahead leaves unexplained. `bags` names
+    (name, digest) the recordings it was fitted on.
+
+    Source: (2.1). Raises ShapeError or DataError on arrays that do not fit or are not finite.
+    """
+
+    exponents: IntArray
+    coefficients: FloatArray
+    period: float
+    x: tuple[Signal, ...]
+    u: tuple[Signal, ...]
+    x_range: FloatArray
+    u_range: FloatArray
+    noise: FloatArray
+    disturbance: FloatArray
+    bags: tuple[tuple[str, str], ...] = ()
+
+    def __post_init__(self) -> None:
+        exponents = np.array(self.exponents, dtype=np.int64)
+        exponents.setflags(write=False)
+        object.__setattr__(self, "exponents", exponents)
+        n, p = len(self.x), len(self.u)
+        shapes = {
+            "coefficients": (len(exponents), n),
+            "x_range": (n, 2),
+            "u_range": (p, 2),
+            "noise": (n,),
+            "disturbance": (n,),
+        }
+        for key, shape in shapes.items():
+            values = np.array(getattr(self, key), dtype=np.float64)
+            if values.shape != shape:
+                raise ShapeError(f"model: {key} should have shape {shape}, has {values.shape}")
+            if not np.isfinite(values).all():
+                raise DataError(f"model: {key} holds NaN or infinity")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        if exponents.shape != (len(exponents), n + p) or (exponents < 0).any():
+            raise ShapeError(f"model: exponents should be (m, {n + p}) and not negative")
+        empty = (self.x_range[:, 0] >= self.x_range[:, 1]).any()
+        if empty or (self.u_range[:, 0] >= self.u_range[:, 1]).any():
+            raise DataError("model: the box of its data is empty")
+        if not (np.isfinite(self.period) and self.period > 0):
+            raise DataError(f"model: period is {self.period} s")
+        if (self.noise < 0).any() or (self.disturbance < 0).any():
+            raise DataError("model: noise and disturbance should not be negative")
+
+    def __len__(self) -> int:
+        """The number of states n."""
+        return len(self.x)
+
+    def __call__(self, x: ArrayLike, u: ArrayLike) -> FloatArray:
+        """x⁺ (..., n) for states (..., n) and inputs (..., p)."""
+        points = np.concatenate(
+            [np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)], axis=-1
+        )
+        next_state: FloatArray = self._monomials(points, self.exponents) @ self.coefficients
+        return next_state
+
+    def linearised(self, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """∂f/∂x (n, n) and ∂f/∂u (n, p) at one state (n,) and input (p,)."""
+        point = np.concatenate([np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)])
+        columns = []
+        for j in range(len(point)):
+            power = self.exponents[:, j]
+            lowered = self.exponents.copy()
+            lowered[:, j] = np.maximum(power - 1, 0)
+            columns.append((power * self._monomials(point, lowered)) @ self.coefficients)
+        jacobian = np.array(columns).T
+        return jacobian[:, : len(self)], jacobian[:, len(self) :]
+
+    def simulate(self, x_start: ArrayLike, u: ArrayLike) -> FloatArray:
+        """States (N + 1, n) from x_start under inputs u (N, p); may overflow to infinity."""
+        inputs = np.asarray(u, dtype=np.float64)
+        states = np.empty((len(inputs) + 1, len(self)))
+        states[0] = x_start
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k, u_k in enumerate(inputs):
+                states[k + 1] = self(states[k], u_k)
+        return states
+
+    def polynomials(self) -> NDArray[np.object_]:
+        """(n,) the equations as polynomials in x0…, u0…."""
+        names = [f"x{i}" for i in range(len(self))] + [f"u{i}" for i in range(len(self.u))]
+        rows = [Polynomial(self.exponents, column, tuple(names)) for column in self.coefficients.T]
+        equations = np.empty(len(rows), dtype=object)
+        equations[:] = rows
+        return equations
+
+    @staticmethod
+    def _monomials(points: FloatArray, exponents: IntArray) -> FloatArray:
+        values: FloatArray = np.prod(points[..., None, :] ** exponents, axis=-1)
+        return values
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "kind": KIND,
+            "equation": "x+ = sum_i coefficients[i] * prod_j [x; u][j] ^ exponents[i][j]",
+            "period": self.period,
+            "x": [signal.document() for signal in self.x],
+            "u": [signal.document() for signal in self.u],
+            "exponents": self.exponents.tolist(),
+            "coefficients": self.coefficients.tolist(),
+            "x_range": self.x_range.tolist(),
+            "u_range": self.u_range.tolist(),
+            "noise": self.noise.tolist(),
+            "disturbance": self.disturbance.tolist(),
+            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "model") -> "StateModel":
+        """Raises DocumentError if the document is not a state map."""
+        _json.header(document, FORMAT, VERSION, source=source)
+        kind = _json.member(document, "kind", str, source=source)
+        if kind != KIND:
+            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        x, u = (_signals(document, key, source) for key in ("x", "u"))
+        exponents = _json.array(document, "exponents", (None, len(x) + len(u)), source=source)
+        if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():
+            raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
+        bags = _json.member(document, "bags", list, source=source)
+        sizes = {"x_range": (len(x), 2), "u_range": (len(u), 2)}
+        sizes |= {"coefficients": (len(exponents), len(x))}
+        arrays = {key: _json.array(document, key, s, source=source) for key, s in sizes.items()}
+        return cls(
+            exponents=exponents.astype(np.int64),
+            period=_json.number(document, "period", source=source),
+            x=x,
+            u=u,
+            noise=_json.array(document, "noise", (len(x),), source=source),
+            disturbance=_json.array(document, "disturbance", (len(x),), source=source),
+            bags=tuple(_json.named_digests(bags, source=source)),
+            **arrays,
+        )
+
+
+MAX_DEGREE = 15  # of one variable in a file; a larger one would only be there to waste our time
+
+
+def _signals(document: Json, key: str, source: str) -> tuple[Signal, ...]:
+    entries = _json.member(document, key, list, source=source)
+    if not entries or not all(isinstance(entry, dict) for entry in entries):
+        raise DocumentError(f"{source}: '{key}' should list at least one signal")
+    return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

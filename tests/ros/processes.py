@@ -1,0 +1,85 @@
+"""Nodes as real processes, over real DDS, on a domain of their own."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+ROOT = Path(__file__).parents[2]
+STARTED = 15.0  # s: patience with a process or with discovery on a busy machine
+DOMAINS = 101  # those that are safe to use on every platform
+
+ros_test = [
+    pytest.mark.ros,
+    # an old lark, which the ROS wheels load with their first message
+    pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"),
+]
+
+
+def use_domain_of_this_run(patch: pytest.MonkeyPatch) -> None:
+    """Let nodes here and in processes started here see only each other."""
+    patch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+    patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % DOMAINS))
+
+
+@contextmanager
+def process(module: str, **parameters: object) -> Iterator[subprocess.Popen[str]]:
+    """Run a node's module with ROS parameters; killed at the end if it still runs."""
+    settings = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
+    running = subprocess.Popen(
+        [sys.executable, "-m", module, "--ros-args", *settings],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
+    )
+    try:
+        yield running
+    finally:
+        if running.poll() is None:
+            running.kill()
+        running.wait()
+        assert running.stdout is not None
+        running.stdout.close()
+
+
+def stop(running: subprocess.Popen[str], how: signal.Signals = signal.SIGINT) -> str:
+    """Signal a node, expect it to end cleanly, and return what it printed."""
+    running.send_signal(how)
+    output = running.communicate(timeout=STARTED)[0]
+    assert running.returncode == 0, output
+    return output
+
+
+@contextmanager
+def node_here(name: str) -> Iterator[tuple[Node, Callable[[Callable[[], bool]], None]]]:
+    """A node in this process, and a function that spins it until a condition holds."""
+    context = Context()
+    rclpy.init(context=context)
+    node = Node(name, context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def spin_until(condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + STARTED
+        while not condition():
+            assert time.monotonic() < deadline, "nothing happened"
+            executor.spin_once(timeout_sec=0.02)
+
+    try:
+        yield node, spin_until
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()

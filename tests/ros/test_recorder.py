@@ -1,0 +1,217 @@
+"""Recorder and player as processes over DDS: what is recorded is what was sent."""
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from nav_msgs.msg import Goals
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from bags.bag import Bag
+from bags.message_types import header_stamp_ns
+from bags.samples import f1tenth
+from nlsid_ros import qos
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+RECORDER = "nlsid_ros.trajectory_recorder"
+PLAYER = "nlsid_ros.bag_player"
+TOPICS = ["/odom", "/cmd_vel", "/steering_command"]
+TRIAL_05 = f1tenth()[4]
+
+
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_domain_of_this_run(monkeypatch)
+
+
+def messages_on(bag: Path, topic: str) -> list[bytes]:
+    with Bag(bag) as source:
+        return [message.data for message in source.messages([topic])]
+
+
+def test_a_trial_played_in_real_time_is_recorded_byte_for_byte(tmp_path: Path) -> None:
+    bag = tmp_path / "recorded"
+    reports: list[dict[str, str]] = []
+    texts: list[str] = []
+
+    def report(message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "trajectory_recorder":
+                texts.append(status.message)
+                reports.append({pair.key: pair.value for pair in status.values})
+
+    def all_received() -> bool:
+        return bool(reports) and reports[-1].get("/odom received") == "121"
+
+    with (
+        node_here("test_observer") as (node, spin_until),
+        process(RECORDER, topics=TOPICS, bag=bag) as recorder,
+    ):
+        node.create_subscription(DiagnosticArray, "/diagnostics", report, qos.EVENTS)
+        spin_until(lambda: bool(reports))
+        assert texts[0] == "; ".join(f"nothing on {topic} yet" for topic in TOPICS)
+        started = time.monotonic()
+        with process(PLAYER, bag=TRIAL_05) as player:
+            spin_until(all_received)
+            output = player.communicate()[0]
+            assert player.returncode == 0, output
+        assert time.monotonic() - started > 3.0, "a trial lasts 3 s"
+        stop(recorder, signal.SIGINT)
+
+    assert texts[-1] == "recording"
+    assert reports[-1] == {
+        "bag": str(bag),
+        "/odom received": "121",
+        "/odom lost": "0",
+        "/cmd_vel received": "120",
+        "/cmd_vel lost": "0",
+        "/steering_command received": "120",
+        "/steering_command lost": "0",
+    }
+    for topic in TOPICS:
+        assert messages_on(bag, topic) == messages_on(TRIAL_05, topic)
+    with (bag / "recorded.mcap").open("rb") as stream:
+        recorded = [message for *_, message in make_reader(stream).iter_messages()]
+    assert len(recorded) == 361
+    assert [m.publish_time for m in recorded] == [header_stamp_ns(m.data) for m in recorded]
+    arrivals = [m.log_time for m in recorded]
+    assert 2.9 < (arrivals[-1] - arrivals[0]) / 1e9 < 3.5
+    assert abs(time.time_ns() - arrivals[-1]) < 60 * 10**9, "log time is the time of arrival"
+
+
+def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None:
+    bag = tmp_path / "killed"
+    sent: list[int] = []
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(RECORDER, topics=["/joints"], bag=bag) as recorder,
+    ):
+        publisher = node.create_publisher(JointState, "/joints", qos.STREAM)
+        spin_until(lambda: publisher.get_subscription_count() == 1)
+
+        def publish() -> None:
+            sent.append(time.time_ns())
+            message = JointState(name=["wheel"], position=[float(len(sent))])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(sent[-1], 10**9)
+            publisher.publish(message)
+
+        node.create_timer(0.002, publish)
+        spin_until(lambda: len(sent) >= 1250)
+        recorder.kill()
+        recorder.wait()
+        killed_ns = time.time_ns()
+
+    kept: list[int] = []
+    with (bag / "killed.mcap").open("rb") as stream:
+        try:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, McapMessage):
+                    kept += [header_stamp_ns(record.data)]
+        except EndOfFile:
+            pass
+    assert kept == sent[: len(kept)]
+    assert len(kept) > 500
+    lost = sent[len(kept) :]
+    assert all((killed_ns - stamp_ns) / 1e9 <= 1.0 for stamp_ns in lost)
+
+
+def test_sigterm_closes_the_bag(tmp_path: Path) -> None:
+    bag = tmp_path / "terminated"
+    typed = "['odom:=nav_msgs/msg/Odometry', '/never:=std_msgs/msg/String']"
+    with process(RECORDER, topics=typed, bag=bag) as recorder:
+        with process(PLAYER, bag=TRIAL_05, topics=["/odom"], rate=50.0) as player:
+            assert player.wait(timeout=20) == 0
+        time.sleep(0.2)
+        stop(recorder, signal.SIGTERM)
+    assert messages_on(bag, "/odom") == messages_on(TRIAL_05, "/odom")
+
+
+def test_best_effort_topics_and_documents_latched_before_the_start_are_recorded(
+    tmp_path: Path,
+) -> None:
+    bag = tmp_path / "mixed"
+    with node_here("test_robot") as (node, spin_until):
+        latched = node.create_publisher(String, "/document", qos.DOCUMENT)
+        latched.publish(String(data="published before the recording"))
+        best_effort = QoSProfile(
+            depth=10,
+            reliability=ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.VOLATILE,
+        )
+        sensor = node.create_publisher(String, "/sensor", best_effort)
+        with process(RECORDER, topics=["/document", "/sensor"], bag=bag) as recorder:
+            spin_until(lambda: sensor.get_subscription_count() == 1)
+            spin_until(lambda: latched.get_subscription_count() == 1)
+            for _ in range(5):
+                sensor.publish(String(data="reading"))
+                time.sleep(0.05)
+            time.sleep(0.3)
+            stop(recorder)
+    assert len(messages_on(bag, "/document")) == 1
+    assert b"published before the recording" in messages_on(bag, "/document")[0]
+    assert len(messages_on(bag, "/sensor")) >= 4
+
+
+def test_a_topic_that_cannot_be_recorded_is_an_error_and_the_others_go_on(tmp_path: Path) -> None:
+    bag = tmp_path / "partly"
+    levels: list[tuple[bytes, str]] = []
+
+    def report(message: DiagnosticArray) -> None:
+        levels.extend((status.level, status.message) for status in message.status)
+
+    with node_here("test_robot") as (node, spin_until):
+        node.create_subscription(DiagnosticArray, "/diagnostics", report, qos.EVENTS)
+        text = node.create_publisher(String, "/text", qos.STREAM)
+        # Goals is installed, but is younger than the definitions that rosbags ships
+        node.create_publisher(Goals, "/goals", qos.STREAM)
+        with process(RECORDER, topics=["/text", "/goals"], bag=bag) as recorder:
+            spin_until(lambda: text.get_subscription_count() == 1)
+            spin_until(lambda: any(level == DiagnosticStatus.ERROR for level, _ in levels))
+            text.publish(String(data="still recorded"))
+            time.sleep(0.2)
+            stop(recorder)
+    assert "/goals: message type 'nav_msgs/msg/Goals' is not known" in levels[-1][1]
+    assert len(messages_on(bag, "/text")) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "parameters", "message"),
+    [
+        (RECORDER, {}, "no topics to record; set the parameter topics"),
+        (RECORDER, {"topics": "['/x:=os/system']"}, "'os/system' is not a message type"),
+        (RECORDER, {"topics": "['/x:=no_such_msgs/msg/Y']"}, "no_such_msgs/msg/Y"),
+        (RECORDER, {"topics": "[/x]", "bag": TRIAL_05}, "trial_05 exists already"),
+        (PLAYER, {}, "no bag to play; set the parameter bag"),
+        (PLAYER, {"rate": 2}, "parameter rate (speed, 1: as recorded): Trying to set"),
+        (PLAYER, {"rate": 200.0}, "Min: 0.01, Max: 100.0, value: 200.0"),
+        (PLAYER, {"wait_for": -1}, "parameter wait_for (subscribers each topic must have first)"),
+        (PLAYER, {"bag": "nowhere"}, "there is no bag nowhere"),
+        (PLAYER, {"bag": TRIAL_05, "topics": "[/imu]"}, "has no topic /imu; it has: /cmd_vel"),
+        (
+            PLAYER,
+            {"bag": TRIAL_05, "topics": "[/odom]", "wait_timeout": 0.2},
+            "fewer than 1 subscribers on /odom after 0.2 s",
+        ),
+    ],
+)
+def test_what_a_node_cannot_do_it_says_and_exits_with_status_1(
+    module: str, parameters: dict[str, object], message: str
+) -> None:
+    with process(module, **parameters) as node:
+        output = node.communicate(timeout=20)[0]
+    assert node.returncode == 1
+    assert message in output
+    assert "Traceback" not in output

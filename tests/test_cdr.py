@@ -1,0 +1,181 @@
+"""Fields gathered from serialised messages are those of a full decoder, bit for bit."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+
+from bags.batch import Batch, BatchBuilder
+from bags.cdr import MAX_LAYOUTS, Gatherer, UnreadableMessageError
+from bags.message_types import decode, standard_types, types_in_bag
+from bags.signals import SignalPath
+from nlsid_core.errors import BagError
+from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, header, odometry
+
+MIXED = """
+bool flag
+uint8[] blob
+string note
+float32 small
+Part[] parts
+int64 big
+Part[2] pair
+float64[3] fixed
+string[] names
+uint16[] counts
+string[2] two
+float64 last
+================================================================================
+MSG: pkg/Part
+uint8 kind
+string label
+float64 weight
+int16[] steps
+"""
+TYPES = types_in_bag("pkg/msg/Mixed", MessageDefinition(MessageDefinitionFormat.MSG, MIXED))
+PATHS = [
+    "flag",
+    "small",
+    "parts[0].weight",
+    "parts[1].steps[0]",
+    "parts[1].kind",
+    "big",
+    "pair[1].weight",
+    "pair[0].kind",
+    "fixed[2]",
+    "counts[names=b]",
+    "counts[1]",
+    "last",
+]
+
+text = st.sampled_from(["", "x", "abc", "abcd", "déjà vu", "a longer note of some length"])
+double = st.floats(width=64)
+part = st.tuples(st.integers(0, 255), text, double, st.lists(st.integers(-9, 9), min_size=1))
+mixed = st.tuples(
+    st.booleans(),
+    st.lists(st.integers(0, 255)),
+    text,
+    st.floats(width=32),
+    st.lists(part, min_size=2, max_size=4),
+    st.integers(-(2**63), 2**63 - 1),
+    st.tuples(part, part),
+    st.lists(double, min_size=3, max_size=3),
+    st.permutations(["a", "b", "long name"]),
+    st.lists(st.integers(0, 65535), min_size=3, max_size=5),
+    st.tuples(text, text),
+    double,
+)
+
+
+def batch_of(messages: list[bytes]) -> Batch:
+    builder = BatchBuilder()
+    for k, data in enumerate(messages):
+        builder.add(data, k)
+    return next(iter(builder.take()))
+
+
+def make_part(entry: tuple[int, str, float, list[int]]) -> object:
+    kind, label, weight, steps = entry
+    return TYPES.types["pkg/msg/Part"](kind, label, weight, np.array(steps, dtype=np.int16))
+
+
+def make_mixed(entry: tuple) -> object:  # type: ignore[type-arg]
+    flag, blob, note, small, parts, big, pair, fixed, names, counts, two, last = entry
+    return TYPES.types["pkg/msg/Mixed"](
+        flag,
+        np.array(blob, dtype=np.uint8),
+        note,
+        small,
+        [make_part(p) for p in parts],
+        big,
+        [make_part(p) for p in pair],
+        np.array(fixed),
+        list(names),
+        np.array(counts, dtype=np.uint16),
+        list(two),
+        last,
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(mixed, min_size=1, max_size=12), st.booleans())
+def test_any_mixture_of_layouts_gives_what_the_decoder_gives(
+    entries: list[tuple],  # type: ignore[type-arg]
+    little: bool,
+) -> None:
+    serialised = [
+        bytes(TYPES.serialize_cdr(make_mixed(e), "pkg/msg/Mixed", little_endian=little))
+        for e in entries
+    ]
+    paths = [SignalPath.parse(f"/x:{path}") for path in PATHS]
+    gatherer = Gatherer("pkg/msg/Mixed", TYPES, [path.steps for path in paths])
+    found = gatherer.gather(batch_of(serialised))
+    for column, data in enumerate(serialised):
+        decoded = decode(data, "pkg/msg/Mixed", TYPES)
+        expected = np.array([path.value(decoded) for path in paths])
+        np.testing.assert_array_equal(found[:, column].view(np.uint64), expected.view(np.uint64))
+
+
+def test_more_layouts_than_are_tried_at_once_still_read() -> None:
+    kind = standard_types().types[JOINT_TYPE]
+    empty = np.zeros(0)
+    messages = []
+    for k in range(3 * MAX_LAYOUTS):
+        message = kind(header(k), ["n" * (k + 1)], np.array([float(k)]), empty, empty)
+        messages.append(bytes(standard_types().serialize_cdr(message, JOINT_TYPE)))
+    path = SignalPath.parse("/arm:position[0]")
+    found = Gatherer(JOINT_TYPE, standard_types(), [path.steps]).gather(batch_of(messages))
+    assert found[0].tolist() == list(range(3 * MAX_LAYOUTS))
+
+
+def test_a_joint_is_followed_where_the_order_of_names_changes() -> None:
+    kind = standard_types().types[JOINT_TYPE]
+    empty = np.zeros(0)
+    messages = []
+    for k in range(6):
+        names, values = ["shoulder", "elbow"], [10.0 + k, float(k)]
+        if k % 3 == 1:
+            names, values = names[::-1], values[::-1]
+        message = kind(header(k), names, np.array(values), empty, empty)
+        messages.append(bytes(standard_types().serialize_cdr(message, JOINT_TYPE)))
+    path = SignalPath.parse("/arm:position[name=elbow]")
+    path.check(JOINT_TYPE, standard_types())
+    gatherer = Gatherer(JOINT_TYPE, standard_types(), [path.steps])
+    assert gatherer.gather(batch_of(messages))[0].tolist() == [0, 1, 2, 3, 4, 5]
+    absent = SignalPath.parse("/arm:position[name=wrist]")
+    with pytest.raises(BagError, match="'name' has no 'wrist'; it has: shoulder, elbow"):
+        Gatherer(JOINT_TYPE, standard_types(), [absent.steps]).gather(batch_of(messages))
+
+
+@pytest.mark.parametrize("length", [0, 3, 4, 11, 40, 500, -100, -1])
+def test_a_message_that_is_cut_is_refused_and_located(length: int) -> None:
+    whole = odometry(1, 0.5)
+    path = SignalPath.parse("/odom:twist.twist.linear.x")
+    gatherer = Gatherer(ODOM_TYPE, standard_types(), [path.steps])
+    with pytest.raises(UnreadableMessageError) as caught:
+        gatherer.gather(batch_of([whole, whole, whole[:length], whole]))
+    assert caught.value.row == 2
+
+
+def test_a_message_that_is_too_long_is_refused() -> None:
+    path = SignalPath.parse("/odom:twist.twist.linear.x")
+    gatherer = Gatherer(ODOM_TYPE, standard_types(), [path.steps])
+    whole = odometry(1, 0.5)
+    assert gatherer.gather(batch_of([whole, whole + bytes(3)])).tolist() == [[0.5, 0.5]]
+    with pytest.raises(UnreadableMessageError, match=f"has {len(odometry(1, 0.5)) + 4} bytes"):
+        gatherer.gather(batch_of([whole, whole + bytes(4)]))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=80))
+def test_random_bytes_are_refused_or_read_as_the_decoder_does(tail: bytes) -> None:
+    data = b"\0\1\0\0" + tail
+    path = SignalPath.parse("/arm:velocity[0]")
+    try:
+        decoded = decode(data, JOINT_TYPE, standard_types())
+        expected = path.value(decoded)
+    except BagError:
+        return  # the gatherer stops at the number and may read what a full decoder refuses
+    found = Gatherer(JOINT_TYPE, standard_types(), [path.steps]).gather(batch_of([data]))
+    np.testing.assert_array_equal(found[0, 0], expected)

@@ -1,0 +1,291 @@
+"""Discrete funnels of identified models: what is proved holds, its neighbours are refused."""
+
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlsid_core import _json
+from nlsid_core.certificate import check, proof_document
+from nlsid_core.certificate.composed import compose
+from nlsid_core.certificate.discrete_funnel import StepProof
+from nlsid_core.certificate.reach import rational
+from nlsid_core.errors import (
+    CertificateMismatch,
+    CertificateRejected,
+    DataError,
+    Infeasible,
+    Undecided,
+)
+from nlsid_core.funnels.motion import plan_motion
+from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
+from nlsid_core.polynomial import Polynomial, compose_affine, monomials
+from tests.tracked import (
+    STEPS,
+    assumption,
+    designed,
+    pendulum,
+    resigned,
+    step,
+    tracked,
+    write,
+)
+
+
+@pytest.mark.parametrize("form", ["response", "peak", "energy", "fading"])
+def test_a_funnel_of_a_nonlinear_model_is_proved_exactly(form: str, tmp_path: Path) -> None:
+    verdict = check(write(designed(form), tmp_path))
+    assert verdict.margin > 0
+    assert form in verdict.assumptions[0]
+
+
+def test_reaches_are_tight_to_one_percent_of_what_starts_on_the_boundary_do() -> None:
+    design = designed()
+    rng = np.random.default_rng(1)
+    z = rng.standard_normal((4000, 2))
+    z /= np.linalg.norm(z, axis=1)[:, None]
+    for k in range(0, STEPS, 6):
+        x = design.policy.x[k] + design.funnel.inlet[k] * z @ np.linalg.inv(design.funnel.S[k]).T
+        moved = (step(design, k, x) - design.policy.x[k + 1]) @ design.funnel.S[k + 1].T
+        farthest = np.linalg.norm(moved, axis=1).max()
+        reach = design.steps["inlet"][k].reach
+        assert 0.99 * reach < farthest <= reach
+
+
+@pytest.mark.parametrize("form", ["response", "peak"])
+def test_the_worst_disturbance_inside_the_assumption_stays_in_the_tube(form: str) -> None:
+    design = designed(form)
+    funnel, policy = design.funnel, design.policy
+    rng = np.random.default_rng(2)
+    closest = 0.0
+    for run in range(200):
+        z = rng.standard_normal(2)
+        x = policy.x[0] + np.linalg.solve(funnel.S[0], z / np.linalg.norm(z) * funnel.tube[0])
+        r = np.zeros(2)
+        for k in range(STEPS):
+            away = funnel.S[k + 1] @ (step(design, k, x) - policy.x[k + 1])
+            worst = np.linalg.solve(funnel.S[k + 1], away / np.linalg.norm(away))
+            if form == "peak":
+                d = 0.999 * funnel.assumption.bound * worst
+            else:
+                d = (1 if run % 2 else -1) * 0.999 * funnel.assumption.bound * worst
+                d = d - funnel.A[k] @ r  # so that the response is as large as is allowed
+                r = funnel.A[k] @ r + d
+            x = step(design, k, x) + d
+            size = float(np.linalg.norm(funnel.S[k + 1] @ (x - policy.x[k + 1])))
+            assert size <= funnel.radius[k + 1]
+            closest = max(closest, size / funnel.radius[k + 1])
+    assert closest > 0.97
+
+
+@pytest.mark.parametrize("form", ["energy", "fading"])
+def test_disturbances_that_spend_their_energy_at_once_or_slowly_stay_in_the_tube(form: str) -> None:
+    design = designed(form)
+    funnel, policy, a = design.funnel, design.policy, design.funnel.assumption
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        z = rng.standard_normal(2)
+        x = policy.x[0] + np.linalg.solve(funnel.S[0], z / np.linalg.norm(z) * funnel.tube[0])
+        energy, share = 0.0, rng.uniform(0.05, 1.0)
+        for k in range(STEPS):
+            away = funnel.S[k + 1] @ (step(design, k, x) - policy.x[k + 1])
+            left = (0.999 * a.bound) ** 2 - a.rate * energy
+            d = np.sqrt(share * left / a.gain) * away / np.linalg.norm(away)
+            energy = a.rate * energy + a.gain * float(d @ d)
+            x = step(design, k, x) + np.linalg.solve(funnel.S[k + 1], d)
+            size = float(np.linalg.norm(funnel.S[k + 1] @ (x - policy.x[k + 1])))
+            assert size <= funnel.radius[k + 1]
+
+
+@pytest.mark.parametrize(("rate", "gain"), [(0.9, 90.0), (0.99, 5.0), (1.0, 90.0), (0.99, 0.5)])
+def test_a_fading_assumption_the_loop_does_not_keep_up_with_is_refused(
+    rate: float, gain: float, tmp_path: Path
+) -> None:
+    design = designed("fading" if rate < 1 else "energy")
+    changed = replace(design.funnel.assumption, rate=rate, gain=gain)
+    if rate == 1.0:
+        changed = replace(changed, rate=0.9)
+    proof = write(resigned(design, funnel=replace(design.funnel, assumption=changed)), tmp_path)
+    with pytest.raises(CertificateRejected, match=r"rate|gain"):
+        check(proof)
+
+
+def forged(design: FunnelDesign, what: str) -> FunnelDesign:
+    """The design with one thing made better than it is, and all digests made to fit."""
+    funnel = design.funnel
+    if what == "tube cut by 2 %":
+        tube = funnel.tube.copy()
+        tube[1:] *= 0.98
+        return resigned(design, funnel=replace(funnel, tube=tube))
+    if what == "one level of the tube cut by 2 %":
+        tube = funnel.tube.copy()
+        tube[7] *= 0.98
+        return resigned(design, funnel=replace(funnel, tube=tube))
+    if what == "goal 2 % below what is reached":
+        inlet = funnel.inlet.copy()
+        inlet[-1] = 0.98 * design.steps["inlet"][-1].reach
+        return resigned(design, funnel=replace(funnel, inlet=inlet))
+    if what == "inlet raised by 2 %":
+        return resigned(design, funnel=replace(funnel, inlet=1.02 * funnel.inlet))
+    if what == "levels and reaches cut by 2 %":
+        steps = {
+            chain: [replace(s, reach=0.98 * s.reach) for s in proofs]
+            for chain, proofs in design.steps.items()
+        }
+        tube = funnel.tube * np.r_[1.0, np.full(STEPS, 0.98)]
+        return resigned(design, funnel=replace(funnel, tube=tube), steps=steps)
+    if what == "assumption made smaller":
+        smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
+        return resigned(design, funnel=replace(funnel, assumption=smaller))
+    if what == "safety factor below one":
+        smaller = replace(funnel.assumption, safety_factor=0.5)
+        return resigned(design, funnel=replace(funnel, assumption=smaller))
+    if what == "commissioning runs are the fitting bags":
+        borrowed = replace(funnel.assumption, measured_on=design.model.bags)
+        return resigned(design, funnel=replace(funnel, assumption=borrowed))
+    if what == "no commissioning runs":
+        unmeasured = replace(funnel.assumption, measured_on=())
+        return resigned(design, funnel=replace(funnel, assumption=unmeasured))
+    if what == "another nominal":
+        return resigned(design, policy=designed(goal=0.3).policy)
+    if what == "gain 3 % smaller":
+        return resigned(design, policy=replace(design.policy, K=0.97 * design.policy.K))
+    if what == "another model":
+        heavier = replace(design.model, coefficients=1.002 * design.model.coefficients)
+        return resigned(design, model=heavier)
+    if what == "narrower data box":
+        return resigned(design, model=replace(design.model, x_range=0.5 * design.model.x_range))
+    if what == "weaker drive":
+        return resigned(design, model=replace(design.model, u_range=0.5 * design.model.u_range))
+    if what == "a Gram entry changed":
+        return replace(design, steps=_changed(design, "Q", np.index_exp[2, 2]))
+    if what == "a multiplier's sign flipped":
+        return replace(design, steps=_changed(design, "sigma", np.index_exp[:, :]))
+    if what == "T shrunk":
+        return replace(design, T=0.5 * design.T)
+    raise ValueError(what)
+
+
+def _changed(design: FunnelDesign, key: str, where: object) -> dict[str, list[StepProof]]:
+    steps = {chain: list(proofs) for chain, proofs in design.steps.items()}
+    matrix = getattr(steps["tube"][5], key).copy()
+    matrix[where] *= -1.0
+    steps["tube"][5] = replace(steps["tube"][5], **{key: matrix})
+    return steps
+
+
+FORGERIES = [
+    "tube cut by 2 %",
+    "one level of the tube cut by 2 %",
+    "goal 2 % below what is reached",
+    "inlet raised by 2 %",
+    "levels and reaches cut by 2 %",
+    "assumption made smaller",
+    "safety factor below one",
+    "commissioning runs are the fitting bags",
+    "no commissioning runs",
+    "another nominal",
+    "gain 3 % smaller",
+    "another model",
+    "narrower data box",
+    "weaker drive",
+    "a Gram entry changed",
+    "a multiplier's sign flipped",
+    "T shrunk",
+]
+
+
+@pytest.mark.parametrize("what", FORGERIES)
+def test_a_forged_funnel_is_refused_though_every_digest_fits(what: str, tmp_path: Path) -> None:
+    proof = write(forged(designed(), what), tmp_path)
+    with pytest.raises(CertificateRejected) as refusal:
+        check(proof)
+    assert not isinstance(refusal.value, CertificateMismatch)  # refused for what it says
+
+
+def test_a_policy_swapped_without_new_digests_is_a_mismatch(tmp_path: Path) -> None:
+    proof = write(designed(), tmp_path)
+    _json.write_document(tmp_path / "policy.json", designed(goal=0.3).policy.document())
+    with pytest.raises(CertificateMismatch, match="policy"):
+        check(proof)
+
+
+@pytest.mark.parametrize("key", ["x_range", "u_range"])
+def test_a_model_without_its_data_box_is_refused(key: str, tmp_path: Path) -> None:
+    design = designed()
+    proof = write(design, tmp_path)
+    document = design.model.document()
+    del document[key]
+    _json.write_document(tmp_path / "model.json", document)
+    with pytest.raises(CertificateMismatch):
+        check(proof)
+    whole = _json.load_document(proof)
+    whole["claim"]["about"]["model"]["digest"] = _json.digest(document)
+    _json.write_document(proof, proof_document(whole["claim"], whole["proof"]))
+    with pytest.raises(CertificateRejected, match=key):
+        check(proof)
+
+
+def test_a_model_made_to_keep_the_checker_busy_is_undecided_at_once(tmp_path: Path) -> None:
+    design = designed()
+    exponents = design.model.exponents.copy()
+    exponents[-1] = [15, 15, 15]
+    huge = resigned(design, model=replace(design.model, exponents=exponents))
+    proof = write(huge, tmp_path)
+    with pytest.raises(Undecided, match="order"):
+        check(proof)
+
+
+def test_a_missing_step_is_refused(tmp_path: Path) -> None:
+    design = designed()
+    steps = {chain: list(proofs) for chain, proofs in design.steps.items()}
+    del steps["inlet"][3]
+    proof = write(replace(design, steps=steps), tmp_path)
+    with pytest.raises(CertificateRejected, match="inlet"):
+        check(proof)
+
+
+def test_commissioning_on_the_fitting_bags_is_refused_before_anything_is_written() -> None:
+    base = tracked()
+    borrowed = replace(assumption(), measured_on=base.model.bags)
+    with pytest.raises(CertificateRejected, match="fitted on"):
+        design_state_funnel(base.model, base.policy, base.feedback, assumption=borrowed)
+
+
+def test_a_disturbance_too_large_for_the_goal_is_infeasible_and_says_where() -> None:
+    base = tracked()
+    with pytest.raises(Infeasible, match="at sample"):
+        design_state_funnel(
+            base.model, base.policy, base.feedback, assumption=assumption("peak", 1.0)
+        )
+
+
+def test_a_start_beyond_the_inlet_is_refused() -> None:
+    base = tracked()
+    with pytest.raises(DataError, match="inlet"):
+        design_state_funnel(
+            base.model, base.policy, base.feedback, assumption=assumption(), start=100.0
+        )
+
+
+def test_a_motion_out_of_reach_of_the_data_is_infeasible() -> None:
+    with pytest.raises(Infeasible, match="out of reach"):
+        plan_motion(pendulum(), [0.0, 0.0], [1.1, 0.0], steps=5)
+    with pytest.raises(DataError, match="angle"):
+        plan_motion(pendulum(), [0.0, 0.0], [1.3, 0.0], steps=50)
+
+
+def test_the_fast_exact_composition_equals_the_general_one() -> None:
+    rng = np.random.default_rng(3)
+    exponents = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 1], [3, 0, 0], [1, 1, 1]])
+    coefficients = rng.standard_normal((5, 2))
+    A, b = rational(rng.standard_normal((3, 2))), rational(rng.standard_normal(3))
+    rows, bits = compose(exponents, coefficients, A, b)
+    names = ("x", "y", "u")
+    f = [Polynomial(exponents, column, names) for column in coefficients.T]
+    for column, general in zip(rows.T, compose_affine(f, A, b, names=("s", "t")), strict=True):
+        basis = monomials(2, range(4))
+        values = np.array([Fraction(entry, 1 << bits) for entry in column], dtype=object)
+        assert Polynomial(basis, values, ("s", "t")) == general

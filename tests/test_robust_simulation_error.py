@@ -1,0 +1,226 @@
+"""The banded kernel of the robust simulation error against dense formulas and a cone solver."""
+
+from itertools import pairwise
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from nlsid_core.identification.bound import Bound
+from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.prediction import one_step_residual
+from nlsid_core.identification.rie import robust_identification_error
+from nlsid_core.identification.rows import Rows
+from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.state_affine import (
+    StateAffineClass,
+    StateAffineRows,
+    build_state_affine_rows,
+)
+from nlsid_core.trajectory import Dataset, Trajectory
+
+EXACT = 1e-10  # agreement of two floating-point routes to the same number
+SOLVER = 1e-6  # agreement with a cone solver's optimum
+
+
+def problem(
+    *, outputs: int = 1, trials: int = 2, samples: int = 24, noise: float = 0.05,
+    model_class: StateAffineClass | None = None, seed: int = 3,
+) -> StateAffineRows:  # fmt: skip
+    """Rows of a small nonlinear system with `outputs` coupled outputs."""
+    rng = np.random.default_rng(seed)
+    trajectories = []
+    for index in range(trials):
+        u = rng.uniform(-1.0, 1.0, samples)
+        y = np.zeros((samples, outputs))
+        A = 0.6 * np.eye(outputs) - 0.2 * np.eye(outputs, k=1)
+        for t in range(1, samples):
+            y[t] = A @ y[t - 1] / (1.0 + 0.3 * u[t] ** 2) + u[t] - 0.3 * u[t - 1] ** 3
+        y += noise * rng.standard_normal(y.shape)
+        trajectories.append(Trajectory(t=np.arange(float(samples)), y=y, u=u, name=f"run {index}"))
+    default = StateAffineClass(2, leading_degree=1, lagged_degree=1, right_degree=1)
+    return build_state_affine_rows(Dataset(tuple(trajectories)), model_class or default)
+
+
+def dense(rows: Rows, theta: np.ndarray) -> np.ndarray:
+    """G(θ) as a full matrix."""
+    N = len(rows)
+    G = np.zeros((N, N))
+    for D, weight, value in zip(rows.offsets, rows.weights.T, theta, strict=True):
+        r = np.arange(max(D, 0), N + min(D, 0))
+        G[r, r - D] += value * weight[r]
+    return G
+
+
+def dense_K(rows: Rows, theta: np.ndarray, theta_m: np.ndarray | None) -> np.ndarray:
+    H = np.eye(len(rows)) if theta_m is None else dense(rows, theta_m)
+    product = dense(rows, theta) @ H.T
+    return np.asarray(product + product.T - H @ H.T)
+
+
+def dense_J(rows: Rows, theta: np.ndarray, theta_m: np.ndarray | None) -> float:
+    """J_m with the best p, by a dense generalised least-squares problem."""
+    L = np.linalg.cholesky(dense_K(rows, theta, theta_m))
+    left, right = np.linalg.solve(L, rows.errors @ theta), np.linalg.solve(L, rows.Q)
+    p = np.linalg.lstsq(right, left, rcond=None)[0]
+    return float(np.sum((left - right @ p) ** 2))
+
+
+def near_identity(rows: Rows, seed: int, size: float) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.asarray(rows.identity + size * rng.standard_normal(len(rows.identity)))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("first", [True, False])
+def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
+    outputs: int, first: bool
+) -> None:
+    rows = problem(outputs=outputs).rows
+    theta = near_identity(rows, 0, 0.02)
+    theta_m = None if first else near_identity(rows, 1, 0.05)
+    bound = Bound(rows, theta_m)
+    point = bound.at(theta)
+    assert pytest.approx(dense_J(rows, theta, theta_m), rel=EXACT) == point.J
+
+    K = dense_K(rows, theta, theta_m)
+    unit = np.eye(len(theta))
+    still = dense_K(rows, np.zeros(len(theta)), theta_m)
+    slopes = [dense_K(rows, unit[i], theta_m) - still for i in range(len(theta))]
+    inverse = np.linalg.inv(K)
+    e = rows.errors @ theta - rows.Q @ point.p
+    V = np.column_stack([rows.errors[:, i] - S @ inverse @ e for i, S in enumerate(slopes)])
+    everything = np.column_stack([V, -rows.Q])
+    full = 2.0 * everything.T @ inverse @ everything
+    n = len(theta)
+    reduced = full[:n, :n] - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
+    expected = rows.errors.T @ inverse @ e + V.T @ inverse @ e
+    gradient, hessian = bound.derivatives(point)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=EXACT * abs(expected).max())
+    np.testing.assert_allclose(hessian, reduced, rtol=1e-7, atol=1e-9 * abs(reduced).max())
+
+    sign, log_determinant = np.linalg.slogdet(K)
+    assert sign == 1.0
+    assert point.factor.log_determinant == pytest.approx(log_determinant, rel=EXACT)
+    np.testing.assert_allclose(
+        bound.log_determinant_gradient(point),
+        [np.trace(inverse @ S) for S in slopes],
+        rtol=1e-8, atol=1e-9,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_bound_is_above_the_simulation_error_and_equal_where_it_was_linearised(
+    outputs: int,
+) -> None:
+    stacked = problem(outputs=outputs)
+    rows = stacked.rows
+    theta_m = near_identity(rows, 4, 0.05)
+    bound = Bound(rows, theta_m)
+
+    def simulation_error(theta: np.ndarray, p: np.ndarray) -> float:
+        model = stacked.model(theta, p)
+        total = 0.0
+        for trial in stacked.dataset:
+            simulated = model.simulate(trial.u, trial.y[: len(model)])
+            total += float(np.sum(((trial.y - simulated) / model.y_scale) ** 2))
+        return total
+
+    at = bound.at(theta_m)
+    assert pytest.approx(simulation_error(theta_m, at.p), rel=1e-8) == at.J
+    for seed in range(10):
+        point = bound.at(theta_m + 0.01 * (near_identity(rows, seed, 1.0) - rows.identity))
+        assert simulation_error(point.theta, point.p) * (1 - EXACT) <= point.J
+
+
+@pytest.mark.parametrize("lagged_degree", [0, 1])
+def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
+    lagged_degree: int,
+) -> None:
+    """min t with [K, ε; ε', t] ⪰ 0, also where the minimiser is on the boundary of K ⪰ 0."""
+    for seed, noise in ((3, 0.05), (5, 1.0)):
+        stacked = problem(
+            trials=1, samples=26, noise=noise, seed=seed,
+            model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+        )  # fmt: skip
+        rows = stacked.rows
+        found = minimise(Bound(rows, None), rows.identity)
+        theta, p, t = cp.Variable(len(rows.identity)), cp.Variable(rows.Q.shape[1]), cp.Variable()
+        eye = np.eye(len(rows.identity))
+        still = dense_K(rows, np.zeros(len(eye)), None)
+        K = still + sum(theta[i] * (dense_K(rows, eye[i], None) - still) for i in range(len(eye)))
+        N = len(rows)
+        error = rows.errors @ theta - rows.Q @ p
+        frame, last = np.eye(N, N + 1), np.eye(N + 1)[:, -1:]
+        M = frame.T @ K @ frame + t * (last @ last.T)
+        M += sum(error[r] * (np.outer(frame[r], last) + np.outer(last, frame[r])) for r in range(N))
+        solved = cp.Problem(cp.Minimize(t), [(M + M.T) / 2 >> 0])
+        solved.solve(solver="CLARABEL")
+        assert pytest.approx(float(solved.value), rel=SOLVER) == found.point.J
+
+
+def test_bounds_never_go_up_over_the_iterates_of_a_nonlinear_model() -> None:
+    rows = problem(trials=2, samples=120).rows
+    bounds = [iterate.J for iterate in robust_simulation_error(rows, iterations=8)]
+    assert len(bounds) > 1
+    assert all(after <= before * (1 + EXACT) for before, after in pairwise(bounds))
+
+
+def test_robust_simulation_error_is_at_most_the_robust_identification_error() -> None:
+    """Proposition 4.4 with P = I."""
+    for seed in range(4):
+        stacked = problem(
+            trials=1, samples=80, seed=seed, noise=0.2,
+            model_class=StateAffineClass(2, leading_degree=1),
+        )  # fmt: skip
+        rows = stacked.rows
+        _, J_identification = robust_identification_error(stacked)
+        assert J_identification >= minimise(Bound(rows, None), rows.identity).point.J
+
+
+def test_theorem_4_7_the_bound_per_sample_tends_to_an_integral_over_frequencies() -> None:
+    """J → ∫|q Y - p U|²/(2 Re q* - 1) for a scalar linear model and a finite signal."""
+    n_padding, length = 400, 30
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(length), rng.standard_normal(length)
+    padded_u = np.concatenate([np.zeros(n_padding), u, np.zeros(n_padding)])
+    padded_y = np.concatenate([np.zeros(n_padding), y, np.zeros(n_padding)])
+    q, p = np.array([1.0, -0.4, 0.1]), np.array([0.5, 0.2, 0.0])
+    N = len(padded_y) - 2
+    lags = [padded_y[2 - k : N + 2 - k] for k in range(3)]
+    inputs = [padded_u[2 - k : N + 2 - k] for k in range(3)]
+    errors = np.column_stack(lags) @ q - np.column_stack(inputs) @ p
+    row = np.arange(N)
+    rows = Rows(
+        offsets=(0, 1, 2),
+        weights=np.asfortranarray(np.column_stack([row >= k for k in range(3)]).astype(float)),
+        errors=np.column_stack([errors, np.zeros(N), np.zeros(N)]),
+        Q=np.eye(N)[:, -1:],  # only the last, zero, error can be moved by p
+        identity=np.array([1.0, 0.0, 0.0]),
+    )
+    K = 2 * dense(rows, q)
+    expected_dense = float(errors @ np.linalg.solve((K + K.T) / 2 - np.eye(N), errors))
+    scaled = Rows(rows.offsets, rows.weights, rows.errors / q[0], rows.Q, rows.identity)
+    J = Bound(scaled, None).at(q).J
+    z = np.exp(2j * np.pi * np.arange(4096) / 4096)
+    Y, U = (np.polyval(signal[::-1], 1 / z) for signal in (y, u))
+    Q_star, P_star = np.polyval(q[::-1], 1 / z), np.polyval(p[::-1], 1 / z)
+    integral = float(np.mean(abs(Q_star * Y - P_star * U) ** 2 / (2 * Q_star.real - 1)))
+    assert expected_dense == pytest.approx(integral, rel=1e-6)
+    assert pytest.approx(expected_dense, rel=1e-9) == J
+
+
+def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19() -> None:
+    """Σ ε² sup_z |e₁'(zI - A)⁻¹e₁|², conservative where the model is lightly damped."""
+    for seed in range(4):
+        stacked = problem(
+            trials=1, samples=120, seed=seed, noise=0.1, model_class=StateAffineClass(2)
+        )
+        model, J = robust_identification_error(stacked)
+        trial = stacked.dataset.trajectories[0]
+        errors = one_step_residual(model, trial)[:, 0] / model.y_scale[0]
+        gains, _ = model.explicit(np.zeros((1, len(model.window))))
+        A = np.array([gains[0, 0], [1.0, 0.0]])
+        z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
+        responses = np.linalg.inv(z[:, None, None] * np.eye(2) - A)[:, 0, 0]
+        assert np.max(abs(responses)) ** 2 * (errors @ errors) <= J * (1 + SOLVER)

@@ -1,0 +1,146 @@
+"""Clocks, gaps, delays, repeats, resampling."""
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bags
+from bags.delays import delay
+from bags.reader import Samples, read_signals
+from bags.repeats import find_period, same_excitation
+from bags.resample import Method, resample
+from bags.timing import clock_relation, segments, without_duplicates
+from nlsid_core.errors import BagError, DataError
+from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
+
+
+def stamps(seconds: np.ndarray) -> np.ndarray:
+    return START_NS + np.rint(seconds * 1e9).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("offset", "ppm"), [(0.0, 0.0), (-514_944.0, 0.0), (3.0, 40.0), (0.0, -90.0)]
+)
+def test_offset_and_drift_between_clocks_are_found_under_latency(offset: float, ppm: float) -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(0, 600, 0.02)
+    latency = 0.001 + rng.exponential(0.004, len(t))
+    log_ns = stamps(t + latency)
+    stamp_ns = stamps(t + offset + 1e-6 * ppm * t)
+    found = clock_relation(stamp_ns, log_ns)
+    assert found.offset == pytest.approx(offset - 0.001, abs=2e-3)
+    assert 1e6 * found.drift == pytest.approx(ppm, abs=2.0)
+    assert (found.drift == 0.0) == (ppm == 0.0)
+    assert found.same_clock == (abs(offset) < 1.0 and ppm == 0.0)
+    assert found.latency == pytest.approx(0.004 * np.log(2), abs=2e-3)
+
+
+def test_simulated_time_is_told_by_its_pace() -> None:
+    t = np.arange(0, 60, 0.02)
+    found = clock_relation(np.rint(0.4e9 * t).astype(np.int64), stamps(t))
+    assert found.drift == pytest.approx(-0.6)
+    assert str(found) == "stamps run at 0.4 times the pace of log time: simulated time?"
+
+
+def test_segments_end_where_messages_are_missing() -> None:
+    t = np.array([0.0, 0.1, 0.2, 1.0, 1.1, 3.0])
+    assert segments(stamps(t), 0.5) == [(0, 3), (3, 5), (5, 6)]
+    assert segments(stamps(t), 5.0) == [(0, 6)]
+    assert segments(stamps(np.zeros(0)), 5.0) == []
+
+
+def test_the_first_of_each_stamp_is_kept() -> None:
+    assert without_duplicates(np.array([3, 3, 4, 4, 4, 9])).tolist() == [0, 2, 5]
+    assert without_duplicates(np.zeros(0, dtype=np.int64)).tolist() == []
+
+
+@pytest.mark.parametrize("true", [0.0, 0.13, 0.42])
+def test_the_delay_of_a_response_is_found(true: float) -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(0, 60, 0.01)
+    u = np.repeat(rng.standard_normal(200), 30)
+    y = np.interp(t - true, t, u) + 0.1 * rng.standard_normal(len(t))
+    found = delay(u, y, 0.01, 2.0)
+    assert found.seconds == pytest.approx(true, abs=0.01)
+    assert found.correlation > 0.9
+    assert delay(u, -y, 0.01, 2.0).correlation < -0.9
+    with pytest.raises(DataError, match="a constant signal has no delay"):
+        delay(u, np.ones(len(u)), 0.01, 2.0)
+
+
+def test_a_period_is_found_and_none_where_there_is_none() -> None:
+    rng = np.random.default_rng(7)
+    once = np.cumsum(rng.standard_normal(150))
+    noise = 0.02 * once.std() * rng.standard_normal(600)
+    assert find_period(np.tile(once, 4) + noise) == 150
+    assert find_period(np.tile(once, 4)[:299]) is None  # not whole twice
+    assert find_period(rng.standard_normal(600)) is None
+    assert find_period(np.ones(600)) is None
+
+
+def test_repeats_are_told_from_steps_of_another_height() -> None:
+    step = np.repeat([0.0, 1.0], 50)
+    rng = np.random.default_rng(8)
+    assert same_excitation(step, step + 0.01 * rng.standard_normal(100))
+    assert not same_excitation(step, 1.2 * step)
+    assert not same_excitation(step, step[:80])
+    assert not same_excitation(np.ones(100), np.ones(100))
+
+
+@pytest.mark.parametrize("method", ["hold", "linear", "cubic"])
+def test_resampling_is_off_by_no_more_than_its_bound(method: Method) -> None:
+    rng = np.random.default_rng(9)
+    t = np.cumsum(rng.uniform(0.005, 0.015, 400))
+    samples = Samples("/x:y", stamps(t), np.sin(5 * t) + 0.3 * np.cos(11 * t))
+    at = np.linspace(t[3], t[-4], 1000)
+    found = resample(samples, stamps(at), method=method, max_gap=0.02)
+    error = np.abs(found.values - np.sin(5 * at) - 0.3 * np.cos(11 * at)).max()
+    assert error <= 1.05 * found.error
+    assert found.error < 30 * error
+    on_samples = resample(samples, samples.stamp_ns, method=method, max_gap=0.02)
+    np.testing.assert_allclose(on_samples.values, samples.values, atol=1e-12)
+
+
+def test_resampling_refuses_gaps_and_times_outside() -> None:
+    samples = Samples("/x:y", stamps(np.array([0.0, 0.1, 0.9, 1.0])), np.arange(4.0))
+    with pytest.raises(DataError, match=r"a gap of 0\.8 s after 1700000000\.100000000 s"):
+        resample(samples, stamps(np.array([0.5])), method="linear", max_gap=0.2)
+    with pytest.raises(DataError, match="nothing recorded at 1700000002"):
+        resample(samples, stamps(np.array([2.0])), method="linear", max_gap=0.2)
+    with pytest.raises(DataError, match="a gap of 1 s"):
+        resample(samples, stamps(np.array([2.0])), method="hold", max_gap=0.2)
+
+
+def test_stamps_that_go_back_are_sorted_on_request(tmp_path: Path) -> None:
+    order = [0, 2, 1, 3]
+    times = [START_NS + k * PERIOD_NS for k in order]
+    bag = speed_bag(tmp_path / "x", map(float, order), [0.0] * 4, stamps_ns=times)
+    with pytest.raises(BagError, match="time goes back"):
+        read_signals(bag, [SPEED])
+    assert read_signals(bag, [SPEED], sort=True)[SPEED].values.tolist() == [0, 1, 2, 3]
+
+
+def test_of_messages_with_one_stamp_the_first_is_kept_on_request(tmp_path: Path) -> None:
+    times = [START_NS + k * PERIOD_NS for k in (0, 1, 1, 2)]
+    bag = speed_bag(tmp_path / "x", [0.0, 1.0, 9.0, 2.0], [0.0] * 4, stamps_ns=times)
+    with pytest.raises(DataError, match="have the same stamp"):
+        bags.read([bag], responses=[SPEED], excitations=[COMMAND])
+    found = bags.read([bag], responses=[SPEED], excitations=[COMMAND], drop_duplicates=True)
+    assert found.trajectories[0].y[:, 0].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_bag_with_a_gap_gives_a_trajectory_per_stretch(tmp_path: Path) -> None:
+    ticks = [*range(30), *range(50, 90)]
+    times = [START_NS + k * PERIOD_NS for k in ticks]
+    values = [float(k) for k in ticks]
+    bag = speed_bag(tmp_path / "x", values, values, stamps_ns=times)
+    options = {"responses": [SPEED], "excitations": [COMMAND]}
+    with pytest.raises(DataError, match="a gap of"):
+        bags.read([bag], **options)  # type: ignore[arg-type]
+    with ThreadPoolExecutor(2) as executor:
+        found = bags.read([bag], split_gaps=True, executor=executor, **options)  # type: ignore[arg-type]
+    assert [(trial.name, len(trial)) for trial in found] == [("x.1", 30), ("x.2", 40)]
+    np.testing.assert_array_equal(found.trajectories[1].y[:, 0], np.arange(50.0, 90.0))
+    np.testing.assert_array_equal(found.trajectories[1].u[:, 0], np.arange(50.0, 90.0))

@@ -1,0 +1,109 @@
+"""A pendulum known exactly, with a cubic in the place of the sine, and a short motion of it."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from nlsid_core import _json
+from nlsid_core._types import FloatArray
+from nlsid_core.discrete_funnel import DisturbanceAssumption
+from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
+from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
+from nlsid_core.models import Signal
+from nlsid_core.models.state_map import StateModel
+from nlsid_core.tracking_policy import TrackingPolicy
+
+PERIOD = 0.02
+STEPS = 25
+BOUND = 0.02
+EXPONENTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [3, 0, 0]]
+
+
+def pendulum() -> StateModel:
+    """q⁺ = q + h v, v⁺ = v + h(u - 9.8(q - q³/6) - 0.5 v)."""
+    h = PERIOD
+    coefficients = [
+        [0.0, 0.0],
+        [1.0, -9.8 * h],
+        [h, 1.0 - 0.5 * h],
+        [0.0, h],
+        [0.0, 9.8 * h / 6],
+    ]
+    return StateModel(
+        exponents=np.array(EXPONENTS),
+        coefficients=np.array(coefficients),
+        period=PERIOD,
+        x=(Signal("angle", "rad"), Signal("rate", "rad/s")),
+        u=(Signal("torque", "N m"),),
+        x_range=np.array([[-1.2, 1.2], [-4.0, 4.0]]),
+        u_range=np.array([[-10.0, 10.0]]),
+        noise=np.array([1e-3, 1e-2]),
+        disturbance=np.array([1e-4, 1e-3]),
+        bags=(("fit", f"sha256:{1:064x}"),),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """Model, motion and feedback before any funnel."""
+
+    model: StateModel
+    policy: TrackingPolicy
+    feedback: Feedback
+
+
+@cache
+def tracked(goal: float = 0.4) -> Tracked:
+    """The motion from rest to `goal` in half a second."""
+    model = pendulum()
+    x, u = plan_motion(model, [0.0, 0.0], [goal, 0.0], steps=STEPS)
+    feedback = tvlqr(model, x, u, input_weight=0.3)
+    return Tracked(model, track(model, x, u, feedback), feedback)
+
+
+RATES = {"energy": (1.0, 60.0), "fading": (0.99, 90.0)}  # rate and gain, of this loop
+
+
+def assumption(form: str = "response", bound: float = BOUND) -> DisturbanceAssumption:
+    """As measured on one commissioning run."""
+    rate, gain = RATES.get(form, (1.0, 1.0))
+    measured_on = (("drive", f"sha256:{2:064x}"),)
+    return DisturbanceAssumption(form, bound, 0.625 * bound, 1.5, measured_on, rate, gain)
+
+
+@cache
+def designed(form: str = "response", goal: float = 0.4) -> FunnelDesign:
+    """The funnel around that motion."""
+    base = tracked(goal)
+    return design_state_funnel(base.model, base.policy, base.feedback, assumption=assumption(form))
+
+
+def write(design: FunnelDesign, folder: Path) -> Path:
+    """Model, policy, funnel and proof as files; the proof's path."""
+    documents = {
+        "model.json": design.model.document(),
+        "policy.json": design.policy.document(),
+        "funnel.json": design.funnel.document(),
+        "funnel.proof.json": design.proof_document(
+            model="model.json", policy="policy.json", funnel="funnel.json"
+        ),
+    }
+    for name, document in documents.items():
+        _json.write_document(folder / name, document)
+    return folder / "funnel.proof.json"
+
+
+def resigned(design: FunnelDesign, **changes: object) -> FunnelDesign:
+    """The design with another funnel, policy or model and every digest made to fit again."""
+    design = replace(design, **changes)  # type: ignore[arg-type]
+    policy = replace(design.policy, model=_json.digest(design.model.document()))
+    funnel = replace(design.funnel, model=policy.model, policy=_json.digest(policy.document()))
+    return replace(design, policy=policy, funnel=funnel)
+
+
+def step(design: FunnelDesign, k: int, x: FloatArray) -> FloatArray:
+    """One undisturbed step of the closed loop from x (..., n)."""
+    u = design.policy.u[k] - (x - design.policy.x[k]) @ design.policy.K[k].T
+    return design.model(x, u)
