@@ -54,8 +54,9 @@ def test_live_nodes_agree_with_the_offline_replay(
     assert seen["sent"] == seen["recorded"] == 241
     assert seen["margins"] == seen["margins_expected"] == 117
     assert seen["margin_difference"] <= 1e-9
-    assert 0 <= seen["alarm_ms"] <= 50
-    assert "above the budget" in seen["alarm"]
+    assert abs(seen["alarm_ms"]) <= 50
+    assert "above the budget" in seen["expected"]
+    assert seen["expected"] in seen["alarm"]
     assert done.returncode == 0
 
 
