@@ -25,6 +25,7 @@ from nlsid_ros.running import declare
 
 NAME = "bag_player"
 SLICE = 0.05  # s: longest sleep, so that an interrupt is noticed
+SETTLE = 1.0  # s: a subscriber learns of its match later than the publisher does
 ACKNOWLEDGE = 5.0  # s: how long the end waits for reliable subscribers to have everything
 
 
@@ -82,6 +83,8 @@ class BagPlayer(Node):
         while ok():
             counts = {topic: p.get_subscription_count() for topic, p in publishers.items()}
             if all(count >= self._wait_for for count in counts.values()):
+                if self._wait_for:
+                    time.sleep(SETTLE)
                 return
             if time.monotonic() > deadline:
                 missing = ", ".join(t for t, n in counts.items() if n < self._wait_for)
