@@ -129,7 +129,7 @@ def test_an_interrupted_copy_leaves_nothing_half_written(tmp_path: Path) -> None
     script = (
         "import os, signal, sys\n"
         "from bags import recover\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background shell ignores it
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # some shells ignore it
         "original = recover._copy\n"
         "def copy(*a):\n"
         "    original(*a)\n"
