@@ -1,6 +1,5 @@
 """Nodes as real processes, over real DDS, on a domain of their own."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -15,9 +14,10 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from tests.ros.domains import fresh_domain
+
 ROOT = Path(__file__).parents[2]
 STARTED = 15.0  # s: patience with a process or with discovery on a busy machine
-DOMAINS = 101  # those that are safe to use on every platform
 
 ros_test = [
     pytest.mark.ros,
@@ -30,7 +30,7 @@ def use_domain_of_this_run(patch: pytest.MonkeyPatch) -> None:
     """Let nodes here and in processes started here see only each other."""
     patch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    patch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % DOMAINS))
+    patch.setenv("ROS_DOMAIN_ID", fresh_domain())
 
 
 @contextmanager

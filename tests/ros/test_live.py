@@ -13,6 +13,7 @@ from bags.config import load_config
 from bags.samples import f1tenth
 from bags.shipped import config_file
 from bags.steps import design_funnel_files, identify_bags
+from tests.ros.domains import fresh_domain
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
@@ -35,7 +36,7 @@ def environment() -> dict[str, str]:
     return os.environ | {
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_DOMAIN_ID": fresh_domain(),
     }
 
 
