@@ -1,5 +1,6 @@
 """A synthetic robot with a known truth, small enough for every test to fit its own model."""
 
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,9 @@ from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.identification import Fit, LinearClass, identify
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.trajectory import Dataset, Trajectory
+
+# A shell's background jobs ignore interrupts, and so would every process the tests start from one.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
 TRUE_B = np.array([0.0, 0.05, 0.03])
