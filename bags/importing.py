@@ -173,11 +173,12 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
     if period is not None:
         if not period > 0:
             raise DataError(f"a period of {period:g} s")
-        return start_ns + np.rint(np.arange(rows) * period * 1e9).astype(np.int64)
+        even: IntArray = start_ns + np.rint(np.arange(rows) * period * 1e9).astype(np.int64)
+        return even
     assert time is not None
     if len(time) < rows:
         raise DataError(f"{rows} rows but {len(time)} times")
-    stamps = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
+    stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
             f"time does not increase after row {back[0]}: {stamp_text(stamps[back[0]])}"

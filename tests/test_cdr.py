@@ -1,5 +1,7 @@
 """Fields gathered from serialised messages are those of a full decoder, bit for bit."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -75,7 +77,7 @@ def batch_of(messages: list[bytes]) -> Batch:
     return next(iter(builder.take()))
 
 
-def make_part(entry: tuple[int, str, float, list[int]]) -> object:
+def make_part(entry: tuple[int, str, float, list[int]]) -> Any:
     kind, label, weight, steps = entry
     return TYPES.types["pkg/msg/Part"](kind, label, weight, np.array(steps, dtype=np.int16))
 

@@ -194,7 +194,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
         return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
 
     bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
-    valid = [[0, -0.2, 0.2], [2, -9, 9]]
+    valid: list[list[float]] = [[0, -0.2, 0.2], [2, -9, 9]]
     field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
     _, nominal = hanging()
     design = design_funnel(field, nominal, goal=30 * np.eye(2))

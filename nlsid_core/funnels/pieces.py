@@ -78,12 +78,12 @@ def prove_pieces(
         alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
         pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
         margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
-        by_part = np.isfinite(margins).reshape(len(solvable), -1).all(axis=1)
+        by_part = np.asarray(np.isfinite(margins).reshape(len(solvable), -1).all(axis=1))
         keep = np.repeat(by_part, len(steps.vertices))
         if keep.any():
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
-        failed = [part for part, good in zip(solvable, by_part, strict=True) if not good]
+        failed = [part for part, good in zip(solvable, by_part.tolist(), strict=True) if not good]
         unproved += [part for part in failed if part.level == MAX_LEVEL]
         waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
     return Proved(*_joined(steps.program, done), unproved=tuple(unproved))

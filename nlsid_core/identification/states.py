@@ -219,7 +219,8 @@ def noise_between(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
         else np.mean(np.diff(group[0].y, 3, axis=0) ** 2, axis=0) / 20.0
         for group in groups
     ]
-    return np.sqrt(np.mean(variances, axis=0))
+    spread: FloatArray = np.sqrt(np.mean(variances, axis=0))
+    return spread
 
 
 def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]]) -> StateModel:

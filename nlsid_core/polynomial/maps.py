@@ -65,7 +65,7 @@ def evaluate(polynomials: ArrayLike, points: ArrayLike) -> FloatArray:
     return values.reshape(points.shape[:-1] + array.shape)
 
 
-def jacobian(polynomials: ArrayLike, names: Sequence[str]) -> NDArray[Any]:
+def jacobian(polynomials: ArrayLike | Sequence[Polynomial], names: Sequence[str]) -> NDArray[Any]:
     """∂p_i/∂names_j as an object array (..., len(names))."""
     array: Any = np.asarray(polynomials, dtype=object)
     result = np.empty((*array.shape, len(names)), dtype=object)
@@ -76,7 +76,11 @@ def jacobian(polynomials: ArrayLike, names: Sequence[str]) -> NDArray[Any]:
 
 
 def compose_affine(
-    polynomials: ArrayLike, A: ArrayLike, b: ArrayLike, *, names: Sequence[str]
+    polynomials: ArrayLike | Sequence[Polynomial],
+    A: ArrayLike,
+    b: ArrayLike,
+    *,
+    names: Sequence[str],
 ) -> NDArray[Any]:
     """q_i(z) = p_i(A z + b), z called `names`: a shift to a trajectory, normalised coordinates.
 
