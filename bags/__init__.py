@@ -1,5 +1,5 @@
 """Bags (MCAP) to and from data; the command line `nlsid`."""
 
-from bags.grid import read_dataset as read
+from bags.signals.grid import read_dataset as read
 
 __all__ = ["read"]

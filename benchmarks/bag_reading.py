@@ -27,9 +27,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from bags.message_types import standard_types
-from bags.reader import read_signals
-from bags.writer import BagWriter
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.reader import read_signals
 from benchmarks.machine import describe
 
 MESSAGES: Final = 2_000_000

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bags.plants import PERIOD, ROBOTS, Robot
-from bags.simulation import Push, record_repeats, run_policy
+from bags.chain.plants import PERIOD, ROBOTS, Robot
+from bags.chain.simulation import Push, record_repeats, run_policy
 from benchmarks.machine import describe
 from nlsid_core import _json
 from nlsid_core._types import FloatArray

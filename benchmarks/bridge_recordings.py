@@ -23,9 +23,10 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
-from bags import documents, tracking_steps
-from bags.joint_bags import write_joint_bag
-from bags.tracking_config import TrackingConfig
+from bags.chain import tracking_steps
+from bags.chain.joint_bags import write_joint_bag
+from bags.chain.tracking_config import TrackingConfig
+from bags.monitoring import documents
 from nlsid_core.certificate import check
 from nlsid_core.errors import NlsidError
 from nlsid_core.trajectory import Trajectory

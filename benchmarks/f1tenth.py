@@ -18,13 +18,13 @@ import time
 from itertools import combinations
 from pathlib import Path
 
-from bags import documents
-from bags.config import Config, load_config
-from bags.faults import FAULTS, write_faulty_copy
-from bags.replay import Replay, replay_bag
+from bags.chain.config import Config, load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
+from bags.monitoring.replay import Replay, replay_bag
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from benchmarks.machine import describe
 from nlsid_core.certificate import check
 from nlsid_core.errors import CertificateRejected

@@ -27,8 +27,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from bags.grid import read_dataset
 from bags.samples import f1tenth
+from bags.signals.grid import read_dataset
 from benchmarks.machine import describe
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_core import _json

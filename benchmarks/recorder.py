@@ -18,9 +18,9 @@ from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import Writer
 from sensor_msgs.msg import JointState
 
-from bags.bag import Bag
-from bags.message_types import header_stamp_ns, standard_types
-from bags.repair import repair
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import header_stamp_ns, standard_types
+from bags.recordings.repair import repair
 from benchmarks.machine import describe
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_ros import qos

@@ -1,7 +1,7 @@
 """The chain in Python: the F1TENTH bags to a proved model, a proved tube and a monitor."""
 
-from bags.grid import read_dataset
 from bags.samples import f1tenth
+from bags.signals.grid import read_dataset
 from nlsid_core.funnels import design_tube
 from nlsid_core.identification import LinearClass, identify, simulation_percent
 from nlsid_core.monitor import Monitor, Status

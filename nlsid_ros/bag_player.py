@@ -16,8 +16,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.utilities import ok, try_shutdown
 
-from bags.bag import Bag
-from bags.grid import seconds
+from bags.recordings.bag import Bag
+from bags.signals.grid import seconds
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class

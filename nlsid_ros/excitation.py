@@ -20,9 +20,9 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.grid import seconds
-from bags.reader import read_signals
-from bags.signals import SignalPath
+from bags.signals.grid import seconds
+from bags.signals.reader import read_signals
+from bags.signals.signal import SignalPath
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.excitation import Shape, chirp, multisine, prbs, steps

@@ -23,10 +23,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.announcement import Run
-from bags.message_types import is_stamped, standard_types
-from bags.signals import SignalPath
-from bags.watch import Stamped, Watch
+from bags.monitoring.announcement import Run
+from bags.monitoring.watch import Stamped, Watch
+from bags.recordings.message_types import is_stamped, standard_types
+from bags.signals.signal import SignalPath
 from nlsid_core import _json
 from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError

@@ -16,8 +16,8 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from bags import documents
-from bags.documents import ProvedFunnel, load_proved_funnel
+from bags.monitoring import documents
+from bags.monitoring.documents import ProvedFunnel, load_proved_funnel
 from nlsid_core._types import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos

@@ -13,11 +13,11 @@ import rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import try_shutdown
 
-from bags import documents
-from bags.config import load_config
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from nlsid_ros.excitation import Excitation
 from nlsid_ros.funnel_monitor import FunnelMonitor
 from nlsid_ros.funnel_publisher import FunnelPublisher

@@ -27,12 +27,12 @@ from rclpy.utilities import try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from bags.bag import Bag
-from bags.documents import load_proved_funnel
-from bags.faults import FAULTS, write_faulty_copy
-from bags.message_types import header_stamp_ns
-from bags.replay import replay_bag
-from bags.signals import SignalPath
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.monitoring.documents import load_proved_funnel
+from bags.monitoring.replay import replay_bag
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import header_stamp_ns
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import NlsidError
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos

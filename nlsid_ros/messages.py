@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from bags.message_types import is_stamped, standard_types
-from bags.signals import SignalPath
+from bags.recordings.message_types import is_stamped, standard_types
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError
 from nlsid_ros.message_classes import message_class
 

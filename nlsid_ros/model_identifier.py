@@ -13,9 +13,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags import documents
-from bags.background import BackgroundIdentification, Progress
-from bags.config import load_config
+from bags.chain.background import BackgroundIdentification, Progress
+from bags.chain.config import load_config
+from bags.monitoring import documents
 from nlsid_core.certificate import check
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos

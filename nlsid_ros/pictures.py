@@ -6,7 +6,7 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bags.documents import ProvedFunnel
+from bags.monitoring.documents import ProvedFunnel
 from nlsid_core._types import FloatArray
 
 LINE = 0.005  # m, width of the lines

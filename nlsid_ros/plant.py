@@ -15,8 +15,8 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
-from bags.documents import load_model
-from bags.signals import SignalPath
+from bags.monitoring.documents import load_model
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.plants import ModelPlant, Pendulum, Plant
 from nlsid_ros import qos

@@ -19,10 +19,10 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.announcement import Run
-from bags.grid import seconds
-from bags.message_types import standard_types
-from bags.signals import SignalPath
+from bags.monitoring.announcement import Run
+from bags.recordings.message_types import standard_types
+from bags.signals.grid import seconds
+from bags.signals.signal import SignalPath
 from nlsid_core import _json
 from nlsid_core.controller import Controller, Limits
 from nlsid_core.errors import BagError, DataError, NlsidError

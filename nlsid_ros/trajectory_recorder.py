@@ -19,10 +19,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from std_srvs.srv import Trigger
 
-from bags.arrivals import Arrival, Recent, Regularity
-from bags.message_types import definition, header_stamp_ns, is_stamped, standard_types
-from bags.repair import repair, unfinished_bags
-from bags.writer import BagWriter
+from bags.recordings.message_types import definition, header_stamp_ns, is_stamped, standard_types
+from bags.recordings.repair import repair, unfinished_bags
+from bags.recordings.writer import BagWriter
+from bags.signals.arrivals import Arrival, Recent, Regularity
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bags.message_types import standard_types
-from bags.writer import BagWriter
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 25_000_000

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
+from bags.monitoring.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
 from nlsid_core import _json
 from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.identification import Fit, LinearClass, identify

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.arrivals import Arrival, Recent, Regularity
-from bags.bag import Bag
+from bags.recordings.bag import Bag
+from bags.signals.arrivals import Arrival, Recent, Regularity
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
 PERIOD_NS = 1_000_000

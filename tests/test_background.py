@@ -3,10 +3,10 @@
 import time
 from pathlib import Path
 
-from bags.background import BackgroundIdentification, Progress
-from bags.documents import MODEL, MODEL_PROOF
+from bags.chain.background import BackgroundIdentification, Progress
+from bags.chain.shipped import config_file
+from bags.monitoring.documents import MODEL, MODEL_PROOF
 from bags.samples import f1tenth
-from bags.shipped import config_file
 from nlsid_core.certificate import check
 
 CONFIG = config_file("f1tenth.yaml")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from bags.reader import bag_digest, bag_metadata, read_signals
-from bags.writer import BagWriter
+from bags.recordings.writer import BagWriter
+from bags.signals.reader import bag_digest, bag_metadata, read_signals
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
     CMD,

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags.bag import Bag
-from bags.bag_cli import bag_app
-from bags.cli import app
-from bags.fitness import Level, check_fitness
-from bags.folders import expand_bags
-from bags.importing import import_tables, read_tables
-from bags.info import bag_info
-from bags.reader import bag_metadata, read_signals
+from bags.commands.bag_cli import bag_app
+from bags.commands.cli import app
+from bags.recordings.bag import Bag
+from bags.recordings.folders import expand_bags
+from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
-from bags.writer import BagWriter
+from bags.signals.reader import bag_metadata, read_signals
+from bags.tools.fitness import Level, check_fitness
+from bags.tools.importing import import_tables, read_tables
+from bags.tools.info import bag_info
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
     CMD,
@@ -73,7 +73,7 @@ def test_every_command_has_help() -> None:
 
 
 def test_an_error_shows_a_path_with_brackets_whole(bag: Path) -> None:
-    command = [sys.executable, "-m", "bags.cli", "bag", "plot", str(bag), "--out", "x.png"]
+    command = [sys.executable, "-m", "bags.commands.cli", "bag", "plot", str(bag), "--out", "x.png"]
     signal = f"{ODOM}:twist.twist.linear[name=elbow].x"
     run = subprocess.run([*command, "-s", signal], capture_output=True, text=True, check=False)
     assert run.returncode == 1

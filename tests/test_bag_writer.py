@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from bags.writer import BagWriter
+from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
 from tests.bag_messages import (
     CMD,
@@ -137,7 +137,7 @@ def test_a_closed_chunk_is_on_disk_and_an_old_chunk_closes_itself(tmp_path: Path
 def test_a_killed_writer_loses_at_most_the_last_chunk(tmp_path: Path) -> None:
     script = (
         "import sys, time\n"
-        "from bags.writer import BagWriter\n"
+        "from bags.recordings.writer import BagWriter\n"
         "bag = BagWriter(sys.argv[1], in_place=True, max_chunk_age=0.2)\n"
         "while True:\n"
         "    now = time.time_ns()\n"

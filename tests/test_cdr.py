@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
-from bags.batch import Batch, BatchBuilder
-from bags.cdr import MAX_LAYOUTS, Gatherer, UnreadableMessageError
-from bags.message_types import decode, standard_types, types_in_bag
-from bags.signals import SignalPath
+from bags.recordings.batch import Batch, BatchBuilder
+from bags.recordings.cdr import MAX_LAYOUTS, Gatherer, UnreadableMessageError
+from bags.recordings.message_types import decode, standard_types, types_in_bag
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import BagError
 from tests.bag_messages import JOINT_TYPE, ODOM_TYPE, header, odometry
 

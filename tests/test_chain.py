@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags import documents
-from bags.cli import app
-from bags.config import Config, load_config
-from bags.faults import FAULTS, write_faulty_copy
-from bags.grid import read_dataset
-from bags.replay import Replay, replay_bag
+from bags.chain.config import Config, load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.chain.training import load_training
+from bags.commands.cli import app
+from bags.monitoring import documents
+from bags.monitoring.replay import Replay, replay_bag
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.signals import SignalPath
-from bags.steps import design_funnel_files, identify_bags
-from bags.training import load_training
+from bags.signals.grid import read_dataset
+from bags.signals.signal import SignalPath
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.identification import FINAL, LEAST_SQUARES, SEM
 from nlsid_core.monitor import Nominal, Status

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
+from bags.monitoring.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
 from nlsid_core import _json
 from nlsid_core._types import Json
 from nlsid_core.certificate import check, proof_document

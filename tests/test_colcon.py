@@ -109,7 +109,9 @@ def test_an_installed_executable_runs_on_the_installed_code(workspace: Workspace
     executable = workspace.prefix / "lib" / "nlsid" / "nlsid"
     assert "identify" in workspace.run_sourced(sys.executable, str(executable), "--help")
 
-    places = "import bags.shipped as s; print(s.__file__); print(s.config_file('f1tenth.yaml'))"
+    places = (
+        "import bags.chain.shipped as s; print(s.__file__); print(s.config_file('f1tenth.yaml'))"
+    )
     module, config = workspace.run_sourced(sys.executable, "-c", places).splitlines()
     root = workspace.prefix.parents[1]
     assert Path(module).is_relative_to(root)

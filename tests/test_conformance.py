@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.bag import Bag
-from bags.columns import read_columns
-from bags.info import bag_info
-from bags.mcap_file import McapFile
-from bags.message_types import decode
-from bags.reader import read_signals
-from bags.recover import recover
-from bags.signals import SignalPath, numeric_paths
+from bags.recordings.bag import Bag
+from bags.recordings.mcap_file import McapFile
+from bags.recordings.message_types import decode
+from bags.signals.columns import read_columns
+from bags.signals.reader import read_signals
+from bags.signals.signal import SignalPath, numeric_paths
+from bags.tools.info import bag_info
+from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.conftest import SHARED
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import bags
-from bags.expressions import Expression, derivative
-from bags.message_types import standard_types
-from bags.reader import LOG_TIME, PUBLISH_TIME, read_signals
-from bags.signals import SignalPath, numeric_paths, quaternion_angle
-from bags.training import load_training, save_training
-from bags.units import UNITS, conversion, implied_unit
-from bags.writer import BagWriter
+from bags.chain.training import load_training, save_training
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.expressions import Expression, derivative
+from bags.signals.reader import LOG_TIME, PUBLISH_TIME, read_signals
+from bags.signals.signal import SignalPath, numeric_paths, quaternion_angle
+from bags.signals.units import UNITS, conversion, implied_unit
 from nlsid_core.errors import BagError
 from tests.bag_messages import JOINT_TYPE, START_NS, joints, serialised, speed_bag
 

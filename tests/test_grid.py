@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.grid import read_dataset, require_excitation, seconds, to_trajectory
-from bags.reader import Samples, bag_digest
+from bags.signals.grid import read_dataset, require_excitation, seconds, to_trajectory
+from bags.signals.reader import Samples, bag_digest
 from nlsid_core.errors import DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 

@@ -20,14 +20,14 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from bags.bag import Bag
-from bags.info import bag_info
-from bags.mcap_file import McapFile
-from bags.message_types import standard_types
-from bags.reader import read_signals
-from bags.recover import recover
-from bags.signals import SignalPath, numeric_paths
-from bags.writer import BagWriter
+from bags.recordings.bag import Bag
+from bags.recordings.mcap_file import McapFile
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.reader import read_signals
+from bags.signals.signal import SignalPath, numeric_paths
+from bags.tools.info import bag_info
+from bags.tools.recover import recover
 from nlsid_core.errors import BagError, NlsidError
 from tests.bag_messages import CMD, CMD_TYPE, ODOM_TYPE, SPEED, command, speed_bag
 

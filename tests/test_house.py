@@ -23,6 +23,8 @@ DOWNWARD = {
     "bags": {"nlsid_core", "bags"},
     "nlsid_ros": {"nlsid_core", "bags", "nlsid_ros"},
 }
+# The rooms of bags, each standing on those before it.
+ROOMS = ("recordings", "signals", "tools", "monitoring", "pictures", "chain", "commands")
 # The rest of nlsid_core decides, holds or measures; a robot that monitors needs no solver.
 SEARCH = {"identification", "funnels", "sos", "conic"}
 SOLVERS = {"clarabel", "cvxpy"}
@@ -43,8 +45,8 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imported_packages(path: Path) -> set[str]:
-    """Top-level names of everything imported anywhere in the file, also inside functions."""
+def imported_modules(path: Path) -> set[str]:
+    """Everything imported anywhere in the file, also inside functions."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -53,7 +55,11 @@ def imported_packages(path: Path) -> set[str]:
             assert node.level == 0, f"{path}: relative import; name the module in full"
             assert node.module is not None
             names.add(node.module)
-    return {name.partition(".")[0] for name in names}
+    return names
+
+
+def imported_packages(path: Path) -> set[str]:
+    return {name.partition(".")[0] for name in imported_modules(path)}
 
 
 def is_base(path: Path) -> bool:
@@ -76,6 +82,13 @@ def test_imports_go_only_downward(path: Path) -> None:
     package = path.relative_to(ROOT).parts[0]
     upward = imported_packages(path) & set(PACKAGES) - DOWNWARD[package]
     assert not upward, f"{package} imports {upward}"
+
+
+@pytest.mark.parametrize("path", [p for room in ROOMS for p in sources(f"bags/{room}")], ids=ids)
+def test_a_room_of_bags_knows_only_the_rooms_below_it(path: Path) -> None:
+    above = ROOMS[ROOMS.index(path.relative_to(ROOT).parts[1]) + 1 :]
+    known = {m.split(".")[1] for m in imported_modules(path) if m.startswith("bags.")}
+    assert not known & set(above)
 
 
 @pytest.mark.parametrize("path", sources(*PACKAGES), ids=ids)

@@ -7,10 +7,10 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from bags import documents
-from bags.cli import app
+from bags.chain.shipped import config_file
+from bags.commands.cli import app
+from bags.monitoring import documents
 from bags.samples import f1tenth
-from bags.shipped import config_file
 from nlsid_core.certificate import check
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification import (

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bags.bag import Bag
-from bags.grid import read_dataset, seconds
-from bags.message_types import decode, header_stamp_ns
-from bags.pairing import Pairing, Sample
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import decode, header_stamp_ns
 from bags.samples import f1tenth
-from bags.signals import SignalPath
+from bags.signals.grid import read_dataset, seconds
+from bags.signals.pairing import Pairing, Sample
+from bags.signals.signal import SignalPath
 from tests.bag_messages import COMMAND, SPEED
 
 

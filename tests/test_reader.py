@@ -8,10 +8,10 @@ import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bags.bag import Bag
-from bags.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_metadata, read_signals
-from bags.recover import recover
-from bags.writer import BagWriter
+from bags.recordings.bag import Bag
+from bags.recordings.writer import BagWriter
+from bags.signals.reader import HEADER_STAMP, LOG_TIME, bag_digest, bag_metadata, read_signals
+from bags.tools.recover import recover
 from tests.bag_messages import (
     COMMAND,
     JOINT_TYPE,

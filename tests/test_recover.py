@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.bag import Bag
-from bags.mcap_file import McapFile
-from bags.reader import bag_metadata, read_signals
-from bags.recover import recover
-from bags.writer import BagWriter
+from bags.recordings.bag import Bag
+from bags.recordings.mcap_file import McapFile
+from bags.recordings.writer import BagWriter
+from bags.signals.reader import bag_metadata, read_signals
+from bags.tools.recover import recover
 from nlsid_core.errors import BagError
 from tests.bag_messages import ODOM, ODOM_TYPE, SPEED, START_NS, odometry, speed_bag
 
@@ -128,7 +128,7 @@ def test_an_interrupted_copy_leaves_nothing_half_written(tmp_path: Path) -> None
     bag = speed_bag(tmp_path / "run", np.arange(3000.0), np.arange(3000.0))
     script = (
         "import os, signal, sys\n"
-        "from bags import recover\n"
+        "from bags.tools import recover\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # some shells ignore it
         "original = recover._copy\n"
         "def copy(*a):\n"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from bags.bag import Bag
-from bags.repair import repair, unfinished_bags
-from bags.writer import BagWriter
+from bags.recordings.bag import Bag
+from bags.recordings.repair import repair, unfinished_bags
+from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
 from tests.bag_messages import CMD, CMD_TYPE, ODOM, PERIOD_NS, START_NS, command
 

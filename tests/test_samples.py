@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.bag import Bag
-from bags.message_types import header_stamp_ns
-from bags.reader import bag_metadata, read_signals
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import header_stamp_ns
 from bags.samples import convert_f1tenth, f1tenth
+from bags.signals.reader import bag_metadata, read_signals
 from nlsid_core.errors import BagError, DataError
 
 SOURCE = Path(__file__).parents[1].parent / "shared" / "data" / "f1tenth" / "F1tenthCar"

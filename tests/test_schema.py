@@ -5,7 +5,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from bags.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
+from bags.monitoring.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
 from nlsid_core import _json
 
 SCHEMAS = Path(__file__).resolve().parent.parent / "docs" / "schema"

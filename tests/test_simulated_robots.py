@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags.cli import app
-from bags.joint_bags import write_joint_bag
-from bags.plants import ARM, PENDULUM, PERIOD, Plant
-from bags.simulation import record_repeats
-from bags.tracking_config import load_tracking_config
-from bags.tracking_steps import read_states
+from bags.chain.joint_bags import write_joint_bag
+from bags.chain.plants import ARM, PENDULUM, PERIOD, Plant
+from bags.chain.simulation import record_repeats
+from bags.chain.tracking_config import load_tracking_config
+from bags.chain.tracking_steps import read_states
+from bags.commands.cli import app
 from nlsid_core.errors import DataError
 
 pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")

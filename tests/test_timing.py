@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import bags
-from bags.delays import delay
-from bags.reader import Samples, read_signals
-from bags.repeats import find_period, same_excitation
-from bags.resample import Method, resample
-from bags.timing import clock_relation, segments, without_duplicates
+from bags.signals.delays import delay
+from bags.signals.reader import Samples, read_signals
+from bags.signals.repeats import find_period, same_excitation
+from bags.signals.resample import Method, resample
+from bags.signals.timing import clock_relation, segments, without_duplicates
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from bags.cli import app
-from bags.problems import FunnelProblem
+from bags.chain.problems import FunnelProblem
+from bags.commands.cli import app
 from examples import one_dimensional, pendulum
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import _json

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from bags.message_types import standard_types
-from bags.writer import BagWriter
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError, NlsidError
 

@@ -21,13 +21,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags import documents
-from bags.bag import Bag
-from bags.config import load_config
-from bags.replay import replay_bag
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
+from bags.monitoring.replay import replay_bag
+from bags.recordings.bag import Bag
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
 from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
@@ -223,7 +223,9 @@ def test_a_lifecycle_manager_can_hold_a_node_stop_it_and_start_it_again(funnel: 
 def test_nlsid_live_starts_a_whole_loop_and_ends_it(funnel: Path) -> None:
     options = ["--funnel", str(funnel), "--track", "--plant", "--highest", "0.4"]
     loop = Loop()
-    running = subprocess.Popen([sys.executable, "-m", "bags.cli", "live", *options], cwd=ROOT)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "bags.commands.cli", "live", *options], cwd=ROOT
+    )
     try:
         with node_here("test_operator") as (node, spin_until):
             node.create_subscription(DiagnosticArray, "/diagnostics", loop.hear_status, qos.EVENTS)

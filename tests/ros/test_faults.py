@@ -21,11 +21,11 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags import documents
-from bags.config import load_config
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from nlsid_core import _json
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from bags import documents
-from bags.config import load_config
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from tests.ros.domains import fresh_domain
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")

@@ -15,11 +15,11 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from bags import documents
-from bags.config import load_config
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.monitoring import documents
 from bags.samples import f1tenth
-from bags.shipped import config_file
-from bags.steps import design_funnel_files, identify_bags
 from nlsid_core import _json
 from nlsid_core.models import DifferenceEquation
 from nlsid_ros import qos

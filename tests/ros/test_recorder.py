@@ -19,8 +19,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.bag import Bag
-from bags.message_types import header_stamp_ns
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import header_stamp_ns
 from bags.samples import f1tenth
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run

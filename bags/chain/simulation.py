@@ -1,0 +1,106 @@
+"""Recordings of simulated robots: repeats of an excitation, and runs of a tracking policy."""
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from bags.chain.plants import PERIOD, Plant, Robot
+from nlsid_core._types import FloatArray
+from nlsid_core.models.state_map import StateModel
+from nlsid_core.tracking_monitor import StateObserver
+from nlsid_core.tracking_policy import TrackingPolicy
+from nlsid_core.trajectory import Dataset, Trajectory
+
+TONES = 40  # sines of an excitation
+LOWEST, HIGHEST = 0.05, 1.5  # Hz: slower than the robots swing, and faster
+
+
+@dataclass(frozen=True, eq=False)
+class Push:
+    """An outside torque (n,) in N·m on the joints, from sample `start` on for `samples`."""
+
+    torque: FloatArray
+    start: int
+    samples: int
+
+    def at(self, k: int) -> FloatArray:
+        """The torque at sample k."""
+        acts = self.start <= k < self.start + self.samples
+        return np.asarray(self.torque * float(acts))
+
+
+def multisine(rng: np.random.Generator, samples: int, peak: FloatArray) -> FloatArray:
+    """(samples, n) sums of sines of random frequency and phase, each with its `peak` (n,)."""
+    t = np.arange(samples)[:, None] * PERIOD
+    columns = []
+    for size in peak:
+        frequency = rng.uniform(LOWEST, HIGHEST, TONES)
+        wave = np.sin(2 * np.pi * (frequency * t + rng.uniform(0, 1, TONES))).sum(axis=1)
+        columns.append(size * wave / np.abs(wave).max())
+    return np.stack(columns, axis=1)
+
+
+def record_repeats(
+    robot: Robot, *, peak: FloatArray, groups: int, repeats: int, seconds: float, seed: int
+) -> Dataset:
+    """`groups` excitations from rest, each `repeats` times with new sensor noise."""
+    runs = []
+    for group in range(groups):
+        u = multisine(np.random.default_rng([seed, group]), round(seconds / PERIOD), peak)
+        for repeat in range(repeats):
+            plant = Plant(robot, np.random.default_rng([seed, group, repeat]))
+            y = np.empty((len(u), 2 * robot.joints))
+            for k, torque in enumerate(u):
+                y[k] = plant.measure()
+                plant.step(torque)
+            name = f"{robot.name}_{group}_{repeat}"
+            runs.append(_trajectory(robot, y, u, name, f"excitation_{group}"))
+    return Dataset(tuple(runs))
+
+
+def run_policy(
+    robot: Robot,
+    model: StateModel,
+    policy: TrackingPolicy,
+    *,
+    seed: int,
+    start: FloatArray | None = None,
+    push: Push | None = None,
+    mass_scale: float = 1.0,
+) -> Trajectory:
+    """One run of the policy on the robot; N + 1 samples.
+
+    The estimate starts at `start` (default: the nominal), the robot a measurement error from it.
+    """
+    rng = np.random.default_rng(seed)
+    plant = Plant(robot, rng, mass_scale=mass_scale)
+    first = policy.x[0] if start is None else start
+    plant.reset(first)
+    plant.reset(2 * first - plant.measure())
+    observer = StateObserver(model, policy.L)
+    y, u = np.empty((len(policy) + 1, len(model))), np.zeros((len(policy) + 1, robot.joints))
+    for k in range(len(policy) + 1):
+        y[k] = plant.measure() if k else first
+        x = observer.update(y[k], u[k - 1] if k else None)
+        if k < len(policy):
+            u[k] = policy(k, x)
+            plant.step(u[k], 0.0 if push is None else push.at(k))
+    return _trajectory(robot, y, u, f"{robot.name}_run_{seed}", "")
+
+
+def _trajectory(robot: Robot, y: FloatArray, u: FloatArray, name: str, group: str) -> Trajectory:
+    n = robot.joints
+    content = hashlib.sha256(y.tobytes() + u.tobytes()).hexdigest()
+    return Trajectory(
+        t=np.arange(len(y)) * PERIOD,
+        y=y,
+        u=u,
+        y_names=tuple(f"{kind}_{i}" for kind in ("angle", "rate") for i in range(n)),
+        u_names=tuple(f"torque_{i}" for i in range(n)),
+        y_units=("rad",) * n + ("rad/s",) * n,
+        u_units=("N m",) * n,
+        name=name,
+        group=group,
+        digest=f"sha256:{content}",
+    )

@@ -1,0 +1,201 @@
+"""The steps of `nlsid track`: each takes files, returns what it made, writes it whole or not."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bags.chain.joint_bags import write_joint_bag
+from bags.chain.plants import ROBOTS, Robot
+from bags.chain.simulation import record_repeats, run_policy
+from bags.chain.tracking_config import SimulationConfig, TrackingConfig
+from bags.monitoring import documents
+from bags.signals.grid import read_dataset
+from nlsid_core import _json
+from nlsid_core.certificate import Verdict, check
+from nlsid_core.discrete_funnel import DiscreteFunnel
+from nlsid_core.errors import CertificateMismatch, DataError
+from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
+from nlsid_core.funnels.state_funnel import FunnelDesign, assume, design_state_funnel, frame
+from nlsid_core.identification.states import StateFit, identify_states
+from nlsid_core.models.state_map import StateModel
+from nlsid_core.tracking_monitor import TrackingMonitor, TrackingReading
+from nlsid_core.tracking_policy import TrackingPolicy
+from nlsid_core.trajectory import Dataset
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ProvedTracking:
+    """A funnel whose proof was checked when it was loaded, with its model and policy."""
+
+    model: StateModel
+    policy: TrackingPolicy
+    funnel: DiscreteFunnel
+    verdict: Verdict
+
+    def replay(self, config: TrackingConfig, bag: Path) -> list[TrackingReading]:
+        """Every sample of one bag held against the funnel; the bag starts with sample 0."""
+        run = read_states([bag], config).trajectories[0]
+        monitor = TrackingMonitor(self.model, self.policy, self.funnel)
+        return [monitor.update(float(t), y, u) for t, y, u in zip(run.t, run.y, run.u, strict=True)]
+
+
+def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
+    """The configured states (as y) and inputs of bags, with their names and units."""
+    signals = config.signals
+    data = read_dataset(
+        bags,
+        responses=[signal.path for signal in signals.states],
+        excitations=[signal.path for signal in signals.inputs],
+        period=config.grid.period,
+        max_gap=config.grid.max_gap,
+    )
+    labelled = [
+        replace(
+            trial,
+            y_names=tuple(signal.name for signal in signals.states),
+            y_units=tuple(signal.unit for signal in signals.states),
+            y_paths=tuple(signal.path for signal in signals.states),
+            u_names=tuple(signal.name for signal in signals.inputs),
+            u_units=tuple(signal.unit for signal in signals.inputs),
+            u_paths=tuple(signal.path for signal in signals.inputs),
+        )
+        for trial in data
+    ]
+    return Dataset(tuple(labelled))
+
+
+def simulate_excitations(config: TrackingConfig, out: Path) -> list[Path]:
+    """Bags of the configured simulated robot under repeated excitations, in `out`."""
+    robot, options = _simulated(config)
+    data = record_repeats(
+        robot,
+        peak=np.array(options.peak),
+        groups=options.groups,
+        repeats=options.repeats,
+        seconds=options.seconds,
+        seed=options.seed,
+    )
+    return [write_joint_bag(out, trial, custom={"source": "MuJoCo"}) for trial in data]
+
+
+def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path) -> StateFit:
+    """Bags in, model.json in `out`. Raises DataError where the data cannot be described."""
+    data, options = read_states(bags, config), config.identification
+    validation = data.select(options.validation)
+    fit = identify_states(
+        data.without(options.validation),
+        validation,
+        degrees=options.degrees,
+        refuse_above=options.refuse_above,
+        biased_without_repeats=options.biased_without_repeats,
+    )
+    _json.write_document(out / documents.MODEL, fit.model.document())
+    return fit
+
+
+def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> TrackingPolicy:
+    """model.json in, policy.json in `out`: a motion within the data and its feedback."""
+    model, motion = load_state_model(model_path), config.motion
+    steps = round(motion.duration / model.period)
+    x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
+    policy = track(model, x, u, _feedback(model, x, u, config))
+    _json.write_document(out / documents.POLICY, policy.document())
+    return policy
+
+
+def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]:
+    """Commissioning bags: the policy of the folder `design` on the simulated robot, in `out`."""
+    robot, options = _simulated(config)
+    model, policy = _load_pair(design)
+    norms = frame(model, policy, _feedback(model, policy.x, policy.u, config))
+    rng = np.random.default_rng([options.seed, 1])
+    written = []
+    for index in range(options.runs):
+        z = rng.standard_normal(len(model))
+        radius = options.spread * norms.cap[0] * rng.uniform() / np.linalg.norm(z)
+        start = policy.x[0] + np.linalg.solve(norms.S[0], radius * z)
+        seed = int(rng.integers(2**31))
+        run = run_policy(robot, model, policy, seed=seed, start=start)
+        run = replace(run, name=f"{robot.name}_run_{index}")
+        written.append(write_joint_bag(out, run, custom={"source": "MuJoCo"}))
+    return written
+
+
+def design_tracking_funnel(
+    design: Path, runs: Sequence[Path], config: TrackingConfig, *, progress: Progress
+) -> FunnelDesign:
+    """model.json, policy.json and commissioning bags in; funnel.json, funnel.proof.json beside.
+
+    Raises DataError, Infeasible or CertificateRejected, saying what is in the way.
+    """
+    model, policy = _load_pair(design)
+    feedback = _feedback(model, policy.x, policy.u, config)
+    if not np.array_equal(feedback.K, policy.K):
+        raise DataError("policy.json was made with other weights than this configuration's")
+    options = config.disturbance
+    assumption = assume(
+        model,
+        policy,
+        feedback,
+        read_states(runs, config),
+        form=options.form,
+        safety_factor=options.safety_factor,
+        rate=options.rate,
+    )
+    made = design_state_funnel(model, policy, feedback, assumption=assumption, progress=progress)
+    proof = made.proof_document(
+        model=documents.MODEL, policy=documents.POLICY, funnel=documents.FUNNEL
+    )
+    _json.write_document(design / documents.FUNNEL, made.funnel.document())
+    _json.write_document(design / documents.FUNNEL_PROOF, proof)
+    return made
+
+
+def load_proved_tracking(funnel_path: Path) -> ProvedTracking:
+    """A funnel with the model, policy and proof beside it, its proof checked.
+
+    Raises CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
+    """
+    verdict = check(funnel_path.with_name(documents.FUNNEL_PROOF), mode="rigorous")
+    model, policy = _load_pair(funnel_path.parent)
+    funnel = DiscreteFunnel.from_document(_json.load_document(funnel_path), source=funnel_path.name)
+    for role, noun in (("model", model), ("policy", policy), ("funnel", funnel)):
+        if verdict.digests.get(role) != _json.digest(noun.document()):
+            raise CertificateMismatch(f"{documents.FUNNEL_PROOF} is not about this {role}")
+    return ProvedTracking(model, policy, funnel, verdict)
+
+
+def load_state_model(path: Path) -> StateModel:
+    """Read a model file; DocumentError says what is wrong with it."""
+    return StateModel.from_document(_json.load_document(path), source=path.name)
+
+
+def _load_pair(folder: Path) -> tuple[StateModel, TrackingPolicy]:
+    model = load_state_model(folder / documents.MODEL)
+    policy = TrackingPolicy.from_document(
+        _json.load_document(folder / documents.POLICY), source=documents.POLICY
+    )
+    if policy.model != _json.digest(model.document()):
+        raise CertificateMismatch(f"{documents.POLICY} was made for another model")
+    return model, policy
+
+
+def _feedback(model: StateModel, x: np.ndarray, u: np.ndarray, config: TrackingConfig) -> Feedback:
+    motion = config.motion
+    return tvlqr(model, x, u, state_weight=motion.state_weight, input_weight=motion.input_weight)
+
+
+def _simulated(config: TrackingConfig) -> tuple[Robot, SimulationConfig]:
+    options = config.simulation
+    if options is None:
+        raise DataError(f"{config.robot} is not simulated: its configuration has no 'simulation'")
+    if options.robot not in ROBOTS:
+        raise DataError(f"no simulated robot '{options.robot}'; there are: {', '.join(ROBOTS)}")
+    robot = ROBOTS[options.robot]
+    if len(options.peak) != robot.joints:
+        raise DataError(f"peak: {robot.name} has {robot.joints} joints, not {len(options.peak)}")
+    return robot, options

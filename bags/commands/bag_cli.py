@@ -1,0 +1,332 @@
+"""The command line `nlsid bag`: look into recordings, check, repair, convert and cut them."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from bags.commands import bag_show
+from bags.pictures.report import report_available
+from bags.recordings.bag import Bag
+from bags.recordings.folders import expand_bags
+from bags.signals.reader import CLOCKS, read_signals
+from bags.signals.resample import Method
+from bags.tools import edit, export
+from bags.tools.fitness import Level, check_fitness
+from bags.tools.importing import import_tables
+from bags.tools.info import bag_info
+from bags.tools.recover import recover
+from nlsid_core.errors import BagError, DataError
+
+WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
+PROGRESS_AFTER = 2.0  # s of work before a progress bar appears
+
+bag_app = typer.Typer(
+    name="bag",
+    help="Look into recordings, check, repair, convert and cut them.",
+    no_args_is_help=True,
+)
+out = Console() if sys.stdout.isatty() else Console(width=WIDTH_IN_FILES)
+err = Console(stderr=True)
+
+
+class Format(StrEnum):
+    """What a table is written as."""
+
+    CSV = "csv"
+    NPZ = "npz"
+    PARQUET = "parquet"
+
+
+class Clock(StrEnum):
+    """Which of a message's times is its stamp."""
+
+    HEADER = "header"
+    LOG = "log"
+    PUBLISH = "publish"
+
+
+class Resampling(StrEnum):
+    """How a signal is put on a grid."""
+
+    LINEAR = "linear"
+    CUBIC = "cubic"
+    HOLD = "hold"
+
+
+BagArgument = Annotated[
+    Path, typer.Argument(help="A rosbag2 folder, an .mcap, .db3 or ROS 1 .bag file.")
+]
+BagsArgument = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags.")]
+OutOption = Annotated[Path, typer.Option("--out", help="What to write; must not be there yet.")]
+SignalsOption = Annotated[
+    list[str],
+    typer.Option(
+        "--signal",
+        "-s",
+        help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
+    ),
+]
+UnfinishedOption = Annotated[
+    bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
+]
+
+
+@bag_app.command()
+def info(bags: BagsArgument) -> None:
+    """Topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
+    for path in expand_bags(bags):
+        with _progress("reading") as progress:
+            found = bag_info(path, progress=progress)
+        bag_show.show_info(out, found)
+
+
+@bag_app.command()
+def signals(bag: BagArgument) -> None:
+    """Every number in the bag's messages as a signal, with its unit where the type implies one."""
+    with Bag(bag, unfinished=True) as source:
+        out.print(bag_show.signals_table(source))
+
+
+@bag_app.command()
+def plot(
+    bag: BagArgument,
+    picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")],
+    signals: SignalsOption,
+    clock: Annotated[Clock | None, typer.Option(help="Which times (default: header).")] = None,
+    unfinished: UnfinishedOption = False,
+) -> None:
+    """Draw signals over time."""
+    if not report_available():
+        raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
+    from bags.pictures.signal_plots import draw_signals, write_picture
+
+    with _progress("reading") as progress:
+        samples = read_signals(
+            bag, signals, clock=_clock(clock), unfinished=unfinished, progress=progress
+        )
+    write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
+    out.print(f"wrote {picture}", soft_wrap=True, markup=False)
+
+
+@bag_app.command()
+def check(
+    bags: BagsArgument,
+    excitations: Annotated[
+        list[str], typer.Option("--excitation", "-u", help="Signals that drive the robot.")
+    ],
+    responses: Annotated[
+        list[str], typer.Option("--response", "-y", help="Signals that are measured.")
+    ],
+) -> None:
+    """Are these bags fit for identification? Status 1 if one is not."""
+    results = check_fitness(expand_bags(bags), excitations=excitations, responses=responses)
+    for result in results:
+        bag_show.show_fitness(out, result)
+    if any(result.verdict is Level.BAD for result in results):
+        raise typer.Exit(1)
+
+
+@bag_app.command("recover")
+def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
+    """Make a whole bag of an unfinished or damaged one, verify it, and say what was lost."""
+    with _progress("recovering") as progress:
+        found = recover(bag, bag_out, progress=progress)
+    for topic, count in found.counts.items():
+        out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
+    for what in found.lost:
+        out.print(f"lost: {what}", soft_wrap=True, markup=False)
+    out.print(
+        f"wrote {found.out}, {found.messages} messages, read back and compared; "
+        + ("nothing was lost" if not found.lost else f"{len(found.lost)} places were lost"),
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+@bag_app.command("export")
+def export_command(
+    bag: BagArgument,
+    target: OutOption,
+    form: Annotated[Format, typer.Option("--format", "-f")] = Format.CSV,
+    signals: Annotated[
+        list[str] | None, typer.Option("--signal", "-s", help="Which; default: every number.")
+    ] = None,
+    period: Annotated[
+        float | None, typer.Option(help="s: one table on a common grid instead of one a topic.")
+    ] = None,
+    hold: Annotated[
+        list[str] | None, typer.Option(help="Signals that are commands: held, not interpolated.")
+    ] = None,
+    method: Annotated[
+        Resampling, typer.Option(help="Of the other signals, on the grid.")
+    ] = Resampling.LINEAR,
+    max_gap: Annotated[
+        float | None, typer.Option(help="s without a sample; default 1.5 periods.")
+    ] = None,
+    unfinished: UnfinishedOption = False,
+) -> None:
+    """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid."""
+    if period is None:
+        with _progress("exporting") as progress:
+            rows = export.export_topics(
+                bag,
+                target,
+                form=form.value,
+                signals=signals,
+                unfinished=unfinished,
+                progress=progress,
+            )
+        for file, count in rows.counts.items():
+            out.print(f"wrote {file}, {count} rows", soft_wrap=True, markup=False)
+        for what in rows.left_out:
+            out.print(f"left out: {what}", soft_wrap=True, markup=False)
+        return
+    if not signals:
+        raise BagError("a common grid needs to know which signals: --signal")
+    how: Method = _METHODS[method]
+    errors = export.export_grid(
+        bag,
+        target,
+        form=form.value,
+        signals=signals,
+        period=period,
+        method=how,
+        hold=hold or (),
+        max_gap=1.5 * period if max_gap is None else max_gap,
+    )
+    for name, error in errors.items():
+        out.print(f"{name}: off by at most {error:.2g}", soft_wrap=True, markup=False)
+    out.print(f"wrote {target}", soft_wrap=True, markup=False)
+
+
+@bag_app.command()
+def cut(
+    bag: BagArgument,
+    bag_out: OutOption,
+    start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0,
+    end: Annotated[float | None, typer.Option(help="s after the first message.")] = None,
+    topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None,
+    unfinished: UnfinishedOption = False,
+) -> None:
+    """Copy a stretch of time, or some topics, to a new bag."""
+    with _progress("copying") as progress:
+        count = edit.cut(
+            bag,
+            bag_out,
+            start=start,
+            end=end,
+            topics=topics or None,
+            unfinished=unfinished,
+            progress=progress,
+        )
+    out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
+
+
+@bag_app.command()
+def merge(bags: BagsArgument, bag_out: OutOption) -> None:
+    """Copy several bags into one, by log time."""
+    with _progress("copying") as progress:
+        count = edit.merge(expand_bags(bags), bag_out, progress=progress)
+    out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
+
+
+@bag_app.command()
+def split(
+    bag: BagArgument,
+    bag_out: Annotated[Path, typer.Option("--out", help="OUT_01, OUT_02, ... are written.")],
+    repeats: Annotated[
+        str | None, typer.Option(help="A signal whose repetitions become the parts.")
+    ] = None,
+    every: Annotated[float | None, typer.Option(help="s per part.")] = None,
+) -> None:
+    """Copy a bag in parts: at the repeats of an excitation, or every so many seconds."""
+    with _progress("copying") as progress:
+        parts = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
+    for part in parts:
+        out.print(f"wrote {part}", soft_wrap=True, markup=False)
+
+
+@bag_app.command("import")
+def import_command(
+    tables: Annotated[list[Path], typer.Argument(help="CSV, MAT or HDF5 files.")],
+    bag_out: OutOption,
+    assignments: Annotated[
+        list[str],
+        typer.Option(
+            "--signal", "-s", help="signal=column: /joints:position[name=elbow]=angles[3]"
+        ),
+    ],
+    types: Annotated[
+        list[str], typer.Option("--type", help="topic=type: /joints=sensor_msgs/msg/JointState")
+    ],
+    period: Annotated[float | None, typer.Option(help="s between rows.")] = None,
+    time_column: Annotated[
+        str | None, typer.Option("--time", help="The column with the rows' times in s.")
+    ] = None,
+    start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0,
+    custom: Annotated[
+        list[str] | None, typer.Option(help="key=value for the bag's metadata.")
+    ] = None,
+) -> None:
+    """Write columns of tables as a bag of standard messages."""
+    counts = import_tables(
+        tables,
+        bag_out,
+        assignments,
+        types=_pairs(types, "--type"),
+        period=period,
+        time=time_column,
+        start_ns=round(start * 1e9),
+        custom=_pairs(custom or (), "--custom"),
+    )
+    listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())
+    out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
+
+
+_METHODS: dict[Resampling, Method] = {
+    Resampling.LINEAR: "linear",
+    Resampling.CUBIC: "cubic",
+    Resampling.HOLD: "hold",
+}
+
+
+def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
+    pairs = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key or not value:
+            raise DataError(f"{option} {text}: expected key=value")
+        pairs[key] = value
+    return pairs
+
+
+def _clock(clock: Clock | None) -> str | None:
+    return None if clock is None else next(name for name in CLOCKS if name.startswith(clock.value))
+
+
+@contextmanager
+def _progress(task: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar that appears after PROGRESS_AFTER s, and only where someone is watching."""
+    started = time.monotonic()
+    columns = (TextColumn(escape(task)), BarColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=err, transient=True, disable=not sys.stderr.isatty())
+    identifier = bar.add_task(task, total=None)
+
+    def show(done: int, total: int) -> None:
+        if time.monotonic() - started > PROGRESS_AFTER:
+            bar.start()
+            bar.update(identifier, completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        bar.stop()

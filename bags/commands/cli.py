@@ -1,0 +1,248 @@
+"""The command line `nlsid`: identify, funnel, check, monitor, live, demo; `bag` for recordings."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from bags.chain.config import load_config
+from bags.chain.problems import FunnelProblem
+from bags.chain.steps import compare_bags, design_funnel_files, identify_bags
+from bags.commands import show, stack
+from bags.commands.bag_cli import bag_app
+from bags.commands.demo import run_demo
+from bags.commands.progress import progress_bar
+from bags.commands.tracking_cli import app as track_app
+from bags.monitoring import documents
+from bags.monitoring.replay import replay_bag
+from bags.pictures.report import report_available, write_margins
+from bags.recordings.folders import expand_bags
+from nlsid_core.certificate import Mode
+from nlsid_core.certificate import check as check_proof
+from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
+from nlsid_core.monitor import Status
+
+app = typer.Typer(
+    name="nlsid",
+    help="From a recorded bag to a proved model, a proved tracking tube and a monitor.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(track_app, name="track")
+app.add_typer(bag_app)
+out = Console()
+err = Console(stderr=True)
+
+BagsArgument = Annotated[
+    list[Path], typer.Argument(help="Bags: rosbag2 folders, .mcap files, or folders of bags.")
+]
+ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
+]
+
+
+@app.command()
+def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
+    """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    with progress_bar("identifying") as progress:
+        result = identify_bags(folders, settings, out_dir, progress=progress)
+    out.print(show.methods_table(result.fit, result.test))
+    for file in result.files:
+        out.print(f"wrote {file}", soft_wrap=True)
+    if not report_available():
+        out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+
+
+@app.command()
+def compare(
+    bags: BagsArgument,
+    config: ConfigOption,
+    lags: Annotated[
+        list[int] | None,
+        typer.Option(help="Numbers of lags to try, repeatable; default the configuration's."),
+    ] = None,
+) -> None:
+    """Score every method on the same test bags: simulation, prediction, residual tests, proof."""
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    with progress_bar("comparing") as progress:
+        tried = lags or [settings.identification.lags]
+        compared = compare_bags(folders, settings, tried, progress=progress)
+    out.print(show.comparison_table(compared))
+
+
+@app.command()
+def funnel(
+    out_dir: OutOption,
+    model: Annotated[
+        Path | None, typer.Option(help="The model.json that `nlsid identify` wrote.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="The robot's YAML configuration.")] = None,
+    problem: Annotated[
+        Path | None,
+        typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
+    ] = None,
+) -> None:
+    """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.
+
+    Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
+    """
+    if problem is not None:
+        if model is not None or config is not None:
+            raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
+        _funnel_around_trajectory(problem, out_dir)
+        return
+    if model is None or config is None:
+        raise typer.BadParameter("give --model and --config, or --problem")
+    settings = load_config(config)
+    with progress_bar("designing") as progress:
+        progress("policy, observer and tube", 0.1)
+        design = design_funnel_files(model, settings, out_dir)
+        progress("done", 1.0)
+    out.print(show.funnel_table(design))
+    for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
+        out.print(f"wrote {out_dir / name}", soft_wrap=True)
+
+
+@app.command()
+def check(
+    proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    mode: Annotated[
+        Mode,
+        typer.Option(help="exact: integers; rigorous: floating point with proved rounding bounds."),
+    ] = "exact",
+) -> None:
+    """Decide proofs without a solver: PROVED (status 0), REJECTED or UNDECIDED (status 1)."""
+    rejected = False
+    for path in proofs:
+        try:
+            verdict = check_proof(path, mode=mode)
+        except Undecided as doubt:
+            rejected = True
+            typer.echo(f"UNDECIDED {path.name}: {doubt}")
+        except (CertificateRejected, OSError) as refusal:
+            rejected = True
+            typer.echo(f"REJECTED {path.name}: {refusal}")
+        else:
+            typer.echo(str(verdict))
+            for assumption in verdict.assumptions:
+                typer.echo(f"  assuming {assumption}")
+    if rejected:
+        raise typer.Exit(1)
+
+
+@app.command()
+def monitor(
+    bags: BagsArgument,
+    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
+    replay: Annotated[
+        bool, typer.Option("--replay", help="Replay the bags (live monitoring is funnel_monitor).")
+    ] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="Takes `split.test` (which bags) and `monitor.nominal`.")
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
+    ] = None,
+) -> None:
+    """Hold recorded bags against a proved funnel: margin, worst axis, disturbance budget.
+
+    Status 0 if every bag is inside with the assumption kept, 1 if one is not.
+    """
+    if not replay:
+        raise typer.BadParameter(
+            "give --replay; a live robot is watched by the node funnel_monitor"
+        )
+    settings = load_config(config) if config is not None else None
+    proved = documents.load_proved_funnel(funnel)
+    folders = expand_bags(bags)
+    if settings is not None:
+        folders = [f for f in folders if f.name in settings.split.test] or folders
+    nominal = show.nominal_of(settings)
+    with progress_bar("replaying") as progress:
+        replays = []
+        for done, bag in enumerate(folders):
+            progress(bag.name, done / len(folders))
+            replays.append(replay_bag(proved, bag, nominal=nominal))
+        progress("drawing", 1.0)
+        picture = plot or funnel.with_name(documents.MARGIN_PLOT)
+        if report_available():
+            write_margins(picture, replays)
+    out.print(show.replay_table(replays))
+    for entry in replays:
+        if entry.reason:
+            out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
+    if report_available():
+        out.print(f"wrote {picture}", soft_wrap=True)
+    if any(entry.verdict != Status.INSIDE.value for entry in replays):
+        raise typer.Exit(1)
+
+
+@app.command()
+def live(
+    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
+    track: Annotated[
+        bool, typer.Option("--track", help="Run the policy too; give --highest. Default: watch.")
+    ] = False,
+    plant: Annotated[
+        bool, typer.Option("--plant", help="With --track: simulate the robot by the model.")
+    ] = False,
+    lowest: Annotated[float, typer.Option(help="Least input the robot may get.")] = 0.0,
+    highest: Annotated[float, typer.Option(help="Greatest input the robot may get.")] = 0.0,
+) -> None:
+    """Start the live nodes on a funnel and end them together: no ROS launch needed, rclpy is."""
+    if importlib.util.find_spec("rclpy") is None:
+        raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    nodes = stack.monitoring(funnel)
+    if track:
+        nodes = stack.tracking(funnel, lowest=lowest, highest=highest, plant=plant)
+    raise typer.Exit(stack.run_stack(nodes))
+
+
+@app.command()
+def demo(
+    out_dir: Annotated[
+        Path, typer.Option("--out", help="Folder for everything the demo makes.")
+    ] = Path("nlsid-demo"),
+) -> None:
+    """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
+    if not run_demo(out_dir, out):
+        raise typer.Exit(1)
+
+
+def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
+    with progress_bar("designing") as progress:
+        design = FunnelProblem.load(problem).design(progress)
+    for path in design.save(out_dir):
+        out.print(f"wrote {path}", soft_wrap=True)
+    if report_available():
+        from bags.pictures.funnel_plots import write_funnel_picture
+
+        picture = out_dir / documents.FUNNEL_PLOT
+        write_funnel_picture(picture, design)
+        out.print(f"wrote {picture}", soft_wrap=True)
+    out.print(str(design), soft_wrap=True)
+
+
+def main() -> None:
+    """Entry point: errors made for people are shown as one message and end with status 1."""
+    try:
+        app()
+    except NlsidError as error:
+        err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
+        sys.exit(1)
+    except OSError as error:
+        err.print(f"error: {error}", soft_wrap=True, markup=False, highlight=False)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""`nlsid demo`: the chain on the shipped bags, step by step, then live where rclpy is there."""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from bags import samples
+from bags.chain.config import Config, load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.commands import show
+from bags.commands.progress import progress_bar
+from bags.monitoring import documents
+from bags.monitoring.replay import Replay, replay_bag
+from bags.pictures.report import report_available, write_margins
+from nlsid_core.certificate import check
+from nlsid_core.monitor import Status
+
+LIVE_MODULE = "nlsid_ros.live"  # started as a process: bags knows nothing of ROS
+LIVE_TRIAL = "trial_05"
+SABOTAGED_PLOT = "sabotaged.png"
+
+
+def run_demo(out: Path, console: Console) -> bool:
+    """Run every step into `out`, saying what happens; True if all came out as it should."""
+    started = time.perf_counter()
+    demo = _Demo(out, console)
+    demo.identify()
+    demo.funnel()
+    demo.check()
+    monitored = demo.monitor()
+    live = demo.live()
+    demo.where_to_look()
+    console.print(f"{time.perf_counter() - started:.0f} s in all")
+    return monitored and live
+
+
+class _Demo:
+    """The steps, each under its own heading with the command that does the same."""
+
+    def __init__(self, out: Path, console: Console) -> None:
+        self.out, self.console = out, console
+        self.config_path = config_file("f1tenth.yaml")
+        self.config: Config = load_config(self.config_path)
+        self.bags = samples.f1tenth()
+
+    def identify(self) -> None:
+        self._heading("1  identify a model from the recordings")
+        self._command(
+            f"identify {self.bags[0].parent} --config {self.config_path} --out {self.out}"
+        )
+        with progress_bar("identifying") as progress:
+            result = identify_bags(self.bags, self.config, self.out, progress=progress)
+        self.console.print(show.methods_table(result.fit, result.test))
+        if not report_available():
+            self._say("no report and no pictures: install matplotlib (pip install 'nlsid[report]')")
+
+    def funnel(self) -> None:
+        self._heading("2  design a policy and a tube around its motion")
+        model = self.out / documents.MODEL
+        self._command(f"funnel --model {model} --config {self.config_path} --out {self.out}")
+        with progress_bar("designing policy, observer and tube"):
+            design = design_funnel_files(model, self.config, self.out)
+        self.console.print(show.funnel_table(design))
+
+    def check(self) -> None:
+        self._heading("3  check both proofs, exactly and without a solver")
+        for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
+            self._command(f"check {self.out / name}")
+            self._say(str(check(self.out / name)))
+
+    def monitor(self) -> bool:
+        self._heading("4  hold unseen recordings against the tube")
+        test = [bag for bag in self.bags if bag.name in self.config.split.test]
+        self._command(f"monitor --funnel {self.out / documents.FUNNEL} --replay BAG... (8 trials)")
+        with progress_bar("replaying") as progress, tempfile.TemporaryDirectory() as folder:
+            replays = self._replay(test)
+            sabotaged: list[Replay] = []
+            pairs = [(bag, fault) for bag in test for fault in FAULTS]
+            for done, (bag, fault) in enumerate(pairs):
+                copy = Path(folder) / f"{bag.name}, {fault}"
+                progress(f"sabotaging {copy.name}", done / len(pairs))
+                write_faulty_copy(bag, copy, self.config.signals.response.path, FAULTS[fault])
+                sabotaged += self._replay([copy])
+            progress("drawing", 1.0)
+            if report_available():
+                write_margins(self.out / documents.MARGIN_PLOT, replays)
+                write_margins(self.out / SABOTAGED_PLOT, sabotaged)
+        self.console.print(show.replay_table(replays))
+        self.console.print(show.caught_table(sabotaged))
+        inside = sum(r.verdict == Status.INSIDE.value for r in replays)
+        caught = sum(r.first_bad is not None for r in sabotaged)
+        self._say(
+            f"{inside} of {len(replays)} test trials inside, "
+            f"{caught} of {len(sabotaged)} sabotaged trials caught"
+        )
+        return inside == len(replays) and caught == len(sabotaged)
+
+    def live(self) -> bool:
+        """The live part in processes of its own; True where ROS is not there to run it."""
+        self._heading("5  the same live, over ROS 2")
+        if importlib.util.find_spec("rclpy") is None:
+            self._say("skipped: rclpy is not installed (pip install 'nlsid[ros]', or a ROS shell)")
+            return True
+        self._say("recorder, publisher, monitor and player as processes; two trials in real time")
+        recording = self.out / "live"
+        shutil.rmtree(recording, ignore_errors=True)
+        trial = next(bag for bag in self.bags if bag.name == LIVE_TRIAL)
+        command = [
+            *(sys.executable, "-m", LIVE_MODULE, "--funnel", str(self.out / documents.FUNNEL)),
+            *("--bag", str(trial), "--out", str(recording)),
+        ]
+        with progress_bar("playing"):
+            done = subprocess.run(command, check=False, capture_output=True, text=True)
+        self._say((done.stdout + done.stderr).strip())
+        return done.returncode == 0
+
+    def where_to_look(self) -> None:
+        self._heading("where to look")
+        if report_available():
+            self._say(f"report    {self.out / documents.REPORT}")
+            self._say(f"pictures  {self.out / documents.MARGIN_PLOT}, {self.out / SABOTAGED_PLOT}")
+        self._say(f"proofs    {self.out / documents.MODEL_PROOF}")
+        self._say(f"          {self.out / documents.FUNNEL_PROOF}")
+
+    def _replay(self, bags: Sequence[Path]) -> list[Replay]:
+        proved = documents.load_proved_funnel(self.out / documents.FUNNEL)
+        nominal = self.config.monitor.nominal_source
+        return [replay_bag(proved, bag, nominal=nominal) for bag in bags]
+
+    def _heading(self, text: str) -> None:
+        self.console.print()
+        self.console.rule(text, align="left")
+
+    def _command(self, text: str) -> None:
+        self.console.print(f"$ nlsid {text}", soft_wrap=True, highlight=False, markup=False)
+
+    def _say(self, text: str) -> None:
+        self.console.print(text, soft_wrap=True, highlight=False, markup=False)

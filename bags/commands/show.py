@@ -1,0 +1,146 @@
+"""Tables for the terminal."""
+
+from collections.abc import Sequence
+
+from rich.table import Table
+
+from bags.chain.config import Config
+from bags.chain.steps import Compared
+from bags.monitoring.replay import Replay
+from nlsid_core.funnels import TubeDesign
+from nlsid_core.identification import AnyFit
+from nlsid_core.monitor import Nominal, Status
+from nlsid_core.trajectory import Dataset
+
+COLOURS = {
+    Status.INSIDE.value: "green",
+    Status.OUTSIDE.value: "red",
+    Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
+    Status.UNKNOWN.value: "magenta",
+}
+
+
+def methods_table(fit: AnyFit, test: Dataset) -> Table:
+    """Every method's error on the test trials, time, and whether its model is proved stable."""
+    table = Table(title=f"{len(fit.model)} lags, {len(test)} test trials", title_justify="left")
+    table.add_column("method")
+    table.add_column("test error", justify="right")
+    table.add_column("time", justify="right")
+    table.add_column("stability")
+    for candidate in fit.candidates:
+        chosen = candidate is fit.chosen
+        table.add_row(
+            candidate.method,
+            f"{candidate.error_percent(test):.2f} %",
+            f"{candidate.seconds * 1e3:.0f} ms",
+            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
+            style="bold" if chosen else "",
+        )
+    return table
+
+
+def comparison_table(compared: Compared) -> Table:
+    """Every method at every number of lags, scored on the same test trials."""
+    table = Table(title=f"{len(compared.test)} test trials", title_justify="left")
+    table.add_column("lags", justify="right")
+    table.add_column("method")
+    table.add_column("simulation", justify="right")
+    horizons = list(compared.rows[0][1].prediction_percent)
+    for horizon in horizons:
+        table.add_column(f"{horizon} ahead", justify="right")
+    for name in ("residual", "stability"):
+        table.add_column(name)
+    table.add_column("time", justify="right")
+    for candidate, scores in compared.rows:
+        flaws = [] if scores.white else ["not white"]
+        flaws += [] if scores.independent else ["follows the input"]
+        table.add_row(
+            str(len(candidate.model)),
+            candidate.method,
+            f"{scores.simulation_percent:.2f} %",
+            *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),
+            ", ".join(flaws) or "white, independent",
+            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
+            f"{candidate.seconds * 1e3:.0f} ms",
+        )
+    return table
+
+
+def funnel_table(design: TubeDesign) -> Table:
+    """What the tube promises and on what."""
+    model, funnel, assumption = design.model, design.funnel, design.funnel.assumption
+    unit = model.y.unit
+    table = Table(title="proved tube", title_justify="left", show_header=False)
+    table.add_column(style="dim")
+    table.add_column()
+    tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
+    table.add_row("policy", tracking)
+    table.add_row(
+        "half-width",
+        f"{funnel.half_width:g} {unit} of {model.y.name}",
+    )
+    table.add_row("horizon", f"{assumption.samples * model.period:g} s")
+    table.add_row(
+        "assuming",
+        f"disturbance energy Σe² ≤ {assumption.budget:.4g} ({unit})²\n"
+        f"largest of {len(assumption.measured_on)} training trials {assumption.measured:.4g}, "
+        f"safety factor {assumption.safety_factor:g} in amplitude",
+    )
+    return table
+
+
+def replay_table(replays: Sequence[Replay]) -> Table:
+    """One row per bag: verdict, worst margin, when, nearest bound, budget, first bad sample."""
+    table = Table(
+        title="held against the funnel",
+        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube",
+        title_justify="left",
+        caption_justify="left",
+    )
+    for column, justify in (
+        ("bag", "left"),
+        ("verdict", "left"),
+        ("margin", "right"),
+        ("at", "right"),
+        ("axis", "left"),
+        ("budget", "right"),
+        ("bad from", "right"),
+    ):
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    for replay in replays:
+        worst, bad = replay.worst, replay.first_bad
+        colour = COLOURS[replay.verdict]
+        table.add_row(
+            replay.name,
+            f"[{colour}]{replay.verdict}[/{colour}]",
+            "-" if worst is None else f"{worst.margin:.3f}",
+            "-" if worst is None else f"{worst.t:.3f} s",
+            "-" if worst is None else worst.worst_axis,
+            "-" if worst is None else f"{100 * replay.budget_spent:.0f} %",
+            "-" if bad is None else f"{bad.t:.3f} s",
+        )
+    return table
+
+
+def caught_table(replays: Sequence[Replay]) -> Table:
+    """One row per bag that should be caught: verdict, first bad sample, budget spent in the end."""
+    table = Table(title="the same trials with a broken sensor", title_justify="left")
+    table.add_column("bag", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("bad from", justify="right", no_wrap=True)
+    table.add_column("budget", justify="right", no_wrap=True)
+    for replay in replays:
+        bad = replay.first_bad
+        colour = COLOURS[replay.verdict]
+        table.add_row(
+            replay.name,
+            f"[{colour}]{replay.verdict}[/{colour}]",
+            "-" if bad is None else f"{bad.t:.3f} s",
+            f"{100 * replay.budget_spent:.0f} %",
+        )
+    return table
+
+
+def nominal_of(settings: Config | None) -> Nominal:
+    """The configured nominal; the received commands where there is no configuration."""
+    return Nominal.COMMAND if settings is None else settings.monitor.nominal_source

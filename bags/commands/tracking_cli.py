@@ -1,0 +1,162 @@
+"""`nlsid track`: from a robot's recordings to a proved funnel around a motion of it, and back."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from bags.chain import tracking_steps
+from bags.chain.tracking_config import TrackingConfig, load_tracking_config
+from bags.commands.progress import progress_bar
+from bags.monitoring import documents
+from bags.recordings.folders import expand_bags
+from nlsid_core.certificate import check
+from nlsid_core.funnels.state_funnel import FunnelDesign
+from nlsid_core.identification.states import StateFit
+from nlsid_core.monitor import Status
+from nlsid_core.tracking_monitor import TrackingReading
+
+app = typer.Typer(
+    help="A measured state: model from repeats, motion, proved discrete funnel, monitor.",
+    no_args_is_help=True,
+)
+out = Console()
+
+EXCITATIONS, RUNS = "excitations", "runs"  # folders of bags that `run` and `simulate` make
+
+ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+BagsArgument = Annotated[list[Path], typer.Argument(help="Bags, or folders of bags.")]
+DesignOption = Annotated[Path, typer.Option(help="Folder with model.json and policy.json.")]
+
+
+@app.command()
+def simulate(config: ConfigOption, out_dir: OutOption) -> None:
+    """Record the configured robot in MuJoCo (extra `sim`): repeats of excitations, as bags."""
+    bags = tracking_steps.simulate_excitations(load_tracking_config(config), out_dir)
+    out.print(f"wrote {len(bags)} bags in {out_dir}", soft_wrap=True)
+
+
+@app.command()
+def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
+    """Identify x⁺ = f(x, u) from repeats: model.json."""
+    fit = tracking_steps.identify_state_bags(
+        expand_bags(bags), load_tracking_config(config), out_dir
+    )
+    out.print(_classes_table(fit))
+    out.print(f"wrote {out_dir / documents.MODEL}", soft_wrap=True)
+
+
+@app.command()
+def plan(
+    model: Annotated[Path, typer.Option(help="The model.json of `nlsid track identify`.")],
+    config: ConfigOption,
+    out_dir: OutOption,
+) -> None:
+    """Plan the configured motion on the model, and its feedback: policy.json."""
+    policy = tracking_steps.plan_tracking(model, load_tracking_config(config), out_dir)
+    out.print(f"{len(policy)} samples; wrote {out_dir / documents.POLICY}", soft_wrap=True)
+
+
+@app.command()
+def drive(design: DesignOption, config: ConfigOption, out_dir: OutOption) -> None:
+    """Commission the policy on the simulated robot: bags that measure the disturbance."""
+    bags = tracking_steps.simulate_runs(design, load_tracking_config(config), out_dir)
+    out.print(f"wrote {len(bags)} bags in {out_dir}", soft_wrap=True)
+
+
+@app.command()
+def funnel(bags: BagsArgument, design: DesignOption, config: ConfigOption) -> None:
+    """Measure the disturbance on commissioning bags and prove the funnel: funnel.json and proof."""
+    made = _funnel(expand_bags(bags), design, load_tracking_config(config))
+    out.print(_funnel_table(made))
+
+
+@app.command()
+def monitor(
+    bags: BagsArgument,
+    funnel: Annotated[Path, typer.Option(help="The funnel.json of `nlsid track funnel`.")],
+    config: ConfigOption,
+) -> None:
+    """Hold recorded runs of the policy against its funnel; status 1 if one is not inside."""
+    if not _monitor(expand_bags(bags), funnel, load_tracking_config(config)):
+        raise typer.Exit(1)
+
+
+@app.command()
+def run(config: ConfigOption, out_dir: OutOption) -> None:
+    """All steps on the configured simulated robot; its bags, model, policy, funnel and proof."""
+    settings = load_tracking_config(config)
+    tracking_steps.simulate_excitations(settings, out_dir / EXCITATIONS)
+    excitations = expand_bags([out_dir / EXCITATIONS])
+    out.print(_classes_table(tracking_steps.identify_state_bags(excitations, settings, out_dir)))
+    tracking_steps.plan_tracking(out_dir / documents.MODEL, settings, out_dir)
+    tracking_steps.simulate_runs(out_dir, settings, out_dir / RUNS)
+    runs = expand_bags([out_dir / RUNS])
+    out.print(_funnel_table(_funnel(runs, out_dir, settings)))
+    verdict = check(out_dir / documents.FUNNEL_PROOF)
+    out.print(str(verdict), soft_wrap=True)
+    for assumption in verdict.assumptions:
+        out.print(f"  assuming {assumption}", soft_wrap=True)
+    if not _monitor(runs, out_dir / documents.FUNNEL, settings):
+        raise typer.Exit(1)
+
+
+def _funnel(bags: list[Path], design: Path, config: TrackingConfig) -> FunnelDesign:
+    with progress_bar("designing") as progress:
+        return tracking_steps.design_tracking_funnel(design, bags, config, progress=progress)
+
+
+def _monitor(bags: list[Path], funnel: Path, config: TrackingConfig) -> bool:
+    proved = tracking_steps.load_proved_tracking(funnel)
+    table = Table(title="runs against the funnel", title_justify="left")
+    for column in ("run", "verdict", "least margin", "disturbance / bound", "end", "why"):
+        table.add_column(column)
+    inside = True
+    for bag in bags:
+        readings = proved.replay(config, bag)
+        judged = [r for r in readings if r.status is not Status.UNKNOWN]
+        bad = next((r for r in readings if r.status is not Status.INSIDE), None)
+        inside = inside and bad is None
+        table.add_row(
+            bag.name,
+            (bad or readings[-1]).status.value,
+            *_extremes(judged),
+            readings[-1].level.value,
+            "" if bad is None else bad.reason,
+        )
+    out.print(table)
+    return inside
+
+
+def _extremes(judged: list[TrackingReading]) -> tuple[str, str]:
+    if not judged:
+        return "-", "-"
+    return (
+        f"{min(r.margin for r in judged):.3f}",
+        f"{max(r.disturbance for r in judged):.2f}",
+    )
+
+
+def _classes_table(fit: StateFit) -> Table:
+    table = Table(title="free-run error on the validation bags", title_justify="left")
+    table.add_column("degree of each state and input")
+    table.add_column("error", justify="right")
+    for degrees, error in fit.errors:
+        table.add_row(", ".join(map(str, degrees)), f"{error:.3g} %")
+    return table
+
+
+def _funnel_table(made: FunnelDesign) -> Table:
+    funnel, model = made.funnel, made.model
+    table = Table(title="half-widths of the tube", title_justify="left")
+    for column in ("state", "at the start", "narrowest", "at the end"):
+        table.add_column(column)
+    widths = funnel.half_widths
+    for i, signal in enumerate(model.x):
+        row = (widths[0, i], np.min(widths[:, i]), widths[-1, i])
+        table.add_row(f"{signal.name} [{signal.unit}]", *(f"{value:.4g}" for value in row))
+    return table

@@ -1,0 +1,1 @@
+"""Recordings and live messages held against a funnel, by one path."""

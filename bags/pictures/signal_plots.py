@@ -1,0 +1,65 @@
+"""Pictures of recorded signals (extra `report`: matplotlib)."""
+
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bags.pictures.plots import BLUE, LINE, ORANGE, png, svg
+from bags.signals.grid import seconds
+from bags.signals.reader import Samples
+from nlsid_core._json import write_atomically
+from nlsid_core.errors import DataError
+
+DRAWN = 20_000  # points a panel; of more, the least and the largest of each stretch are drawn
+
+
+def draw_signals(samples: Sequence[Samples], *, title: str) -> Figure:
+    """One panel a signal over time in s since the first stamp of all; gaps are left open."""
+    origin = min(int(s.stamp_ns[0]) for s in samples)
+    figure = Figure(figsize=(9.5, 0.8 + 1.7 * len(samples)), layout="constrained")
+    panels = figure.subplots(len(samples), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, signal in zip(panels, samples, strict=True):
+        t, values = _thinned(seconds(signal.stamp_ns, origin), signal.values)
+        steps = np.diff(t)
+        gaps = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else steps.astype(int)
+        axes.plot(np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan), color=BLUE, lw=LINE)
+        if len(t) < 200:
+            axes.plot(t, values, ".", color=ORANGE, ms=3)
+        axes.set_title(signal.path, fontsize=9, loc="left")
+        axes.set_ylabel(f"[{signal.unit}]" if signal.unit else "")
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[-1].set_xlabel(f"time [s] by {samples[0].clock}")
+    figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def write_picture(path: Path | str, figure: Figure, *, title: str) -> None:
+    """A .png, .svg or .html file, by its ending; DataError for another one."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".png":
+        content = png(figure)
+    elif suffix == ".svg":
+        content = svg(figure).encode()
+    elif suffix in (".html", ".htm"):
+        name = html.escape(title)
+        content = (
+            f"<!DOCTYPE html><html lang='en'><meta charset='utf-8'><title>{name}</title>"
+            f"<body>{svg(figure)}</body></html>\n"
+        ).encode()
+    else:
+        raise DataError(f"{path}: a picture is a .png, .svg or .html file")
+    write_atomically(path, content)
+
+
+def _thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    if len(t) <= DRAWN:
+        return t, values
+    kept: list[int] = []
+    for part in np.array_split(np.arange(len(t)), DRAWN // 2):
+        ends = {int(part[np.argmin(values[part])]), int(part[np.argmax(values[part])])}
+        kept += sorted(ends)
+    return t[kept], values[kept]

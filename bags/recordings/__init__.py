@@ -1,0 +1,1 @@
+"""Recordings as messages: finding, reading, writing and mending bags and MCAP files."""

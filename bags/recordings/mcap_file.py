@@ -1,0 +1,364 @@
+"""An MCAP file as blocks of messages that NumPy can index, whatever state the file is in.
+
+The file is walked record by record from its start, hopping over the chunks' contents: that needs no
+summary, so a file that was never finished or that lost its end reads like any other up to there.
+Every length is held against the bytes that are there before anything is allocated.
+
+Source: the MCAP specification, https://mcap.dev/spec.
+"""
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, BinaryIO, Final, TypeVar
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema, Statistics
+
+from bags.recordings.batch import Batch
+from bags.recordings.mcap_records import (
+    MESSAGE,
+    MESSAGE_FIXED,
+    RECORD,
+    Block,
+    add_channel,
+    add_schema,
+    messages_at,
+    parse,
+    uncompressed,
+    unpack,
+    walk_channels,
+    walk_messages,
+)
+from nlsid_core._types import IntArray
+from nlsid_core.errors import BagError
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.FOOTER)
+SEARCH_BYTES: Final = 2**20
+MAX_RECORD_BYTES: Final = (
+    128 * 2**20
+)  # of the records read whole: schemas, metadata, loose messages
+LOOSE_RUN_BYTES: Final = 4 * 2**20  # messages outside chunks are read in runs of about this size
+
+_CHUNK: Final = struct.Struct("<QQQII")
+_INDEX: Final = struct.Struct("<HI")
+_COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
+_INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
+
+Record = TypeVar("Record")
+
+
+@dataclass
+class Contents:
+    """What the walk found. `ending`: why the file stops early, None if it is finished."""
+
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    blocks: list[Block] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)  # without their data
+    stated: dict[int, int] | None = None  # the statistics' count of messages per channel
+    ending: str | None = None
+    good_bytes: int = 0
+    lost: list[str] = field(default_factory=list)
+
+
+class McapFile:
+    """An MCAP file open for reading. Close it, or use as a context manager.
+
+    Raises BagError if it is not an MCAP file or if a record is damaged; a file that merely stops
+    early opens, and says so in `contents.ending`. With `salvage=True` what is damaged is left out
+    and listed in `contents.lost`, and indexes and summary are not used.
+    """
+
+    def __init__(self, path: Path | str, *, salvage: bool = False) -> None:
+        self.path = Path(path)
+        self._salvage = salvage
+        self._size = self.path.stat().st_size
+        self._stream: BinaryIO = self.path.open("rb")
+        try:
+            self.contents = self._walk()
+            self._find_channels()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    def __enter__(self) -> "McapFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
+        """(channel id, messages) block by block, in the order of the file.
+
+        Raises BagError if a block is damaged or not what its index says.
+        """
+        for block in self.contents.blocks:
+            yield from self.block_batches(block, channels)
+
+    def block_batches(
+        self, block: Block, channels: Collection[int], *, use_index: bool = True
+    ) -> Iterator[tuple[int, Batch]]:
+        """The messages of one block, one batch per channel that has any."""
+        index = block.index if use_index else None
+        if index is not None and not any(channel in index for channel in channels):
+            return
+        buffer = self.content(block)
+        if index is None:
+            offsets = {c: np.array(o, dtype=np.int64) for c, o in walk_messages(buffer).items()}
+            where = f"the block at byte {block.offset}"
+        else:
+            offsets = {c: self._indexed(*index[c]) for c in channels if c in index}
+            where = f"the message index of the chunk at byte {block.offset}"
+        for channel in channels:
+            if len(found := offsets.get(channel, ())):
+                yield channel, messages_at(buffer, np.asarray(found), channel, where)
+
+    def content(self, block: Block) -> bytes:
+        """The block's records, decompressed; BagError if they are not what the chunk states."""
+        raw = self._read(block.offset, block.size)
+        if len(raw) != block.size:
+            raise BagError(f"the chunk at byte {block.offset} is cut off")
+        return uncompressed(block, raw)
+
+    def attachment_data(self, attachment: Attachment) -> bytes:
+        """The data of one of `contents.attachments`."""
+        offset, size = struct.unpack("<QQ", attachment.data)
+        return self._read(offset, size)
+
+    def _walk(self) -> Contents:
+        found = Contents(ending="it stops without the end of an MCAP file")
+        if self._read(0, len(MAGIC)) != MAGIC:
+            raise BagError("not an MCAP file")
+        at = found.good_bytes = len(MAGIC)
+        loose = _LooseRun()
+        while at + RECORD.size <= self._size:
+            opcode, length = RECORD.unpack(self._read(at, RECORD.size))
+            content, end = at + RECORD.size, at + RECORD.size + length
+            if end > self._size or opcode == 0:
+                what = "runs past the end of the file" if opcode else "is no record"
+                found.ending = f"what starts at byte {at} {what}"
+                following = self._next_chunk(at + 1) if self._salvage else None
+                if following is None:
+                    break
+                found.lost.append(f"bytes {at} to {following}: no records")
+                at = following
+                continue
+            if opcode == Opcode.MESSAGE:
+                if length < MESSAGE_FIXED:
+                    raise BagError(f"the message at byte {at} has {length} bytes")
+                header = np.frombuffer(self._read(at, MESSAGE.itemsize), MESSAGE)[0]
+                loose.add(found, at, end, int(header["log"]))
+            else:
+                loose.close(found)
+                self._try_note(found, opcode, content, length)
+            at = found.good_bytes = end
+            if opcode == Opcode.DATA_END and self._salvage:  # what follows repeats what was said
+                found.ending = None
+                break
+            if opcode == Opcode.FOOTER:
+                if self._read(at, len(MAGIC)) == MAGIC:
+                    found.ending = None
+                break
+        loose.close(found)
+        if found.ending is not None and found.blocks:  # its index may be cut off
+            last = found.blocks[-1]
+            found.blocks[-1] = replace(last, index=None)
+        return found
+
+    def _try_note(self, found: Contents, opcode: int, content: int, length: int) -> None:
+        if not self._salvage:
+            self._note(found, opcode, content, length)
+        elif opcode not in SUMMARISING:
+            try:
+                self._note(found, opcode, content, length)
+            except BagError as error:
+                found.lost.append(str(error))
+
+    def _next_chunk(self, start: int) -> int | None:
+        """The first byte from `start` on where a compressed chunk's record begins."""
+        before = RECORD.size + _CHUNK.size - 4  # from there to the length of the compression's name
+        keep = before + 16
+        for at in range(start, self._size, SEARCH_BYTES):
+            window = self._read(at, SEARCH_BYTES + keep)
+            for match in _COMPRESSION.finditer(window, before):
+                place = at + match.start() - before
+                opcode, length = RECORD.unpack(self._read(place, RECORD.size))
+                if opcode == Opcode.CHUNK and place + RECORD.size + length <= self._size:
+                    return place
+        return None
+
+    def _note(self, found: Contents, opcode: int, content: int, length: int) -> None:
+        """Keep what a record outside chunks says."""
+        if opcode == Opcode.CHUNK:
+            found.blocks.append(self._chunk(content, length))
+        elif opcode == Opcode.MESSAGE_INDEX and found.blocks:
+            self._note_index(found.blocks, content, length)
+        elif opcode == Opcode.HEADER:
+            header = self._parse(Header.read, content, length)
+            found.profile, found.library = header.profile, header.library
+        elif opcode == Opcode.SCHEMA:
+            add_schema(found.schemas, self._parse(Schema.read, content, length))
+        elif opcode == Opcode.CHANNEL:
+            add_channel(found.channels, self._parse(Channel.read, content, length))
+        elif opcode == Opcode.METADATA:
+            found.metadata.append(self._parse(Metadata.read, content, length))
+        elif opcode == Opcode.ATTACHMENT:
+            found.attachments.append(self._attachment(content, length))
+        elif opcode == Opcode.STATISTICS:
+            statistics = self._parse(Statistics.read, content, length)
+            found.stated = dict(statistics.channel_message_counts)
+        elif opcode == Opcode.FOOTER:
+            self._check_summary(self._parse(Footer.read, content, length), content)
+
+    def _chunk(self, content: int, length: int) -> Block:
+        start, _, uncompressed, crc, letters = unpack(_CHUNK, self._read(content, _CHUNK.size))
+        if letters > 32 or length < _CHUNK.size + letters + 8:
+            raise BagError(f"the chunk at byte {content} has no valid header")
+        rest = self._read(content + _CHUNK.size, letters + 8)
+        size = int.from_bytes(rest[letters:], "little")
+        offset = content + _CHUNK.size + letters + 8
+        if offset + size > content + length:
+            raise BagError(f"the chunk at byte {content} is longer than its record")
+        compression = rest[:letters].decode("utf-8", "replace")
+        return Block(offset, size, compression, uncompressed, crc, start)
+
+    def _note_index(self, blocks: list[Block], content: int, length: int) -> None:
+        channel, size = unpack(_INDEX, self._read(content, _INDEX.size))
+        if size % _INDEX_ENTRY.itemsize or _INDEX.size + size > length:
+            raise BagError(f"the message index at byte {content} is damaged")
+        block = blocks[-1]
+        index = dict(block.index or {})
+        if size:
+            index[channel] = (content + _INDEX.size, size // _INDEX_ENTRY.itemsize)
+        blocks[-1] = replace(block, index=index)
+
+    def _attachment(self, content: int, length: int) -> Attachment:
+        """The attachment's header; `data` holds (offset, size) of its data, which stay on disk."""
+        head = self._read(content, min(length, 2**16))
+        log, create, letters = unpack(struct.Struct("<QQI"), head)
+        name = head[20 : 20 + letters].decode("utf-8", "replace")
+        at = 20 + letters
+        (letters,) = unpack(struct.Struct("<I"), head[at:])
+        media = head[at + 4 : at + 4 + letters].decode("utf-8", "replace")
+        at += 4 + letters
+        (size,) = unpack(struct.Struct("<Q"), head[at:])
+        if at + 8 + size > length:
+            raise BagError(f"the attachment at byte {content} is longer than its record")
+        return Attachment(create, log, name, media, struct.pack("<QQ", content + at + 8, size))
+
+    def _check_summary(self, footer: Footer, content: int) -> None:
+        start = footer.summary_start
+        if not footer.summary_crc or not start:
+            return
+        end = content + 16  # the sum goes over everything up to itself
+        if not len(MAGIC) <= start <= end:
+            raise BagError("the footer's summary offset is damaged")
+        crc = 0
+        for at in range(start, end, 2**20):
+            crc = zlib.crc32(self._read(at, min(2**20, end - at)), crc)
+        if crc != footer.summary_crc:
+            raise BagError("the summary is damaged: its checksum differs")
+
+    def _find_channels(self) -> None:
+        """Look into the blocks for channels the rest of the file does not list; count messages."""
+        found = self.contents
+        damaged: list[Block] = []
+        for block in found.blocks:
+            if block.index is not None and all(map(self._is_known, block.index)):
+                counts = {channel: count for channel, (_, count) in block.index.items()}
+            else:
+                try:
+                    counts = self._declared_in(block)
+                except BagError as error:
+                    if found.ending is None and not self._salvage:
+                        raise
+                    found.lost.append(str(error))
+                    damaged.append(block)
+                    continue
+            for channel_id, count in counts.items():
+                found.counts[channel_id] = found.counts.get(channel_id, 0) + count
+        found.blocks = [block for block in found.blocks if block not in damaged]
+        if lost := found.counts.keys() - found.channels.keys():
+            if not self._salvage:
+                raise BagError(f"messages on channel {min(lost)}, which nothing declares")
+            found.lost += [f"{found.counts[c]} messages of unknown channel {c}" for c in lost]
+        self._check_statistics()
+
+    def _declared_in(self, block: Block) -> dict[int, int]:
+        """Note the schemas and channels a block declares; how many messages each channel has."""
+        content = self.content(block)
+        schemas, channels = walk_channels(content)
+        for schema in schemas:
+            add_schema(self.contents.schemas, schema)
+        for channel in channels:
+            add_channel(self.contents.channels, channel)
+        return {channel_id: len(at) for channel_id, at in walk_messages(content).items()}
+
+    def _is_known(self, channel_id: int) -> bool:
+        """Whether a channel and its schema have been declared so far."""
+        channel = self.contents.channels.get(channel_id)
+        if channel is None:
+            return False
+        return channel.schema_id == 0 or channel.schema_id in self.contents.schemas
+
+    def _check_statistics(self) -> None:
+        """Hold the finished file's own count of its messages against what is there."""
+        stated = self.contents.stated
+        if stated is None or self.contents.ending is not None:
+            return
+        for channel, count in stated.items():
+            there = self.contents.counts.get(channel, 0)
+            if there != count:
+                raise BagError(
+                    f"channel {channel} has {there} messages, the file's statistics say {count}"
+                )
+
+    def _indexed(self, offset: int, count: int) -> IntArray:
+        raw = self._read(offset, count * _INDEX_ENTRY.itemsize)
+        entries = np.frombuffer(raw, _INDEX_ENTRY)
+        return entries["offset"].astype(np.int64)
+
+    def _parse(self, read: Callable[[Any], Record], content: int, length: int) -> Record:
+        if length > MAX_RECORD_BYTES:
+            raise BagError(f"a record of {length} bytes at byte {content}; refused")
+        return parse(read, self._read(content, length))
+
+    def _read(self, offset: int, size: int) -> bytes:
+        self._stream.seek(offset)
+        return self._stream.read(min(size, max(0, self._size - offset)))
+
+
+class _LooseRun:
+    """Messages outside chunks, gathered into blocks while the file is walked."""
+
+    def __init__(self) -> None:
+        self._start: int | None = None
+        self._end = 0
+        self._log_ns = 0
+
+    def add(self, found: Contents, at: int, end: int, log_ns: int) -> None:
+        if self._start is not None and end - self._start > LOOSE_RUN_BYTES:
+            self.close(found)
+        if self._start is None:
+            self._start, self._log_ns = at, log_ns
+        self._end, self._log_ns = end, min(self._log_ns, log_ns)
+
+    def close(self, found: Contents) -> None:
+        if self._start is not None:
+            size = self._end - self._start
+            found.blocks.append(Block(self._start, size, "", size, 0, self._log_ns))
+        self._start = None

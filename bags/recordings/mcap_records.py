@@ -1,0 +1,197 @@
+"""The records of an MCAP file: the layout of a message, chunk contents, and checks on both.
+
+Source: the MCAP specification, https://mcap.dev/spec.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, Final, TypeVar
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Schema
+
+from bags.recordings.batch import Batch
+from nlsid_core._types import IntArray
+from nlsid_core.errors import BagError
+
+MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message
+RECORD: Final = struct.Struct("<BQ")
+MESSAGE: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log", "<u8"),
+        ("publish", "<u8"),
+    ]
+)
+MESSAGE_FIXED: Final = MESSAGE.itemsize - RECORD.size  # of a message's content, before its data
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """A chunk, or a run of records outside chunks, which reads like an uncompressed one.
+
+    offset, size: bytes of its content in the file. index: channel -> (offset, count) of its message
+    index entries in the file; None if it has none.
+    """
+
+    offset: int
+    size: int
+    compression: str
+    uncompressed_size: int
+    crc: int
+    start_ns: int
+    index: dict[int, tuple[int, int]] | None = None
+
+
+def uncompressed(block: Block, raw: bytes) -> bytes:
+    """The block's records from its bytes in the file.
+
+    Raises BagError if they are damaged, not what the chunk's header states, or more than
+    MAX_CHUNK_BYTES; nothing larger than the header states is allocated.
+    """
+    where, size = f"the chunk at byte {block.offset}", block.uncompressed_size
+    if size > MAX_CHUNK_BYTES:
+        raise BagError(f"{where} unpacks to {size} bytes; at most {MAX_CHUNK_BYTES} are read")
+    try:
+        content = _decompress(block.compression, raw, size)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise BagError(f"{where} cannot be decompressed: {error}") from error
+    if len(content) != size:
+        raise BagError(f"{where} holds {len(content)} bytes, its header says {size}")
+    if block.crc and zlib.crc32(content) != block.crc:
+        raise BagError(f"{where} is damaged: its checksum differs")
+    return content
+
+
+def walk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """(opcode, offset of the record, its end) of each record in a chunk; BagError if one is cut."""
+    at = 0
+    while at < len(content):
+        if at + RECORD.size > len(content):
+            raise BagError(f"a chunk ends inside a record, at {at} of {len(content)} bytes")
+        opcode, length = RECORD.unpack_from(content, at)
+        end = at + RECORD.size + length
+        if end > len(content):
+            raise BagError(f"a record in a chunk runs past its end, at {at} of {len(content)}")
+        yield opcode, at, end
+        at = end
+
+
+def walk_messages(content: bytes) -> dict[int, list[int]]:
+    """Channel -> offsets of its message records in a chunk without an index."""
+    found: dict[int, list[int]] = {}
+    for opcode, at, end in walk_records(content):
+        if opcode == Opcode.MESSAGE:
+            if end - at < MESSAGE.itemsize:
+                raise BagError(f"a message record of {end - at} bytes")
+            channel = int.from_bytes(content[at + RECORD.size : at + RECORD.size + 2], "little")
+            found.setdefault(channel, []).append(at)
+    return found
+
+
+def walk_channels(content: bytes) -> tuple[list[Schema], list[Channel]]:
+    """The schemas and channels declared in a chunk."""
+    schemas, channels = [], []
+    for opcode, at, end in walk_records(content):
+        if opcode == Opcode.SCHEMA:
+            schemas.append(parse(Schema.read, content[at + RECORD.size : end]))
+        elif opcode == Opcode.CHANNEL:
+            channels.append(parse(Channel.read, content[at + RECORD.size : end]))
+    return schemas, channels
+
+
+def messages_at(content: bytes, offsets: IntArray, channel: int, where: str) -> Batch:
+    """The messages whose records are at `offsets`; BagError unless all are messages of `channel`.
+
+    Gathered through overlapping views, so that no message costs a step of Python.
+    """
+    last = len(content) - MESSAGE.itemsize
+    if last < 0 or (offsets < 0).any() or (offsets > last).any():
+        raise BagError(f"{where} points outside it")
+    if (np.diff(offsets) <= 0).any():
+        offsets = np.sort(offsets)
+        if (np.diff(offsets) == 0).any():
+            raise BagError(f"{where} lists a message twice")
+    overlapping = np.ndarray((last + 1,), f"V{MESSAGE.itemsize}", content, strides=(1,))
+    header = overlapping[offsets].view(MESSAGE)
+    if (header["opcode"] != Opcode.MESSAGE).any() or (header["channel"] != channel).any():
+        raise BagError(f"{where} does not point at messages of channel {channel}")
+    length = header["length"]
+    if (length < MESSAGE_FIXED).any() or (length > len(content)).any():
+        raise BagError(f"{where} points at messages that are no messages")
+    start = offsets + MESSAGE.itemsize
+    size = length.astype(np.int64) - MESSAGE_FIXED
+    ends = start + size
+    if ends[-1] > len(content) or (ends[:-1] > offsets[1:]).any():
+        raise BagError(f"{where} points at messages that overlap")
+    return Batch(
+        content,
+        start,
+        size,
+        _time(header["log"], where),
+        _time(header["publish"], where),
+        header["sequence"].astype(np.int64),
+    )
+
+
+def add_schema(schemas: dict[int, Schema], schema: Schema) -> None:
+    """Keep a schema; BagError if its id already names another."""
+    if schemas.setdefault(schema.id, schema) != schema:
+        raise BagError(f"schema {schema.id} is declared twice, and differently")
+
+
+def add_channel(channels: dict[int, Channel], channel: Channel) -> None:
+    """Keep a channel; BagError if its id already names another."""
+    if channels.setdefault(channel.id, channel) != channel:
+        raise BagError(f"channel {channel.id} is declared twice, and differently")
+
+
+def parse(read: Callable[[Any], Record], content: bytes) -> Record:
+    """One record by mcap's own parser; BagError if it is damaged."""
+    try:
+        return read(ReadDataStream(BytesIO(content)))
+    except Exception as error:  # mcap raises what the bytes make struct and codecs raise
+        raise BagError(f"a damaged record: {type(error).__name__}: {error}") from error
+
+
+def unpack(layout: struct.Struct, content: bytes) -> tuple[Any, ...]:
+    """The start of `content` by `layout`; BagError if it is too short."""
+    if len(content) < layout.size:
+        raise BagError(f"a record ends after {len(content)} bytes, {layout.size} are needed")
+    return layout.unpack_from(content)
+
+
+def _decompress(compression: str, raw: bytes, size: int) -> bytes:
+    if compression == "":
+        return raw
+    if compression == "zstd":
+        stated = zstandard.frame_content_size(raw)
+        if stated not in (-1, size):
+            raise BagError(f"a zstd frame of {stated} bytes where the header says {size}")
+        if size == 0:
+            return b""
+        return zstandard.ZstdDecompressor().decompress(raw, max_output_size=size)
+    if compression == "lz4":
+        # one byte more than stated, to see that there is none
+        content: bytes = lz4.frame.LZ4FrameDecompressor().decompress(raw, max_length=size + 1)
+        return content
+    raise BagError(f"a chunk is compressed by '{compression}'; known are zstd and lz4")
+
+
+def _time(stamps: Any, where: str) -> IntArray:
+    if len(stamps) and stamps.max() >= 2**63:
+        raise BagError(f"{where} points at a message with time {stamps.max()} ns")
+    times: IntArray = stamps.astype(np.int64)
+    return times

@@ -1,0 +1,86 @@
+"""What arrived on a topic: how many, how often, how evenly, and the last seconds of it."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from bags.recordings.writer import BagWriter
+
+GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
+SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
+
+
+class Arrival(NamedTuple):
+    """One serialised message as it came; times in ns since the epoch."""
+
+    topic: str
+    msgtype: str
+    data: bytes
+    log_time_ns: int
+    publish_time_ns: int
+
+
+@dataclass
+class Regularity:
+    """Rate and jitter of one topic's stamps, and the gaps in them; cheap enough for 10 kHz."""
+
+    gaps: int = 0
+    _last_ns: int | None = None
+    _period: float = math.nan
+    _variance: float = 0.0
+
+    def update(self, stamp_ns: int) -> None:
+        """Take the next stamp."""
+        last, self._last_ns = self._last_ns, stamp_ns
+        if last is None:
+            return
+        interval = (stamp_ns - last) * 1e-9
+        if math.isnan(self._period):
+            self._period = interval
+            return
+        off = interval - self._period
+        if interval > GAP * self._period > 0.0:
+            self.gaps += 1
+            return
+        self._period += SMOOTHING * off
+        self._variance += SMOOTHING * (off * off - self._variance)
+
+    @property
+    def rate(self) -> float:
+        """Hz, NaN before the second message."""
+        return 1.0 / self._period if self._period > 0.0 else math.nan
+
+    @property
+    def jitter(self) -> float:
+        """s, standard deviation of the intervals between stamps."""
+        return math.sqrt(self._variance)
+
+
+@dataclass
+class Recent:
+    """The arrivals of the last `seconds`, to be kept when something happened."""
+
+    seconds: float
+    _arrivals: deque[Arrival] = field(default_factory=deque)
+
+    def add(self, arrival: Arrival) -> None:
+        """Remember this one, forget what is too old."""
+        self._arrivals.append(arrival)
+        oldest = arrival.log_time_ns - round(self.seconds * 1e9)
+        while self._arrivals[0].log_time_ns < oldest:
+            self._arrivals.popleft()
+
+    def save(self, path: Path) -> int:
+        """Write a bag of what is remembered; how many messages. Raises BagError if it exists."""
+        with BagWriter(path) as bag:
+            for arrival in self._arrivals:
+                bag.write(
+                    arrival.topic,
+                    arrival.msgtype,
+                    arrival.data,
+                    log_time_ns=arrival.log_time_ns,
+                    publish_time_ns=arrival.publish_time_ns,
+                )
+        return len(self._arrivals)

@@ -1,0 +1,187 @@
+"""Signals of a bag as columns, topic by topic, in bounded memory.
+
+`stream_columns` gives them part by part, as many messages at once as a chunk holds; `read_columns`
+puts the parts together. Memory: one chunk and its index, and what is returned.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from bags.recordings.bag import Bag
+from bags.recordings.batch import Batch
+from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.message_types import decode, is_stamped
+from bags.signals.signal import SignalPath, Step
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.errors import BagError
+
+STAMP: Final = (
+    (Step("header"), Step("stamp"), Step("sec")),
+    (Step("header"), Step("stamp"), Step("nanosec")),
+)
+MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Signals of one topic over N messages.
+
+    log_ns, publish_ns: (N,) ns. stamp_ns: (N,) ns, the header's stamps; None without a header.
+    values: signal -> (N,), in the message's unit.
+    """
+
+    topic: str
+    log_ns: IntArray
+    publish_ns: IntArray
+    stamp_ns: IntArray | None
+    values: Mapping[str, FloatArray]
+
+    def __len__(self) -> int:
+        return len(self.log_ns)
+
+
+def stream_columns(
+    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress | None = None
+) -> Iterator[Columns]:
+    """The signals part by part, in the order of the bag's files.
+
+    `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
+    All are checked against the types in the bag before a message is read. `progress` is called with
+    messages done and to come. Raises BagError where `signals` or the bag are wrong.
+    """
+    topics: dict[str, dict[str, SignalPath]] = {}
+    for name, signal in signals.items():
+        topics.setdefault(signal.topic, {})[name] = signal
+    readers = {topic: _TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
+    total = sum(c.count for c in bag.channels if c.topic in readers)
+    done = 0
+    for channel, batch in bag.batches(list(readers)):
+        yield readers[channel.topic].read(batch)
+        done += len(batch)
+        if progress is not None:
+            progress(done, total)
+
+
+def read_columns(
+    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress | None = None
+) -> dict[str, Columns]:
+    """Topic -> its signals over the whole bag, by log time; equal log times as recorded.
+
+    As `stream_columns`; a topic without messages gives columns of length 0.
+    """
+    names: dict[str, list[str]] = {}
+    for name, signal in signals.items():
+        names.setdefault(signal.topic, []).append(name)
+    growing = {topic: _Growing(bag, topic, columns) for topic, columns in names.items()}
+    for part in stream_columns(bag, signals, progress=progress):
+        growing[part.topic].append(part)
+    return {topic: growing.pop(topic).columns() for topic in names}
+
+
+def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
+    """The paths, with `[*]` replaced by the elements that the topic's first message has.
+
+    Raises BagError if a path does not fit the topic's type, or if there is no message to count in.
+    """
+    expanded: list[SignalPath] = []
+    for path in paths:
+        msgtype, types = bag.types_on(path.topic)
+        _check(bag, path)
+        if not path.every:
+            expanded.append(path)
+            continue
+        first = next((batch for _, batch in bag.batches([path.topic])), None)
+        if first is None:
+            raise BagError(f"{bag.path}: {path.topic} has no messages, so [*] stands for nothing")
+        expanded += path.expand(decode(first.data(0), msgtype, types))
+    return expanded
+
+
+class _TopicReader:
+    """Turns batches of one topic into columns."""
+
+    def __init__(self, bag: Bag, topic: str, signals: Mapping[str, SignalPath]) -> None:
+        msgtype, types = bag.types_on(topic)
+        for signal in signals.values():
+            _check(bag, signal)
+        self._where = f"{bag.path}: {topic}"
+        self._topic = topic
+        self._signals = signals
+        self._stamped = is_stamped(msgtype, types)
+        self._done = 0
+        self._targets = {n: s.targets(msgtype, types) for n, s in signals.items()}
+        targets: list[tuple[Step, ...]] = list(STAMP) if self._stamped else []
+        targets += [target for group in self._targets.values() for target in group]
+        self._gatherer = Gatherer(msgtype, types, targets)
+
+    def read(self, batch: Batch) -> Columns:
+        try:
+            numbers = self._gatherer.gather(batch)
+        except UnreadableMessageError as error:
+            raise BagError(
+                f"{self._where}: message {self._done + error.row} cannot be read: {error}"
+            ) from error
+        self._done += len(batch)
+        at = len(STAMP) if self._stamped else 0
+        stamp_ns = None
+        if self._stamped:
+            stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
+        values = {}
+        for name, group in self._targets.items():
+            values[name] = self._signals[name].combine(numbers[at : at + len(group)])
+            at += len(group)
+        return Columns(self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values)
+
+
+def _check(bag: Bag, path: SignalPath) -> None:
+    try:
+        path.check(*bag.types_on(path.topic))
+    except BagError as error:
+        message = str(error)
+        raise BagError(message if str(bag.path) in message else f"{bag.path}: {error}") from error
+
+
+class _Growing:
+    """One topic's columns while they are read: memory for what the bag announces, within reason."""
+
+    def __init__(self, bag: Bag, topic: str, names: Sequence[str]) -> None:
+        announced = sum(channel.count for channel in bag.channels if channel.topic == topic)
+        capacity = min(announced, MAX_ANNOUNCED)
+        self._topic = topic
+        self._names = names
+        self._stamped = is_stamped(*bag.types_on(topic))
+        self._times = np.empty((3 if self._stamped else 2, capacity), dtype=np.int64)
+        self._values = np.empty((len(names), capacity))
+        self._length = 0
+
+    def append(self, part: Columns) -> None:
+        start, self._length = self._length, self._length + len(part)
+        if self._length > self._times.shape[1]:
+            more = max(self._length, 2 * self._times.shape[1]) - start
+            self._times = np.pad(self._times[:, :start], ((0, 0), (0, more)))
+            self._values = np.pad(self._values[:, :start], ((0, 0), (0, more)))
+        here = slice(start, self._length)
+        self._times[0, here] = part.log_ns
+        self._times[1, here] = part.publish_ns
+        if part.stamp_ns is not None:
+            self._times[2, here] = part.stamp_ns
+        for row, name in enumerate(self._names):
+            self._values[row, here] = part.values[name]
+
+    def columns(self) -> Columns:
+        """By log time; the sort is stable, so equal log times stay as recorded."""
+        times, values = self._times[:, : self._length], self._values[:, : self._length]
+        if (np.diff(times[0]) < 0).any():
+            order = np.argsort(times[0], kind="stable")
+            times, values = times[:, order], values[:, order]
+        return Columns(
+            self._topic,
+            times[0],
+            times[1],
+            times[2] if self._stamped else None,
+            dict(zip(self._names, values, strict=True)),
+        )

@@ -1,0 +1,213 @@
+"""Read signals from a bag: numbers with the stamps of the messages they came in."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from bags.recordings.bag import Bag
+from bags.signals.columns import Columns, Progress, expand_paths, read_columns
+from bags.signals.expressions import Expression
+from bags.signals.timing import without_duplicates
+from nlsid_core._types import FloatArray, IntArray, Json
+from nlsid_core.errors import BagError
+
+HEADER_STAMP: Final = "header stamp"
+LOG_TIME: Final = "log time"
+PUBLISH_TIME: Final = "publish time"
+CLOCKS: Final = (HEADER_STAMP, LOG_TIME, PUBLISH_TIME)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """A signal as recorded; arrays are read-only.
+
+    stamp_ns: (N,) ns since the epoch, not decreasing. values: (N,) finite, in `unit` ("": unknown).
+    clock: where the stamps come from, one of CLOCKS.
+    """
+
+    path: str
+    stamp_ns: IntArray
+    values: FloatArray
+    clock: str = HEADER_STAMP
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        self.stamp_ns.setflags(write=False)
+        self.values.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
+def read_signals(
+    bag: Path | str,
+    paths: Sequence[str],
+    *,
+    clock: str | None = None,
+    sort: bool = False,
+    drop_duplicates: bool = False,
+    unfinished: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Samples]:
+    """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
+
+    clock: which times are the stamps (None: header stamps, log time for types without a header).
+    sort: put messages in the order of their stamps instead of refusing stamps that go back.
+    drop_duplicates: of messages with one stamp keep the first.
+    unfinished: read what there is of a recording that was not closed.
+    `[*]` gives one entry per element. Every path is checked against the types in the bag before a
+    message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
+    if a topic or field does not exist or is no number; if a topic has no messages; if a value is
+    not finite or time goes back.
+    """
+    if clock is not None and clock not in CLOCKS:
+        raise BagError(f"no clock '{clock}'; there are: {', '.join(CLOCKS)}")
+    with Bag(bag, unfinished=unfinished) as source:
+        wanted: dict[str, Expression] = {}
+        for text in paths:
+            expression = Expression.parse(text)
+            for path in expand_paths(source, [expression.path]):
+                name = str(expression.of(path)) if expression.path.every else text
+                wanted[name] = expression.of(path)
+        kinds = {e.path.topic: source.types_on(e.path.topic) for e in wanted.values()}
+        for expression in wanted.values():
+            _checked_unit(source, expression, *kinds[expression.path.topic])
+        columns = read_columns(
+            source, {name: e.path for name, e in wanted.items()}, progress=progress
+        )
+        topics = {}
+        for topic, found in columns.items():
+            topics[topic] = _Topic(source, found, clock, sort=sort)
+            topics[topic].check_stamps(source.count(topic))
+            if drop_duplicates:
+                topics[topic].drop_duplicates()
+        samples = {}
+        for name, expression in wanted.items():
+            recorded = topics[expression.path.topic].samples(name)
+            samples[name] = _applied(source, expression, recorded, kinds[expression.path.topic])
+    return samples
+
+
+def bag_digest(bag: Path | str) -> str:
+    """`sha256:<hex>` of the bag's data file (of its data files, joined in their order)."""
+    digest: str = bag_origin(bag)["digest"]
+    return digest
+
+
+def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
+    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data."""
+    with Bag(bag, unfinished=unfinished) as source:
+        digest = hashlib.sha256()
+        for file in source.files:
+            with file.open("rb") as stream:
+                while block := stream.read(2**20):
+                    digest.update(block)
+        return {
+            "digest": f"sha256:{digest.hexdigest()}",
+            "files": {file.name: file.stat().st_size for file in source.files},
+            "custom": source.custom,
+        }
+
+
+def bag_metadata(bag: Path | str) -> dict[str, str]:
+    """The bag's own key-value pairs (`custom_data`); empty if it has none. BagError as above."""
+    with Bag(bag) as source:
+        return source.custom
+
+
+def stamp_text(stamp_ns: int) -> str:
+    """A stamp for people: seconds with all nine decimals."""
+    sign = "-" if stamp_ns < 0 else ""
+    return f"{sign}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d} s"
+
+
+def _checked_unit(source: Bag, expression: Expression, msgtype: str, types: Typestore) -> str:
+    try:
+        return expression.unit(msgtype, types)
+    except BagError as error:
+        raise BagError(f"{source.path}: {error}") from error
+
+
+def _applied(
+    source: Bag, expression: Expression, recorded: Samples, kind: tuple[str, Typestore]
+) -> Samples:
+    """The recorded numbers after the expression's operations."""
+    unit = expression.unit(*kind)
+    if not expression.operations:
+        return replace(recorded, unit=unit)
+    try:
+        values = expression.apply(
+            recorded.values, recorded.stamp_ns, expression.recorded_unit(*kind)
+        )
+    except BagError as error:
+        raise BagError(f"{source.path}: {error}") from error
+    return replace(recorded, values=values, unit=unit)
+
+
+class _Topic:
+    """One topic's columns, with the stamps of the chosen clock, checked."""
+
+    def __init__(self, source: Bag, columns: Columns, clock: str | None, *, sort: bool) -> None:
+        self._where = f"{source.path}: {columns.topic}"
+        self._bag = source.path
+        self._values = columns.values
+        if clock is None:
+            clock = LOG_TIME if columns.stamp_ns is None else HEADER_STAMP
+        self._clock = clock
+        if clock == HEADER_STAMP:
+            if columns.stamp_ns is None:
+                raise BagError(
+                    f"{self._where}: its messages have no header stamp; choose {LOG_TIME}"
+                )
+            self._stamps = columns.stamp_ns
+        else:
+            self._stamps = columns.log_ns if clock == LOG_TIME else columns.publish_ns
+        if sort and (np.diff(self._stamps) < 0).any():
+            order = np.argsort(self._stamps, kind="stable")
+            self._stamps = self._stamps[order]
+            self._values = {name: values[order] for name, values in columns.values.items()}
+
+    def check_stamps(self, expected: int) -> None:
+        stamps = self._stamps
+        if len(stamps) != expected:
+            raise BagError(
+                f"{self._where} has {len(stamps)} messages, the bag's index says {expected}; "
+                "the bag is damaged"
+            )
+        if not len(stamps):
+            raise BagError(f"{self._where} has no messages; was its publisher running?")
+        if self._clock == HEADER_STAMP and not stamps.any():
+            raise BagError(
+                f"{self._where}: every header stamp is 0; its publisher does not fill it in"
+            )
+        steps = np.diff(stamps)
+        if len(back := np.flatnonzero(steps < 0)):
+            i = int(back[0])
+            raise BagError(
+                f"{self._where}: time goes back by {-int(steps[i]) / 1e9:g} s at message {i + 1}: "
+                f"{self._clock} {stamp_text(int(stamps[i]))}, then "
+                f"{stamp_text(int(stamps[i + 1]))} "
+                f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
+            )
+
+    def drop_duplicates(self) -> None:
+        kept = without_duplicates(self._stamps)
+        if len(kept) < len(self._stamps):
+            self._stamps = self._stamps[kept]
+            self._values = {name: values[kept] for name, values in self._values.items()}
+
+    def samples(self, name: str) -> Samples:
+        values = self._values[name]
+        if len(bad := np.flatnonzero(~np.isfinite(values))):
+            i = int(bad[0])
+            raise BagError(
+                f"{self._bag}: {name} is {values[i]} in message {i} at "
+                f"{stamp_text(int(self._stamps[i]))} ({len(bad)} of {len(values)} messages "
+                "are not finite); record it again or cut the bag there"
+            )
+        return Samples(name, self._stamps, values, self._clock)

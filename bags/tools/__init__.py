@@ -1,0 +1,1 @@
+"""What people do to bags: look inside, judge, cut, convert."""

@@ -1,0 +1,271 @@
+"""Signals of a bag as tables: CSV, npz or Parquet (extra `export`: pyarrow).
+
+One table per topic is written part by part and needs the memory of one chunk (npz: of the topic).
+One table on a common grid needs the memory of its columns.
+"""
+
+import io
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from bags.recordings.bag import Bag
+from bags.signals.columns import Columns, Progress, expand_paths, stream_columns
+from bags.signals.grid import seconds
+from bags.signals.reader import read_signals
+from bags.signals.resample import Method, resample
+from bags.signals.signal import SignalPath, numeric_paths
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.errors import BagError, DataError
+
+FORMATS: Final = ("csv", "npz", "parquet")
+MAX_COLUMNS: Final = 256  # of one array, when everything is exported; images are not tables
+TIMES: Final = ("log_time_ns", "publish_time_ns", "stamp_ns")
+Table = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Exported:
+    """Rows of each file written; left_out: what of everything is not there, and why."""
+
+    counts: Mapping[Path, int]
+    left_out: tuple[str, ...] = ()
+
+
+def export_topics(
+    path: Path | str,
+    out: Path | str,
+    *,
+    form: str,
+    signals: Sequence[str] | None = None,
+    unfinished: bool = False,
+    progress: Progress | None = None,
+) -> Exported:
+    """One table per topic in the new folder `out`: times in ns and the signals in their own unit.
+
+    signals: which (None: every number in every message whose type can be read, but for arrays whose
+    length changes). Raises BagError as `read_signals` does for damage, and if `out` exists.
+    """
+    _check_format(form)
+    out = Path(out)
+    if out.exists():
+        raise BagError(f"{out} exists already; name another folder or move it away")
+    with Bag(path, unfinished=unfinished) as bag:
+        left_out: list[str] = []
+        if signals:
+            wanted = expand_paths(bag, [SignalPath.parse(text) for text in signals])
+        else:
+            wanted = _every_number(bag, left_out)
+        columns = {str(signal): signal for signal in wanted}
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+            folder_path = Path(folder) / out.name
+            folder_path.mkdir()
+            rows = _write_topics(bag, columns, folder_path, form, progress)
+            folder_path.rename(out)
+    return Exported({out / name: count for name, count in rows.items()}, tuple(left_out))
+
+
+def export_grid(
+    path: Path | str,
+    out: Path | str,
+    *,
+    form: str,
+    signals: Sequence[str],
+    period: float,
+    method: Method = "linear",
+    hold: Sequence[str] = (),
+    max_gap: float,
+) -> dict[str, float]:
+    """One table on a common grid of `period` s: t in s since the first common stamp, and signals.
+
+    hold: the signals (of `signals`) that are commands; the others are resampled by `method`.
+    Returns each signal's error bound (see `resample`). Raises BagError and DataError as
+    `read_signals` and `resample` do, and if `out` exists.
+    """
+    _check_format(form)
+    out = Path(out)
+    if out.exists():
+        raise BagError(f"{out} exists already; name another file or move it away")
+    read = read_signals(path, signals)
+    if unknown := set(hold) - read.keys():
+        raise BagError(f"hold: {min(unknown)} is not one of the signals")
+    first = max(int(s.stamp_ns[0]) for s in read.values())
+    last = min(int(s.stamp_ns[-1]) for s in read.values())
+    period_ns = round(period * 1e9)
+    if period_ns <= 0 or last - first < period_ns:
+        raise DataError(f"{path}: the signals overlap in {(last - first) / 1e9:g} s, less than two")
+    grid = first + period_ns * np.arange(1 + (last - first) // period_ns)
+    table: dict[str, Any] = {"t": seconds(grid, first)}
+    errors = {}
+    for name, samples in read.items():
+        how: Method = "hold" if name in hold else method
+        found = resample(samples, grid, method=how, max_gap=max_gap)
+        table[name], errors[name] = found.values, found.error
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
+        part = Path(folder) / out.name
+        with _WRITERS[form](part) as writer:
+            writer.write(table)
+        part.rename(out)
+    return errors
+
+
+def _every_number(bag: Bag, left_out: list[str]) -> list[SignalPath]:
+    """Every number of every topic that has messages and a type that can be read."""
+    found: list[SignalPath] = []
+    for topic in bag.topics:
+        if not bag.count(topic):
+            continue
+        try:
+            kind = bag.types_on(topic)
+            texts = [f"{topic}:{path}" for path, *_ in numeric_paths(*kind)]
+        except BagError as error:
+            left_out.append(str(error))
+            continue
+        for path in map(SignalPath.parse, texts):
+            try:
+                found += _steady(bag, path) if path.every else [path]
+            except BagError as error:
+                left_out.append(f"{path}: {error}")
+    return found
+
+
+def _steady(bag: Bag, path: SignalPath) -> list[SignalPath]:
+    """The elements of an array; BagError if some message has more or fewer."""
+    if sum(step.every for step in path.steps) > 1:
+        raise BagError("arrays in arrays are not laid out in columns")
+    elements = expand_paths(bag, [path])
+    if len(elements) > MAX_COLUMNS:
+        raise BagError(f"{len(elements)} elements; name those you need")
+    for _ in stream_columns(bag, {str(element): element for element in elements}):
+        pass
+    return elements
+
+
+def _write_topics(
+    bag: Bag,
+    columns: Mapping[str, SignalPath],
+    folder: Path,
+    form: str,
+    progress: Progress | None,
+) -> dict[str, int]:
+    writers: dict[str, TableWriter] = {}
+    rows: dict[str, int] = {}
+    try:
+        for part in stream_columns(bag, columns, progress=progress):
+            name = f"{part.topic.strip('/').replace('/', '__')}.{form}"
+            if name not in writers:
+                writers[name] = _WRITERS[form](folder / name)
+            writers[name].write(_table(part))
+            rows[name] = rows.get(name, 0) + len(part)
+    finally:
+        for writer in writers.values():
+            writer.close()
+    return rows
+
+
+def _table(part: Columns) -> dict[str, IntArray | FloatArray]:
+    times = (part.log_ns, part.publish_ns, part.stamp_ns)
+    table: dict[str, IntArray | FloatArray] = {
+        name: column for name, column in zip(TIMES, times, strict=True) if column is not None
+    }
+    return table | {name.partition(":")[2]: values for name, values in part.values.items()}
+
+
+class TableWriter(Protocol):
+    """A file that takes a table part by part; all parts have the same columns."""
+
+    def write(self, table: Table) -> None:
+        """Append rows."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+    def __enter__(self) -> "TableWriter":
+        """Use it in a with block."""
+
+    def __exit__(self, *_: object) -> None:
+        """Finish the file."""
+
+
+class _Closing:
+    def close(self) -> None:
+        raise NotImplementedError
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Csv(_Closing):
+    """Numbers with all digits that tell float64 apart."""
+
+    def __init__(self, path: Path) -> None:
+        self._stream = path.open("w", encoding="utf-8", newline="")
+        self._started = False
+
+    def write(self, table: Table) -> None:
+        if not self._started:
+            self._stream.write(",".join(f'"{name}"' for name in table) + "\n")
+            self._started = True
+        texts = [[repr(value) for value in column.tolist()] for column in table.values()]
+        self._stream.writelines(",".join(row) + "\n" for row in zip(*texts, strict=True))
+
+    def close(self) -> None:
+        self._stream.close()
+
+
+class _Npz(_Closing):
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._parts: list[Table] = []
+
+    def write(self, table: Table) -> None:
+        self._parts.append(table)
+
+    def close(self) -> None:
+        arrays = {n: np.concatenate([p[n] for p in self._parts]) for n in self._parts[0]}
+        stream = io.BytesIO()
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+        self._path.write_bytes(stream.getvalue())
+
+
+class _Parquet(_Closing):
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._writer: Any = None
+
+    def write(self, table: Table) -> None:
+        import pyarrow
+        from pyarrow import parquet
+
+        rows = pyarrow.table(dict(table))
+        if self._writer is None:
+            self._writer = parquet.ParquetWriter(self._path, rows.schema, compression="zstd")
+        self._writer.write_table(rows)
+
+    def close(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+
+
+_WRITERS: Final[Mapping[str, Callable[[Path], Any]]] = {
+    "csv": _Csv,
+    "npz": _Npz,
+    "parquet": _Parquet,
+}
+
+
+def _check_format(form: str) -> None:
+    if form not in FORMATS:
+        raise BagError(f"no format '{form}'; there are: {', '.join(FORMATS)}")
+    if form == "parquet" and find_spec("pyarrow") is None:
+        raise BagError("Parquet needs pyarrow: pip install 'nlsid[export]', or take csv or npz")

@@ -1,0 +1,190 @@
+"""What is in a bag: topics, rates, jitter, gaps, clocks, losses, sizes.
+
+Memory: two integers a message, and one chunk.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bags.recordings.bag import Bag
+from bags.recordings.batch import Batch
+from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.message_types import is_stamped
+from bags.signals.columns import STAMP, Progress
+from bags.signals.timing import ClockRelation, clock_relation
+from nlsid_core._types import IntArray
+from nlsid_core.errors import BagError
+
+GAP: Final = 5.0  # median intervals without a message
+BINS: Final = np.array([0.0, 0.5, 0.8, 0.95, 1.05, 1.25, 2.0, 5.0, np.inf])  # median intervals
+BARS: Final = " ▁▂▃▄▅▆▇█"
+
+
+@dataclass(frozen=True, eq=False)
+class TopicInfo:
+    """One topic. Intervals are between log times, in s; NaN with fewer than two messages.
+
+    histogram: intervals per bin of BINS, which are in median intervals. missing: sequence numbers
+    left out, where the recorder counted. clock: None without header stamps. unstamped: there are
+    header stamps and all are 0.
+    """
+
+    topic: str
+    msgtype: str
+    count: int
+    size: int
+    first_ns: int = 0
+    last_ns: int = 0
+    interval: float = float("nan")
+    histogram: tuple[int, ...] = ()
+    gaps: int = 0
+    longest: float = float("nan")
+    backward: int = 0
+    duplicates: int = 0
+    missing: int = 0
+    clock: ClockRelation | None = None
+    unstamped: bool = False
+    unreadable: str = ""
+
+    @property
+    def rate(self) -> float:
+        """Hz, from the median interval."""
+        return 1.0 / self.interval if self.interval > 0 else float("nan")
+
+    @property
+    def jitter(self) -> str:
+        """The histogram as a line of bars, from half the median interval to five times it."""
+        most = max(self.histogram, default=0)
+        if not most:
+            return ""
+        height = [np.ceil((len(BARS) - 1) * n / most) for n in self.histogram]
+        return "".join(BARS[int(h)] for h in height)
+
+
+@dataclass(frozen=True, eq=False)
+class BagInfo:
+    """A bag and its topics. ending: why it stops early, None if it is whole."""
+
+    path: Path
+    files: int
+    size: int
+    ending: str | None
+    custom: Mapping[str, str]
+    topics: tuple[TopicInfo, ...]
+
+    @property
+    def messages(self) -> int:
+        """On all topics."""
+        return sum(topic.count for topic in self.topics)
+
+    @property
+    def duration(self) -> float:
+        """s from the first to the last log time."""
+        filled = [topic for topic in self.topics if topic.count]
+        if not filled:
+            return 0.0
+        first, last = min(t.first_ns for t in filled), max(t.last_ns for t in filled)
+        return (last - first) / 1e9
+
+
+def bag_info(path: Path | str, *, progress: Progress | None = None) -> BagInfo:
+    """Read the whole bag once, an unfinished one as far as it goes.
+
+    `progress` is called with messages done and to come. Raises BagError as `Bag` does.
+    """
+    with Bag(path, unfinished=True) as bag:
+        found = {topic: _Collector(bag, topic, msgtype) for topic, msgtype in bag.topics.items()}
+        total, done = sum(channel.count for channel in bag.channels), 0
+        for channel, batch in bag.batches():
+            found[channel.topic].add(batch)
+            done += len(batch)
+            if progress is not None:
+                progress(done, total)
+        return BagInfo(
+            path=bag.path,
+            files=len(bag.files),
+            size=sum(file.stat().st_size for file in bag.files),
+            ending=bag.ending,
+            custom=bag.custom,
+            topics=tuple(collector.info() for collector in found.values()),
+        )
+
+
+@dataclass
+class _Collector:
+    bag: Bag
+    topic: str
+    msgtype: str
+    size: int = 0
+    log_ns: list[IntArray] = field(default_factory=list)
+    stamp_ns: list[IntArray] = field(default_factory=list)
+    sequence: list[IntArray] = field(default_factory=list)
+    unreadable: str = ""
+
+    def __post_init__(self) -> None:
+        self._gatherer: Gatherer | None = None
+        try:
+            msgtype, types = self.bag.types_on(self.topic)
+            if is_stamped(msgtype, types):
+                self._gatherer = Gatherer(msgtype, types, STAMP)
+        except BagError as error:
+            self.unreadable = str(error)
+
+    def add(self, batch: Batch) -> None:
+        self.size += int(batch.size.sum())
+        self.log_ns.append(batch.log_ns)
+        self.sequence.append(batch.sequence)
+        if self._gatherer is None:
+            return
+        try:
+            seconds, nanoseconds = self._gatherer.gather(batch).astype(np.int64)
+        except UnreadableMessageError as error:
+            self.unreadable, self._gatherer = str(error), None
+            return
+        self.stamp_ns.append(seconds * 10**9 + nanoseconds)
+
+    def info(self) -> TopicInfo:
+        count = sum(map(len, self.log_ns))
+        shown = TopicInfo(self.topic, self.msgtype, count, self.size, unreadable=self.unreadable)
+        if not count:
+            return shown
+        log_ns = np.concatenate(self.log_ns)
+        order = np.argsort(log_ns, kind="stable")
+        log_ns = log_ns[order]
+        values: dict[str, Any] = vars(shown) | {
+            "first_ns": int(log_ns[0]),
+            "last_ns": int(log_ns[-1]),
+        }
+        values["missing"] = _missing(np.concatenate(self.sequence))
+        if self._gatherer is not None:
+            stamp_ns = np.concatenate(self.stamp_ns)[order]
+            steps = np.diff(stamp_ns)
+            values["backward"] = int((steps < 0).sum())
+            values["duplicates"] = int((steps == 0).sum())
+            if stamp_ns.any():
+                values["clock"] = clock_relation(stamp_ns, log_ns)
+            else:
+                values["unstamped"] = True
+        if count > 1:
+            intervals = np.diff(log_ns) / 1e9
+            median = float(np.median(intervals))
+            scale = median if median > 0 else float(np.max(intervals)) or 1.0
+            values |= {
+                "interval": median,
+                "histogram": tuple(np.histogram(intervals / scale, BINS)[0].tolist()),
+                "gaps": int((intervals > GAP * scale).sum()),
+                "longest": float(np.max(intervals)),
+            }
+        return TopicInfo(**values)
+
+
+def _missing(sequence: IntArray) -> int:
+    """Numbers left out by a recorder that counted up from message to message."""
+    steps = np.diff(np.sort(sequence))
+    if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
+        return 0
+    return int(np.maximum(steps - 1, 0).sum())
