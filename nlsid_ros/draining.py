@@ -1,16 +1,19 @@
 """Subscriptions that take everything that has arrived, in one go.
 
-rclpy's executor builds a wait set of all the node's entities for every message it takes, which is
-most of what a message costs. `subscribe` wakes for a message and then takes all there are, so a
-node that has fallen behind catches up; `Polled` subscriptions do not wake the node at all and are
-taken from a timer, for those that only keep what comes.
+rclpy's executor builds a wait set of all the node's entities each time it wakes, which costs as
+much as taking a hundred messages. `subscribe` wakes for a message and then takes all there are, so
+a node that has fallen behind catches up; `Polled` subscriptions do not wake the node at all and are
+taken from a timer, for those that only keep what comes. Their events are polled too: in a wait set
+an event wakes the node at every message of its topic.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
@@ -38,14 +41,22 @@ def subscribe(
     return subscription
 
 
-def take(subscription: Subscription, callback: Received) -> None:
-    """Call back for at most BATCH of the messages that are waiting now."""
+def take(subscription: Subscription, callback: Received, most: int = BATCH) -> None:
+    """Call back for at most `most` of the messages that are waiting now."""
     with subscription.handle:
-        for _ in range(BATCH):
+        for _ in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 return
             callback(*taken)
+
+
+@dataclass(frozen=True)
+class _Source:
+    subscription: Subscription
+    callback: Received
+    lost: Any
+    on_lost: Callable[[int], None]
 
 
 class Polled:
@@ -54,7 +65,7 @@ class Polled:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._group = _Asleep()
-        self._subscriptions: list[tuple[Subscription, Received]] = []
+        self._sources: list[_Source] = []
 
     def subscribe(
         self,
@@ -63,34 +74,48 @@ class Polled:
         callback: Received,
         profile: QoSProfile,
         *,
-        events: SubscriptionEventCallbacks,
+        on_lost: Callable[[int], None],
     ) -> None:
-        """Subscribe to the serialised messages on a topic."""
+        """Subscribe to the serialised messages on a topic; `on_lost` hears how many DDS lost."""
         subscription = self._node.create_subscription(
             kind,
             topic,
             callback,  # type: ignore[arg-type]
             profile,
             callback_group=self._group,
-            event_callbacks=events,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        self._subscriptions.append((subscription, callback))
+        kind_of_event = _rclpy.rcl_subscription_event_type_t.RCL_SUBSCRIPTION_MESSAGE_LOST
+        with subscription.handle:
+            lost = _rclpy.EventHandle(subscription.handle, kind_of_event)
+        self._sources.append(_Source(subscription, callback, lost, on_lost))
 
     def take(self) -> None:
-        """Call back for the messages that are waiting now."""
-        for subscription, callback in self._subscriptions:
-            take(subscription, callback)
+        """Call back for the messages that are waiting now, and for those that were lost."""
+        for source in self._sources:
+            take(source.subscription, source.callback, source.subscription.qos_profile.depth)
+            with source.lost:
+                lost = source.lost.take_event()
+            if lost is not None and lost.total_count_change:
+                source.on_lost(lost.total_count)
+
+    def destroy(self) -> None:
+        """Let go of the subscriptions."""
+        for source in self._sources:
+            source.lost.destroy_when_not_in_use()
+            self._node.destroy_subscription(source.subscription)
+        self._sources = []
 
 
 class _Asleep(CallbackGroup):
-    """Keeps its subscriptions out of the executor's wait set; their events stay in."""
+    """Keeps its entities out of the executor's wait set."""
 
-    def can_execute(self, entity: object) -> bool:
-        return not isinstance(entity, Subscription)
+    def can_execute(self, entity: object) -> bool:  # noqa: ARG002
+        return False
 
-    def beginning_execution(self, entity: object) -> bool:
-        return self.can_execute(entity)
+    def beginning_execution(self, entity: object) -> bool:  # noqa: ARG002
+        return False
 
     def ending_execution(self, entity: object) -> None:
         pass

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from std_srvs.srv import Trigger
 
 from bags.recordings.message_types import definition, header_stamp_ns, is_stamped, standard_types
@@ -32,7 +31,7 @@ from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
-POLL = 0.005  # s between taking what has arrived; the middleware says when it did
+POLL = 0.05  # s between taking what has arrived; waking rclpy costs as much as 100 messages
 UNASKED = {"/rosout", "/parameter_events"}  # every node has them; a pattern does not mean them
 REPORT = 1.0  # s between diagnostics
 
@@ -108,6 +107,7 @@ class TrajectoryRecorder(ManagedNode):
     def stop(self) -> None:
         """Take what has arrived, write what came of each topic into the bag, and close it."""
         self._polled.take()
+        self._polled.destroy()
         if not self._full:
             self._bag.annotate(self._counts())
         self._bag.close()
@@ -134,7 +134,7 @@ class TrajectoryRecorder(ManagedNode):
                 topic,
                 partial(self._record, topic, msgtype, is_stamped(msgtype, standard_types())),
                 qos.recording_of([publisher.qos_profile for publisher in publishers]),
-                events=SubscriptionEventCallbacks(message_lost=partial(self._lose, topic)),
+                on_lost=partial(self._lose, topic),
             )
         if not self._waiting and not self._patterns:
             self._discovery.cancel()
@@ -173,9 +173,9 @@ class TrajectoryRecorder(ManagedNode):
         if not self._paused:
             self._bag.write(topic, msgtype, data, log_time_ns=arrival_ns, publish_time_ns=stamp_ns)
 
-    def _lose(self, topic: str, event: QoSMessageLostInfo) -> None:
-        self._lost[topic] = event.total_count
-        self.get_logger().warning(f"{topic}: {event.total_count} messages lost so far")
+    def _lose(self, topic: str, count: int) -> None:
+        self._lost[topic] = count
+        self.get_logger().warning(f"{topic}: {count} messages lost so far")
 
     def _counts(self) -> dict[str, str]:
         """What came on each topic, in words."""
