@@ -51,12 +51,14 @@ def take(subscription: Subscription, callback: Received, most: int = BATCH) -> N
             callback(*taken)
 
 
-@dataclass(frozen=True)
-class _Source:
+@dataclass
+class Source:
+    """A polled subscription; its messages wait until it has a callback."""
+
     subscription: Subscription
-    callback: Received
     lost: Any
     on_lost: Callable[[int], None]
+    callback: Received | None = None
 
 
 class Polled:
@@ -65,22 +67,16 @@ class Polled:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._group = _Asleep()
-        self._sources: list[_Source] = []
+        self._sources: list[Source] = []
 
     def subscribe(
-        self,
-        kind: Any,
-        topic: str,
-        callback: Received,
-        profile: QoSProfile,
-        *,
-        on_lost: Callable[[int], None],
-    ) -> None:
-        """Subscribe to the serialised messages on a topic; `on_lost` hears how many DDS lost."""
+        self, kind: Any, topic: str, profile: QoSProfile, *, on_lost: Callable[[int], None]
+    ) -> Source:
+        """Subscribe to the serialised messages; `on_lost` hears how many more the DDS lost."""
         subscription = self._node.create_subscription(
             kind,
             topic,
-            callback,  # type: ignore[arg-type]
+            lambda _message: None,
             profile,
             callback_group=self._group,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
@@ -89,23 +85,29 @@ class Polled:
         kind_of_event = _rclpy.rcl_subscription_event_type_t.RCL_SUBSCRIPTION_MESSAGE_LOST
         with subscription.handle:
             lost = _rclpy.EventHandle(subscription.handle, kind_of_event)
-        self._sources.append(_Source(subscription, callback, lost, on_lost))
+        self._sources.append(Source(subscription, lost, on_lost))
+        return self._sources[-1]
 
     def take(self) -> None:
         """Call back for the messages that are waiting now, and for those that were lost."""
         for source in self._sources:
-            take(source.subscription, source.callback, source.subscription.qos_profile.depth)
+            if source.callback is not None:
+                take(source.subscription, source.callback, source.subscription.qos_profile.depth)
             with source.lost:
                 lost = source.lost.take_event()
             if lost is not None and lost.total_count_change:
-                source.on_lost(lost.total_count)
+                source.on_lost(lost.total_count_change)
 
-    def destroy(self) -> None:
-        """Let go of the subscriptions."""
-        for source in self._sources:
-            source.lost.destroy_when_not_in_use()
-            self._node.destroy_subscription(source.subscription)
-        self._sources = []
+    def drop(self, source: Source) -> None:
+        """Unsubscribe."""
+        self._sources.remove(source)
+        source.lost.destroy_when_not_in_use()
+        self._node.destroy_subscription(source.subscription)
+
+    def drop_all(self) -> None:
+        """Unsubscribe from everything."""
+        for source in list(self._sources):
+            self.drop(source)
 
 
 class _Asleep(CallbackGroup):

@@ -2,120 +2,196 @@
 
 Subscribes to each topic once a publisher shows its type and quality of service, and writes the
 messages undecoded: log time is the arrival, publish time the header stamp. What a killed recorder
-loses is what came after the last chunk, at most `chunk_period`. Counts of received and lost
-messages, rate, jitter and gaps go to /diagnostics every second and into the bag's metadata.
-`~/pause`, `~/resume`, and `~/snapshot`, which saves the last seconds in a bag of their own.
+loses is what came after the last chunk, at most `chunk_period` and one POLL. Counts of received and
+lost messages, rate, jitter and gaps go to /diagnostics every second and into the bag's metadata.
+`~/start` and `~/stop` begin and end a bag, `~/pause` and `~/resume` leave out a part of one,
+`~/snapshot` saves the last seconds in a bag of their own.
 """
 
-import shutil
 import sys
+from collections.abc import Callable
 from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.recordings.message_types import definition, header_stamp_ns, is_stamped, standard_types
+from bags.recordings.definitions import Definition, read_definitions
+from bags.recordings.message_types import header_stamp_ns
+from bags.recordings.part import COMPRESSIONS
 from bags.recordings.repair import repair, unfinished_bags
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Recent, Regularity
+from bags.signals.arrivals import Arrival, Recent
+from bags.signals.recording import Recording
+from nlsid_core import _json
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
-from nlsid_ros.draining import Polled
+from nlsid_ros.draining import Polled, Source
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.type_descriptions import TypeDescriptions
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 POLL = 0.05  # s between taking what has arrived; waking rclpy costs as much as 100 messages
 UNASKED = {"/rosout", "/parameter_events"}  # every node has them; a pattern does not mean them
 REPORT = 1.0  # s between diagnostics
+EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said it did
+
+
+class Undefined(NamedTuple):
+    """A topic that is subscribed to, whose type's definition is being looked for."""
+
+    source: Source
+    msgtype: str
+    type_hash: str
 
 
 class TrajectoryRecorder(ManagedNode):
-    """Records topics from its start to its end into one new bag."""
+    """Records topics into one new bag after another."""
 
     def __init__(self) -> None:
         super().__init__(NAME)
         topics: Any = declare(
             self, "topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"
         )
+        number = partial(declare_number, self)
         self._name = declare_text(
-            self, "bag", "", "folder of the new bag; empty: trajectory_DATE_TIME"
+            self, "bag", "", "folder of the new bag, later ones _2, _3, ...; empty: by date"
         )
-        self._period = declare_number(
-            self, "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 1.0)
+        self._at_once = bool(
+            declare(self, "at_once", True, "begin a bag when activated; false: wait for ~/start")
         )
-        self._least_free = declare_number(
-            self,
+        self._compression = declare_text(
+            self, "compression", "zstd", "of the chunks, one of " + ", ".join(COMPRESSIONS)
+        )
+        self._split_size = number(
+            "split_size", 0.0, "MB after which a new file begins; 0: never", between=(0.0, 1e6)
+        )
+        self._split_time = number(
+            "split_time", 0.0, "s after which a new file begins; 0: never", between=(0.0, 1e6)
+        )
+        self._period = number(
+            "chunk_period", 0.5, "s of messages a kill may lose", between=(0.05, 0.9)
+        )
+        self._least_free = number(
             "least_free",
             200.0,
             "MB left on the disk at which recording stops",
             between=(0.0, 1e12),
         )
-        self._snapshot = declare_number(
-            self, "snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", between=(0.0, 600.0)
+        self._snapshot = number(
+            "snapshot", 0.0, "s kept in memory for ~/snapshot; 0: none", between=(0.0, 600.0)
         )
         self._repair = bool(
             declare(self, "repair", True, "finish unfinished bags beside the new one first")
         )
+        given: Any = declare(
+            self, "definitions", [""], ".msg files and packages' share folders of custom types"
+        )
+        self._said_by = declare_text(
+            self,
+            "experiment",
+            "/excitation/experiment",
+            "topic whose JSON goes into the bag's metadata; empty: none",
+        )
         self._topics = dict(_topic_and_type(entry) for entry in topics if entry)
         if not self._topics:
             raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
+        self._given = [Path(path) for path in given if path]
+        self._bags = 0
 
     def prepare(self) -> None:
-        """Finish what a killed recorder left, and refuse types that are not known."""
-        path = Path(self._name)
-        for bag in unfinished_bags(path.parent) if self._repair else []:
-            count = repair(bag)
-            self.get_logger().warning(f"{bag} was not closed; repaired, {count} messages kept")
+        """Finish what a killed recorder left, and refuse what could not be recorded."""
+        if self._compression not in COMPRESSIONS:
+            raise DataError(
+                f"compression is '{self._compression}'; it should be one of "
+                + ", ".join(COMPRESSIONS)
+            )
         if any(_is_pattern(topic) and kind for topic, kind in self._topics.items()):
             raise DataError("a pattern cannot have a type; topics found by it have their own")
         for msgtype in filter(None, self._topics.values()):
             message_class(msgtype)
-            definition(msgtype)
+        self._definitions = read_definitions(self._given)
+        for bag in unfinished_bags(Path(self._name).parent) if self._repair else []:
+            try:
+                count = repair(bag)
+            except (NlsidError, OSError) as error:
+                self.get_logger().error(f"{bag} was not closed and cannot be repaired: {error}")
+                continue
+            self.get_logger().warning(f"{bag} was not closed; repaired, {count} messages kept")
 
     def start(self) -> None:
-        """Open a new bag and subscribe to what is there already."""
+        """Subscribe to what is there already, and open a bag unless that is to wait."""
         self._waiting = {t: kind for t, kind in self._topics.items() if not _is_pattern(t)}
+        self._expected = list(self._waiting)
         self._patterns = [topic for topic in self._topics if _is_pattern(topic)]
-        self._lost = dict.fromkeys(self._waiting, 0)
-        self._regularity = {topic: Regularity() for topic in self._waiting}
+        self._undefined: dict[str, Undefined] = {}
+        self._recorded: dict[str, Definition] = {}
+        self._refused: dict[str, str] = {}
         self._recent = Recent(self._snapshot) if self._snapshot else None
         self._snapshots = 0
-        self._paused = False
-        self._refused: dict[str, str] = {}
-        self._full = ""
-        path = Path(self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S"))
-        self._bag = BagWriter(path, in_place=True, max_chunk_age=self._period)
+        self._experiment: dict[str, str] = {}
+        self._recording: Recording | None = None
+        if self._at_once:
+            self._begin()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._polled = Polled(self)
+        self._types = TypeDescriptions(self, self._definitions)
+        if self._said_by:
+            self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
         self.create_timer(POLL, self._polled.take)
-        self._discovery = self.create_timer(DISCOVERY, self._connect)
-        self.create_timer(self._period, lambda: None if self._full else self._bag.close_chunk())
+        self.create_timer(DISCOVERY, self._connect)
+        self.create_timer(self._period, self._keep_up)
         self.create_timer(REPORT, self._report)
-        self.create_service(Trigger, "~/pause", partial(self._on_pause, True))
-        self.create_service(Trigger, "~/resume", partial(self._on_pause, False))
-        self.create_service(Trigger, "~/snapshot", self._on_snapshot)
-        self.get_logger().info(f"recording {', '.join(self._topics)} to {path}")
+        for name, serve in (
+            ("start", self._on_start),
+            ("stop", self._on_stop),
+            ("pause", partial(self._on_pause, True)),
+            ("resume", partial(self._on_pause, False)),
+            ("snapshot", self._on_snapshot),
+        ):
+            self.create_service(Trigger, f"~/{name}", _answering(serve))
         self._connect()
 
     def stop(self) -> None:
         """Take what has arrived, write what came of each topic into the bag, and close it."""
         self._polled.take()
-        self._polled.destroy()
-        if not self._full:
-            self._bag.annotate(self._counts())
-        self._bag.close()
+        self._polled.drop_all()
+        if self._recording is not None:
+            self._recording.close()
+
+    def _begin(self) -> Path:
+        """Open the next bag."""
+        name = self._name or datetime.now().strftime("trajectory_%Y%m%d_%H%M%S")
+        path = Path(name if not (self._name and self._bags) else f"{name}_{self._bags + 1}")
+        writer = BagWriter(
+            path,
+            in_place=True,
+            max_chunk_age=self._period,
+            compression=self._compression,
+            split_bytes=round(self._split_size * 1e6) or None,
+            split_seconds=self._split_time or None,
+        )
+        self._bags += 1
+        self._ended = ""
+        self._recording = Recording(writer, least_free=self._least_free)
+        for topic in self._expected:
+            self._recording.expect(topic)
+        for topic, definition in self._recorded.items():
+            self._recording.add_topic(topic, definition)
+        self._recording.annotate(self._experiment)
+        self.get_logger().info(f"recording {', '.join(self._topics)} to {path}")
+        return path
 
     def _connect(self) -> None:
-        """Subscribe to topics that have publishers now."""
-        if self._patterns:
-            self._find()
+        """Subscribe to topics that have publishers now, record those whose type is defined."""
+        self._find()
         for topic, asked in list(self._waiting.items()):
             publishers = self.get_publishers_info_by_topic(topic)
             if not publishers:
@@ -124,115 +200,153 @@ class TrajectoryRecorder(ManagedNode):
             msgtype = asked or publishers[0].topic_type
             try:
                 kind = message_class(msgtype)
-                self._bag.add_topic(topic, msgtype)
             except NlsidError as error:
-                self._refused[topic] = str(error)
-                self.get_logger().error(f"{topic} is not recorded: {error}")
+                self._refuse(topic, error)
                 continue
-            self._polled.subscribe(
-                kind,
-                topic,
-                partial(self._record, topic, msgtype, is_stamped(msgtype, standard_types())),
-                qos.recording_of([publisher.qos_profile for publisher in publishers]),
-                on_lost=partial(self._lose, topic),
+            profile = qos.recording_of([publisher.qos_profile for publisher in publishers])
+            source = self._polled.subscribe(
+                kind, topic, profile, on_lost=partial(self._lose, topic)
             )
-        if not self._waiting and not self._patterns:
-            self._discovery.cancel()
+            self._undefined[topic] = Undefined(source, msgtype, str(publishers[0].topic_type_hash))
+        for topic, found in list(self._undefined.items()):
+            try:
+                definition = self._types.find(found.msgtype, found.type_hash)
+                if definition is None:
+                    continue
+                if self._recording is not None:
+                    self._recording.add_topic(topic, definition)
+            except NlsidError as error:
+                self._polled.drop(found.source)
+                self._refuse(topic, error)
+            else:
+                self._recorded[topic] = definition
+                found.source.callback = partial(
+                    self._record, topic, definition.msgtype, definition.is_stamped
+                )
+            del self._undefined[topic]
+
+    def _refuse(self, topic: str, error: NlsidError) -> None:
+        self._refused[topic] = str(error)
+        self.get_logger().error(f"{topic} is not recorded: {error}")
 
     def _find(self) -> None:
         """Wait for topics that match a pattern too."""
+        if not self._patterns:
+            return
         for topic, _ in self.get_topic_names_and_types():
-            known = topic in self._lost or topic in UNASKED
+            known = topic in self._expected or topic in UNASKED
             if not known and any(fnmatchcase(topic, pattern) for pattern in self._patterns):
                 self._waiting[topic] = ""
-                self._lost[topic] = 0
-                self._regularity[topic] = Regularity()
-
-    def _stop_if_the_disk_is_nearly_full(self) -> None:
-        free = shutil.disk_usage(self._bag.path).free / 1e6
-        if free >= self._least_free or self._full:
-            return
-        self._full = f"recording stopped: {free:.0f} MB left, {self._least_free:g} are to stay free"
-        self.get_logger().error(self._full)
-        self._polled.take()
-        self._bag.close()
+                self._expected.append(topic)
+                if self._recording is not None:
+                    self._recording.expect(topic)
 
     def _record(
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
     ) -> None:
-        if self._full:
-            return
         arrival_ns = info["received_timestamp"]
         stamp_ns = arrival_ns
         if stamped and len(data) >= 12:
             stamp_ns = header_stamp_ns(data)
-        self._regularity[topic].update(stamp_ns)
-        stamp_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
+        publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
+        arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns)
         if self._recent is not None:
-            self._recent.add(Arrival(topic, msgtype, data, arrival_ns, stamp_ns))
-        if not self._paused:
-            self._bag.write(topic, msgtype, data, log_time_ns=arrival_ns, publish_time_ns=stamp_ns)
+            self._recent.add(arrival)
+        if self._recording is not None:
+            self._recording.add(arrival, stamp_ns)
 
     def _lose(self, topic: str, count: int) -> None:
-        self._lost[topic] = count
-        self.get_logger().warning(f"{topic}: {count} messages lost so far")
+        self.get_logger().warning(f"{topic}: {count} messages lost", throttle_duration_sec=REPORT)
+        if self._recording is not None:
+            self._recording.lose(topic, count)
 
-    def _counts(self) -> dict[str, str]:
-        """What came on each topic, in words."""
-        values = {}
-        for topic, lost in self._lost.items():
-            regularity = self._regularity[topic]
-            values[f"{topic} received"] = str(self._bag.counts.get(topic, 0))
-            values[f"{topic} lost"] = str(lost)
-            values[f"{topic} gaps"] = str(regularity.gaps)
-            values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
-            values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
-        return values
+    def _on_experiment(self, message: String) -> None:
+        """Keep what an excitation says it does; an empty object says that it does nothing."""
+        try:
+            said = _json.parse_document(message.data)
+        except NlsidError as error:
+            self.get_logger().warning(f"{self._said_by} is not in the bag's metadata: {error}")
+            return
+        self._experiment = {EXPERIMENT: message.data} if said else {}
+        group = said.get("repeat_group")
+        if isinstance(group, str):
+            self._experiment["repeat_group"] = group
+        if self._recording is not None:
+            self._recording.annotate(self._experiment)
 
-    def _on_pause(
-        self, pause: bool, _request: Trigger.Request, answer: Trigger.Response
-    ) -> Trigger.Response:
+    def _keep_up(self) -> None:
+        if self._recording is None:
+            return
+        self._recording.keep_up()
+        if self._recording.ended != self._ended:
+            self._ended = self._recording.ended
+            self.get_logger().error(self._ended)
+            self._report()
+
+    def _on_start(self) -> tuple[bool, str]:
+        if self._recording is not None and not self._recording.ended:
+            return False, f"recording {self._recording.bag.path} already"
         self._polled.take()  # what came before belongs to before
-        self._paused = pause
-        answer.success, answer.message = True, "paused" if pause else "recording"
-        return answer
+        return True, str(self._begin())
 
-    def _on_snapshot(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self) -> tuple[bool, str]:
+        if self._recording is None:
+            return False, "nothing is being recorded"
+        self._polled.take()
+        self._recording.close()
+        ended, path = self._recording.ended, self._recording.bag.path
+        self._recording = None
+        return not ended, ended or f"{path} is closed"
+
+    def _on_pause(self, pause: bool) -> tuple[bool, str]:
+        if self._recording is None:
+            return False, "nothing is being recorded"
+        self._polled.take()
+        self._recording.paused = pause
+        return True, "paused" if pause else "recording"
+
+    def _on_snapshot(self) -> tuple[bool, str]:
         """Save the last seconds in a bag of their own."""
         if self._recent is None:
-            answer.message = "no snapshots are kept; set the parameter snapshot to seconds"
-            return answer
+            return False, "no snapshots are kept; set the parameter snapshot to seconds"
         self._polled.take()
         self._snapshots += 1
-        path = self._bag.path.with_name(f"{self._bag.path.name}_snapshot_{self._snapshots}")
-        try:
-            count = self._recent.save(path)
-        except (NlsidError, OSError) as error:
-            answer.message = str(error)
-            return answer
-        answer.success, answer.message = True, f"{count} messages in {path}"
-        return answer
+        base = self._recording.bag.path if self._recording is not None else Path(self._name or NAME)
+        path = base.with_name(f"{base.name}_snapshot_{self._snapshots}")
+        count = self._recent.save(path, definitions=self._recorded, custom=self._experiment)
+        return True, f"{count} messages in {path}"
 
     def _report(self) -> None:
         """Counts per topic; a warning while a topic is missing, silent or losing messages."""
-        self._stop_if_the_disk_is_nearly_full()
-        values = {"bag": str(self._bag.path)} | self._counts()
-        level, text = DiagnosticStatus.OK, "paused" if self._paused else "recording"
-        silent = [topic for topic in self._lost if not self._bag.counts.get(topic)]
-        losing = [topic for topic, lost in self._lost.items() if lost]
-        if silent or losing:
-            level = DiagnosticStatus.WARN
-            text = "; ".join(
-                [f"nothing on {topic} yet" for topic in silent]
-                + [f"messages lost on {topic}" for topic in losing]
-            )
+        recording = self._recording
+        level, text, values = DiagnosticStatus.OK, "waiting for ~/start", {}
+        if recording is not None:
+            values = {"bag": str(recording.bag.path)} | recording.counts()
+            text = "paused" if recording.paused else "recording"
+            if warnings := recording.warnings():
+                level, text = DiagnosticStatus.WARN, "; ".join(warnings)
         if self._refused:
             level = DiagnosticStatus.ERROR
             text = "; ".join(f"{topic}: {why}" for topic, why in self._refused.items())
-        if self._full:
-            level, text = DiagnosticStatus.ERROR, self._full
+        if recording is not None and recording.ended:
+            level, text = DiagnosticStatus.ERROR, recording.ended
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, NAME, level, text, values))
+
+
+def _answering(
+    serve: Callable[[], tuple[bool, str]],
+) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+    """A service that answers what `serve` returns or why it could not."""
+
+    def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.success, response.message = serve()
+        except (NlsidError, OSError) as error:
+            response.success, response.message = False, str(error)
+        return response
+
+    return answer
 
 
 def _is_pattern(topic: str) -> bool:

@@ -15,8 +15,8 @@ from bags.recordings.folders import COMPRESSED, bag_files
 from bags.recordings.mcap_file import MAGIC
 from bags.recordings.message_types import are_same, types_in_bag
 from bags.recordings.names import did_you_mean, listed
+from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.storage import Channel, McapStorage, RosbagsStorage, Storage
-from bags.recordings.writer import CUSTOM_DATA
 from nlsid_core.errors import BagError
 
 RECOVER: Final = "`nlsid bag recover`"

@@ -79,22 +79,15 @@ def decode(data: bytes, msgtype: str, types: Typestore) -> object:
         raise BagError(f"not a '{msgtype}': {type(error).__name__}: {str(error)[:200]}") from error
 
 
-def definition(msgtype: str) -> tuple[str, str]:
-    """The text (`ros2msg`) and RIHS01 hash that define a standard type; BagError if unknown."""
-    types = standard_types()
-    fields_of(msgtype, types)
-    return types.generate_msgdef(msgtype, ros_version=2)[0], types.hash_rihs01(msgtype)
-
-
 def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinition:
     """A ROS 1 definition as ROS 2 writes it: no `seq` in the header, `time` as a message.
 
     Raises BagError if it cannot be used.
     """
     standard = standard_types().fielddefs
-    with _defining(msgtype):
+    with defining(msgtype):
         parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
-        _refuse_what_code_cannot_be(parsed)
+        refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         text, _ = types.generate_msgdef(msgtype, ros_version=2)
@@ -112,14 +105,14 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     if embedded.format == MessageDefinitionFormat.NONE:
         fields_of(msgtype, standard)
         return standard
-    with _defining(msgtype):
-        parsed = _completed(_parse(msgtype, embedded))
+    with defining(msgtype):
+        parsed = completed(_parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
             for name, (_, fields) in parsed.items()
         ):
             return standard
-        _refuse_what_code_cannot_be(parsed)
+        refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(msgtype)
@@ -132,12 +125,13 @@ def are_same(first: Typestore, second: Typestore) -> bool:
 
 
 @contextmanager
-def _defining(msgtype: str) -> Iterator[None]:
+def defining(msgtype: str) -> Iterator[None]:
+    """Turn what a definition that cannot be used raises into a BagError that names the type."""
     try:
         yield
     except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
         raise BagError(
-            f"the definition of '{msgtype}' in the bag cannot be used: {type(error).__name__}: "
+            f"the definition of '{msgtype}' cannot be used: {type(error).__name__}: "
             f"{str(error)[:200]}"
         ) from error
 
@@ -154,17 +148,17 @@ def _parse(msgtype: str, embedded: MessageDefinition) -> Typesdict:
     return types
 
 
-def _completed(parsed: Typesdict) -> Typesdict:
-    """With the standard types that the definition uses and leaves out."""
-    standard = standard_types().fielddefs
+def completed(parsed: Typesdict, others: Typesdict | None = None) -> Typesdict:
+    """With the types that the definitions use and leave out: from `others`, else standard ones."""
+    known = {**standard_types().fielddefs, **(others or {})}
     todo, complete = list(parsed), dict(parsed)
     while todo:
         for _, description in complete[todo.pop()][1]:
             if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
                 description = description[1][0]
             name = str(description[1])
-            if description[0] == Nodetype.NAME and name not in complete and name in standard:
-                complete[name] = standard[name]
+            if description[0] == Nodetype.NAME and name not in complete and name in known:
+                complete[name] = known[name]
                 todo.append(name)
     return complete
 
@@ -186,7 +180,7 @@ def _elements(name: str, types: Typesdict, sizes: dict[str, int]) -> int:
     return sizes[name]
 
 
-def _refuse_what_code_cannot_be(types: Typesdict) -> None:
+def refuse_what_code_cannot_be(types: Typesdict) -> None:
     """rosbags turns definitions into code: from a bag only plain names and sane sizes reach it."""
     for name, (constants, fields) in types.items():
         if not _TYPE_NAME.fullmatch(name):

@@ -1,15 +1,22 @@
 """Finish what a killed recorder left: an .mcap file without its end, a folder without metadata."""
 
 import fcntl
+import re
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.reader import make_reader
 
-from bags.recordings.writer import BagWriter
+from bags.recordings.description import (
+    METADATA,
+    FileDescription,
+    TopicDescription,
+    write_metadata,
+)
+from bags.recordings.part import CUSTOM_DATA, TYPE_HASH, Part, topic_like
+from bags.recordings.storage import McapStorage
+from bags.recordings.writer import RESERVE
 from nlsid_core.errors import BagError
 
 
@@ -22,38 +29,79 @@ def unfinished_bags(folder: Path) -> list[Path]:
 
 
 def repair(bag: Path) -> int:
-    """Rewrite an unfinished bag with every message that can still be read; how many there are.
+    """Make an unfinished bag whole with every message that can still be read; how many there are.
 
-    The bag is replaced only once the new file is complete. Raises BagError if nothing can be read
-    or the bag is being written.
+    Files that were finished stay as they are; one that was not is replaced only once the new one is
+    complete. Types are defined as the file defines them. Raises BagError if nothing can be read or
+    the bag is being written.
     """
-    file = bag / f"{bag.name}.mcap"
     if not _is_unfinished(bag):
         raise BagError(f"{bag} is not an unfinished bag of ours, or it is being written")
+    files: list[FileDescription] = []
+    topics: dict[str, TopicDescription] = {}
+    custom: dict[str, str] = {}
     scratch = Path(tempfile.mkdtemp(dir=bag.parent, prefix=f".{bag.name}.repair."))
     try:
-        with BagWriter(scratch / bag.name) as repaired:
-            for topic, msgtype, message in _readable(file):
-                repaired.write(
-                    topic,
-                    msgtype,
-                    message.data,
-                    log_time_ns=message.log_time,
-                    publish_time_ns=message.publish_time,
+        for file in _files(bag):
+            storage = McapStorage([file], CUSTOM_DATA, salvage=True)
+            try:
+                finished = _finished(file)
+                files.append(finished or _rewritten(storage, scratch / file.name))
+            finally:
+                storage.close()
+            custom |= storage.custom
+            for channel in storage.channels:
+                type_hash = channel.metadata.get(TYPE_HASH, "")
+                topics[channel.topic] = TopicDescription(
+                    channel.msgtype, channel.encoding, type_hash
                 )
-        count = sum(repaired.counts.values())
-        (scratch / bag.name / file.name).replace(file)
-        (scratch / bag.name / "metadata.yaml").replace(bag / "metadata.yaml")
+            if finished is None:
+                (scratch / file.name).replace(file)
+        write_metadata(bag, files, topics, custom)
+        (bag / RESERVE).unlink(missing_ok=True)
     finally:
         shutil.rmtree(scratch)
-    return count
+    return sum(sum(file.counts.values()) for file in files)
+
+
+def _finished(file: Path) -> FileDescription | None:
+    """What a file says of itself at its end, None if it has none."""
+    with file.open("rb") as stream:
+        try:
+            summary = make_reader(stream).get_summary()
+        except Exception:  # mcap raises nearly anything where a file breaks off
+            return None
+    if summary is None or summary.statistics is None:
+        return None
+    there = summary.statistics
+    counts = {
+        channel.topic: there.channel_message_counts.get(number, 0)
+        for number, channel in summary.channels.items()
+    }
+    first_ns = there.message_start_time if there.message_count else None
+    return FileDescription(file.name, counts, first_ns, there.message_end_time)
+
+
+def _rewritten(storage: McapStorage, target: Path) -> FileDescription:
+    """A finished copy of the messages that are there."""
+    part = Part(target)
+    part.annotate(storage.custom)
+    for channel in storage.channels:
+        if channel.topic not in part.counts:
+            part.add_topic(topic_like(channel))
+    for message in storage.messages(range(len(storage.channels))):
+        topic = storage.channels[message.key].topic
+        count = part.counts[topic]
+        part.write(topic, message.data, message.log_ns, message.publish_ns, count)
+    part.finish()
+    return part.description
 
 
 def _is_unfinished(bag: Path) -> bool:
-    file = bag / f"{bag.name}.mcap"
-    if (bag / "metadata.yaml").exists() or not file.is_file():
+    files = _files(bag)
+    if (bag / METADATA).exists() or not files:
         return False
-    with file.open("rb") as stream:
+    with files[-1].open("rb") as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:  # a recorder holds it
@@ -61,23 +109,8 @@ def _is_unfinished(bag: Path) -> bool:
     return True
 
 
-def _readable(file: Path) -> Iterator[tuple[str, str, Message]]:
-    """(topic, type, message) up to where the file breaks off."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with file.open("rb") as stream:
-        records = iter(StreamReader(stream).records)
-        while True:
-            try:
-                record = next(records, None)
-            except Exception:  # mcap raises nearly anything at the place where a file breaks off
-                return
-            if record is None:
-                return
-            if isinstance(record, Schema):
-                schemas[record.id] = record
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                channel = channels[record.channel_id]
-                yield channel.topic, schemas[channel.schema_id].name, record
+def _files(bag: Path) -> list[Path]:
+    """The files our recorder gave the bag, in their order."""
+    ours = re.compile(re.escape(bag.name) + r"(?:_(\d+))?\.mcap")
+    found = [(match, path) for path in bag.iterdir() if (match := ours.fullmatch(path.name))]
+    return [path for match, path in sorted(found, key=lambda pair: int(pair[0][1] or 0))]

@@ -1,45 +1,42 @@
-"""Write a bag: a rosbag2 folder with one MCAP file, from messages that are already serialised."""
+"""Write a bag: a rosbag2 folder of MCAP files, from messages that are already serialised."""
 
-import fcntl
-import os
 import shutil
 import tempfile
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Final
+from typing import Final
 
-import yaml
-from mcap.writer import CompressionType, Writer
-
-from bags.recordings.message_types import are_same, definition, types_in_bag
-from bags.recordings.storage import FORMATS, Channel
-from nlsid_core._json import write_atomically
+from bags.recordings.definitions import Definition, standard_definition
+from bags.recordings.description import TopicDescription, write_metadata
+from bags.recordings.message_types import are_same, types_in_bag
+from bags.recordings.output import Reserve
+from bags.recordings.part import TYPE_HASH, Part, Topic, topic_like
+from bags.recordings.storage import Channel
 from nlsid_core.errors import BagError
 
-PROFILE: Final = "ros2"
-LIBRARY: Final = "nlsid"
-CUSTOM_DATA: Final = "custom_data"  # the MCAP Metadata record with the bag's own key-value pairs
-METADATA_VERSION: Final = 9  # the rosbag2 metadata of ROS 2 Jazzy
-CHUNK_BYTES: Final = 2**20
-SCHEMA_ENCODINGS: Final = {format: name for name, format in FORMATS.items()}
+RESERVE: Final = ".reserve"  # the file in a growing bag that keeps room for its end
 
 
 class BagWriter:
-    """A bag being written: NAME/NAME.mcap (zstd chunks) and NAME/metadata.yaml.
+    """A bag being written: NAME/NAME.mcap and NAME/metadata.yaml.
 
     Normally everything is written to a temporary folder beside `path`, which gets its name when
     the bag is closed; leaving a `with` block by an exception removes it. With `in_place=True` the
     bag grows under its own name and whatever happens stays readable: a recorder that is killed
-    loses only the messages after the last closed chunk (it has no metadata.yaml then). A killed
-    process loses nothing of a closed chunk; a power cut may.
+    loses only the messages after the last closed chunk (it has no metadata.yaml then), and one
+    whose disk is full spends the room that was kept for the bag's end and says so in `full`. A
+    killed process loses nothing of a closed chunk; a power cut may.
 
     `custom` is stored in the MCAP file and in metadata.yaml's `custom_data`. `max_chunk_age` in s
     of wall time closes a chunk at the first message after that age; where messages may pause, call
-    `close_chunk` from a timer too.
+    `close_chunk` from a timer too. `compression` of the chunks: zstd, lz4 or none. `split_bytes`
+    and `split_seconds` (of log time) begin another file, NAME_0.mcap, NAME_1.mcap and so on, at the
+    first message beyond them.
 
-    Raises BagError if `path` exists; OS errors pass through.
+    Raises BagError if `path` exists or a setting makes no sense; OS errors pass through.
     """
 
     def __init__(
@@ -49,24 +46,24 @@ class BagWriter:
         custom: Mapping[str, str] | None = None,
         in_place: bool = False,
         max_chunk_age: float | None = None,
+        compression: str = "zstd",
+        split_bytes: int | None = None,
+        split_seconds: float | None = None,
     ) -> None:
         self.path = Path(path)
         self.counts: dict[str, int] = {}
-        self._types: dict[str, str] = {}
-        self._hashes: dict[str, str] = {}
-        self._encodings: dict[str, str] = {}
+        self._topics: dict[str, Topic] = {}
         self._like: dict[str, Channel] = {}
-        self._schemas: dict[tuple[str, str], int] = {}
-        self._channels: dict[str, int] = {}
         self._custom = dict(custom or {})
-        self._first_ns: int | None = None
-        self._last_ns = 0
         self._max_chunk_age = max_chunk_age
         self._chunk_opened: float | None = None
+        self._compression = compression
+        self._split_bytes = split_bytes
+        self._split_ns = None if split_seconds is None else round(split_seconds * 1e9)
+        self._in_place = in_place
         if self.path.exists():
             raise BagError(f"{self.path} exists already; name another bag or move it away")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._in_place = in_place
         if in_place:
             self._folder = self.path
             self._folder.mkdir()
@@ -75,45 +72,66 @@ class BagWriter:
                 tempfile.mkdtemp(dir=self.path.parent, prefix=f".{self.path.name}.")
             )
             self._folder.chmod(0o755)
-        self._stream: BinaryIO = (self._folder / self._file_name).open("xb")
-        fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
-        # Any: half of mcap's writer is not annotated
-        self._mcap: Any = Writer(
-            self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
-        )
-        self._mcap.start(profile=PROFILE, library=LIBRARY)
-        if self._custom:
-            self._mcap.add_metadata(CUSTOM_DATA, self._custom)
-        self.close_chunk()
+        self._reserve: Reserve | None = None
+        self._parts: list[Part] = []
+        try:
+            self._reserve = Reserve(self._folder / RESERVE) if in_place else None
+            self._open_part()
+        except BaseException:
+            shutil.rmtree(self._folder)
+            raise
 
-    def add_topic(self, topic: str, msgtype: str, *, like: Channel | None = None) -> None:
+    @property
+    def full(self) -> str:
+        """Why the bag should be closed now, if the disk is full; otherwise empty."""
+        return "" if self._reserve is None else self._reserve.spent
+
+    def _open_part(self) -> None:
+        split = self._split_bytes is not None or self._split_ns is not None
+        number = f"_{len(self._parts)}" if split else ""
+        part = Part(
+            self._folder / f"{self.path.name}{number}.mcap",
+            compression=self._compression,
+            reserve=self._reserve,
+        )
+        self._parts.append(part)
+        part.annotate(self._custom)
+        for topic in self._topics.values():
+            part.add_topic(topic)
+        part.close_chunk()
+
+    def add_topic(
+        self,
+        topic: str,
+        msgtype: str,
+        *,
+        definition: Definition | None = None,
+        like: Channel | None = None,
+    ) -> None:
         """Announce a topic, so that the bag lists it even if no message comes.
 
-        `like`: the channel of another bag that it is a copy of, with its own definition of its
-        type; without one the type is a standard one. Raises BagError for a type that is not known
-        and for a second type on one topic.
+        `definition`: what defines its type, `like`: the channel of another bag that it is a copy
+        of, with its own definition; without either the type is a standard one. Raises BagError for
+        a type that is not known and for a second type on one topic.
         """
-        if topic in self._types:
-            if self._types[topic] != msgtype:
+        if topic in self._topics:
+            known = self._topics[topic].msgtype
+            if known != msgtype:
                 raise BagError(
-                    f"{self.path}: {topic} holds '{self._types[topic]}', not '{msgtype}'; "
-                    "a topic has one type"
+                    f"{self.path}: {topic} holds '{known}', not '{msgtype}'; a topic has one type"
                 )
             if like is not None and self._like.setdefault(topic, like) is not like:
                 self._refuse_another(self._like[topic], like)
             return
         if like is None:
-            text, type_hash = definition(msgtype)
-            schema, encoding = self._schema(msgtype, "ros2msg", text), "cdr"
-            metadata = {"offered_qos_profiles": "[]", "topic_type_hash": type_hash}
+            defined = definition or standard_definition(msgtype)
+            metadata = {"offered_qos_profiles": "[]", TYPE_HASH: defined.type_hash}
+            added = Topic(topic, msgtype, "cdr", ("ros2msg", defined.text), metadata)
         else:
-            schema, encoding = self._schema_like(like), like.encoding
-            metadata = dict(like.metadata)
+            added = replace(topic_like(like), name=topic)
             self._like[topic] = like
-        self._channels[topic] = self._mcap.register_channel(topic, encoding, schema, metadata)
-        self._types[topic] = msgtype
-        self._hashes[topic] = metadata.get("topic_type_hash", "")
-        self._encodings[topic] = encoding
+        self._parts[-1].add_topic(added)
+        self._topics[topic] = added
         self.counts[topic] = 0
 
     def _refuse_another(self, first: Channel, second: Channel) -> None:
@@ -127,21 +145,6 @@ class BagWriter:
             f"{self.path}: {first.topic} comes with two definitions of '{first.msgtype}'; keep "
             "them in two bags"
         )
-
-    def _schema_like(self, like: Channel) -> int:
-        if not like.definition.data and like.encoding == "cdr":
-            try:
-                return self._schema(like.msgtype, "ros2msg", definition(like.msgtype)[0])
-            except BagError:
-                pass  # not a standard type either: copied as it came, without its definition
-        encoding = SCHEMA_ENCODINGS.get(like.definition.format, "")
-        return self._schema(like.msgtype, encoding, like.definition.data)
-
-    def _schema(self, msgtype: str, encoding: str, text: str) -> int:
-        key = (msgtype, text)
-        if key not in self._schemas:
-            self._schemas[key] = self._mcap.register_schema(msgtype, encoding, text.encode())
-        return self._schemas[key]
 
     def write(
         self,
@@ -161,17 +164,16 @@ class BagWriter:
         if not (0 <= log_time_ns < 2**63 and 0 <= publish_time_ns < 2**63):
             raise BagError(f"{self.path}: {topic}: times {log_time_ns}, {publish_time_ns} ns")
         self.add_topic(topic, msgtype)
-        self._mcap.add_message(
-            self._channels[topic],
-            log_time_ns,
-            data,
-            publish_time_ns,
-            sequence=self.counts[topic] if sequence is None else sequence,
+        part = self._parts[-1]
+        if self._is_full(part, log_time_ns):
+            self._open_part()
+            part.finish()
+            part, self._chunk_opened = self._parts[-1], None
+        count = self.counts[topic]
+        part.write(
+            topic, data, log_time_ns, publish_time_ns, count if sequence is None else sequence
         )
-        self.counts[topic] += 1
-        first = log_time_ns if self._first_ns is None else self._first_ns
-        self._first_ns = min(first, log_time_ns)
-        self._last_ns = max(self._last_ns, log_time_ns)
+        self.counts[topic] = count + 1
         if self._max_chunk_age is not None:
             now = time.monotonic()
             if self._chunk_opened is None:
@@ -179,27 +181,46 @@ class BagWriter:
             elif now - self._chunk_opened >= self._max_chunk_age:
                 self.close_chunk()
 
+    def _is_full(self, part: Part, log_time_ns: int) -> bool:
+        if part.first_ns is None:
+            return False
+        if self._split_bytes is not None and part.size >= self._split_bytes:
+            return True
+        return self._split_ns is not None and log_time_ns - part.first_ns >= self._split_ns
+
     def annotate(self, custom: Mapping[str, str]) -> None:
-        """Add to the bag's own key-value pairs."""
+        """Add to the bag's own key-value pairs; the newest of those with one key counts."""
         self._custom.update(custom)
-        self._mcap.add_metadata(CUSTOM_DATA, dict(custom))
+        self._parts[-1].annotate(custom)
 
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
-        self._mcap.flush()
+        self._parts[-1].close_chunk()
         self._chunk_opened = None
 
     def close(self) -> None:
-        """Finish the file, write metadata.yaml, give the folder its name; once."""
-        if self._stream.closed:
+        """Finish the file, write metadata.yaml, give the folder its name; once.
+
+        Where that fails (a full disk without a reserve), a bag in place stays what a killed
+        recorder leaves: unfinished, all its closed chunks readable.
+        """
+        if self._parts[-1].closed:
             return
-        self._mcap.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
-        document = {"rosbag2_bagfile_information": self._information()}
-        text = yaml.safe_dump(document, sort_keys=False, width=4096)  # a value stays on its line
-        write_atomically(self._folder / "metadata.yaml", text.encode())
+        try:
+            if self._reserve is not None:
+                self._reserve.release()
+            for part in self._parts:
+                if not part.closed:
+                    part.finish()
+            topics = {
+                name: TopicDescription(t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""))
+                for name, t in self._topics.items()
+            }
+            files = [part.description for part in self._parts]
+            write_metadata(self._folder, files, topics, self._custom)
+        except OSError:
+            self.abandon()
+            raise
         if not self._in_place:
             if self.path.exists():  # rename would replace an empty folder
                 self.discard()
@@ -208,8 +229,13 @@ class BagWriter:
 
     def discard(self) -> None:
         """Remove what was written."""
-        self._stream.close()
+        self.abandon()
         shutil.rmtree(self._folder)
+
+    def abandon(self) -> None:
+        """Let go of the files as they are: what a killed recorder leaves."""
+        for part in self._parts:
+            part.abandon()
 
     def __enter__(self) -> "BagWriter":
         return self
@@ -224,46 +250,3 @@ class BagWriter:
             self.close()
         else:
             self.discard()
-
-    @property
-    def _file_name(self) -> str:
-        return f"{self.path.name}.mcap"
-
-    def _information(self) -> dict[str, Any]:
-        """metadata.yaml, version 9, as rosbag2 and rosbags read it."""
-        start = {"nanoseconds_since_epoch": self._first_ns or 0}
-        duration = {"nanoseconds": self._last_ns - (self._first_ns or 0)}
-        count = sum(self.counts.values())
-        return {
-            "version": METADATA_VERSION,
-            "storage_identifier": "mcap",
-            "relative_file_paths": [self._file_name],
-            "starting_time": start,
-            "duration": duration,
-            "message_count": count,
-            "topics_with_message_count": [
-                {
-                    "topic_metadata": {
-                        "name": topic,
-                        "type": msgtype,
-                        "serialization_format": self._encodings[topic],
-                        "offered_qos_profiles": [],
-                        "type_description_hash": self._hashes[topic],
-                    },
-                    "message_count": self.counts[topic],
-                }
-                for topic, msgtype in self._types.items()
-            ],
-            "compression_format": "",
-            "compression_mode": "",
-            "files": [
-                {
-                    "path": self._file_name,
-                    "starting_time": dict(start),
-                    "duration": dict(duration),
-                    "message_count": count,
-                }
-            ],
-            "custom_data": self._custom or None,
-            "ros_distro": "jazzy",
-        }

@@ -2,10 +2,12 @@
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from bags.recordings.definitions import Definition
 from bags.recordings.writer import BagWriter
 
 GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
@@ -72,9 +74,20 @@ class Recent:
         while self._arrivals[0].log_time_ns < oldest:
             self._arrivals.popleft()
 
-    def save(self, path: Path) -> int:
-        """Write a bag of what is remembered; how many messages. Raises BagError if it exists."""
-        with BagWriter(path) as bag:
+    def save(
+        self,
+        path: Path,
+        *,
+        definitions: Mapping[str, Definition] | None = None,
+        custom: Mapping[str, str] | None = None,
+    ) -> int:
+        """Write a bag of what is remembered; how many messages. Raises BagError if it exists.
+
+        definitions: of the topics' types by topic; those that are not in it have standard types.
+        """
+        with BagWriter(path, custom=custom) as bag:
+            for topic, definition in (definitions or {}).items():
+                bag.add_topic(topic, definition.msgtype, definition=definition)
             for arrival in self._arrivals:
                 bag.write(
                     arrival.topic,

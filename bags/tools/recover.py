@@ -8,8 +8,9 @@ from pathlib import Path
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
 from bags.recordings.folders import bag_files
+from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.storage import Channel, McapStorage, reading
-from bags.recordings.writer import CUSTOM_DATA, BagWriter
+from bags.recordings.writer import BagWriter
 from bags.signals.columns import Progress
 from nlsid_core.errors import BagError
 

@@ -1,0 +1,117 @@
+"""A bag while it is recorded: what came on each topic, until it ends or the disk is full."""
+
+import shutil
+from collections.abc import Mapping
+from typing import Final
+
+from bags.recordings.definitions import Definition
+from bags.recordings.writer import BagWriter
+from bags.signals.arrivals import Arrival, Regularity
+
+UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
+
+
+class Recording:
+    """Messages into a bag, and counts of them.
+
+    `ended` says why the recording ended by itself; what came until then is in the bag. No method
+    raises an OSError: a recorder that runs on can still keep snapshots and say what happened.
+    """
+
+    def __init__(self, bag: BagWriter, *, least_free: float) -> None:
+        self.bag = bag
+        self.ended = ""
+        self.paused = False
+        self._least_free = least_free  # MB
+        self._lost: dict[str, int] = {}
+        self._regularity: dict[str, Regularity] = {}
+        self._closed = False
+
+    def expect(self, topic: str) -> None:
+        """List a topic although nothing is known of it yet."""
+        self._lost.setdefault(topic, 0)
+        self._regularity.setdefault(topic, Regularity())
+
+    def add_topic(self, topic: str, definition: Definition) -> None:
+        """Announce a topic; BagError if it holds another type already."""
+        self.expect(topic)
+        self.bag.add_topic(topic, definition.msgtype, definition=definition)
+
+    def add(self, arrival: Arrival, stamp_ns: int) -> None:
+        """Take a message; `stamp_ns` is what its regularity is judged by."""
+        if self._closed:
+            return
+        topic, msgtype, data, log_ns, publish_ns = arrival
+        self._regularity[topic].update(stamp_ns)
+        if self.paused:
+            return
+        try:
+            self.bag.write(topic, msgtype, data, log_time_ns=log_ns, publish_time_ns=publish_ns)
+        except OSError as error:
+            self._end(str(error))
+
+    def lose(self, topic: str, count: int) -> None:
+        """Count messages that the middleware lost."""
+        self._lost[topic] = self._lost.get(topic, 0) + count
+
+    def annotate(self, custom: Mapping[str, str]) -> None:
+        """Add to the bag's metadata."""
+        if self._closed:
+            return
+        try:
+            self.bag.annotate(custom)
+        except OSError as error:
+            self._end(str(error))
+
+    def keep_up(self) -> None:
+        """Close the chunk, and the bag if the disk is (nearly) full; to be called regularly."""
+        if self._closed:
+            return
+        try:
+            self.bag.close_chunk()
+        except OSError as error:
+            self._end(str(error))
+            return
+        free = shutil.disk_usage(self.bag.path).free / 1e6
+        if self.bag.full:
+            self._end(self.bag.full)
+        elif free < self._least_free:
+            self._end(f"{free:.0f} MB left, {self._least_free:g} are to stay free")
+
+    def close(self) -> None:
+        """Write the counts into the bag and close it; once."""
+        if self._closed:
+            return
+        self._closed = True
+        ended = {"ended": self.ended} if self.ended else {}
+        try:
+            self.bag.annotate(self.counts() | ended)
+            self.bag.close()
+        except OSError as error:
+            self.ended = (self.ended or f"recording stopped: {error}") + UNFINISHED
+            self.bag.abandon()
+
+    def counts(self) -> dict[str, str]:
+        """What came on each topic, in words."""
+        values = {}
+        for topic, lost in self._lost.items():
+            regularity = self._regularity[topic]
+            values[f"{topic} received"] = str(self.bag.counts.get(topic, 0))
+            values[f"{topic} lost"] = str(lost)
+            values[f"{topic} gaps"] = str(regularity.gaps)
+            values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
+            values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
+        return values
+
+    def warnings(self) -> list[str]:
+        """What a person should look at."""
+        silent = [topic for topic in self._lost if not self.bag.counts.get(topic)]
+        losing = [topic for topic, lost in self._lost.items() if lost]
+        return [
+            *(f"nothing on {topic} yet" for topic in silent),
+            *(f"messages lost on {topic}" for topic in losing),
+        ]
+
+    def _end(self, why: str) -> None:
+        self.ended = f"recording stopped: {why}"
+        self.close()
