@@ -1,10 +1,12 @@
 """Node `excitation`: safe signals to identify a robot with, repeated as often as asked.
 
 Publishes commands at a fixed rate after `~/start`, stamped on an exact grid; `~/stop`, shutdown and
-the end fade to rest. What was done is said on ~/experiment (latched, JSON), for the recorder.
-Refuses to run without limits.
+the end go to rest as fast as the limits allow. What each repeat is, is said on ~/experiment
+(latched, JSON), for the recorder to write into its bag; with `recorder` every repeat gets a bag of
+its own, and those of one signal have one `repeat_group`. Refuses to run without limits.
 """
 
+import hashlib
 import json
 import sys
 import time
@@ -57,6 +59,10 @@ class Excitation(ManagedNode):
         self._highest_hz = number("highest_hz", 2.0, "highest frequency", between=(1e-6, 1e4))
         self._hold = number("hold", 0.5, "s a step or a bit lasts", between=(1e-3, 1e4))
         self._pause = number("pause", 2.0, "s of rest before each repeat", between=(0.0, 3600.0))
+        recorder = declare_text(
+            self, "recorder", "", "node asked for a bag per repeat (at_once: false); empty: none"
+        )
+        self._recorder = recorder.rstrip("/")
         repeats: Any = declare(self, "repeats", 1, "how often it is played", between=(1, 1000))
         seed: Any = declare(self, "seed", 1, "of phases and levels", between=(0, 2**31))
         self._repeats, self._seed = repeats, seed
@@ -70,10 +76,12 @@ class Excitation(ManagedNode):
 
     def prepare(self) -> None:
         """Make the whole signal before anything moves."""
-        once = np.concatenate(
-            [np.full(round(self._pause / self._period), self._shape.rest), self._inputs()]
-        )
-        self._inputs_in_all = np.tile(once, self._repeats)
+        if self._kind not in KINDS:
+            raise DataError(f"kind is '{self._kind}'; it should be one of {', '.join(KINDS)}")
+        rest = np.full(round(self._pause / self._period), self._shape.rest)
+        self._once = np.concatenate([rest, self._inputs()])
+        digest = hashlib.sha256(self._once.tobytes()).hexdigest()
+        self._group = f"{self._command.path}, {self._kind}, sha256:{digest[:16]}"
 
     def _inputs(self) -> FloatArray:
         samples, period = round(self._duration / self._period), self._period
@@ -88,10 +96,8 @@ class Excitation(ManagedNode):
                 signal = prbs(samples, period, hold=self._hold)
             case "steps":
                 signal = steps(samples, period, hold=self._hold, rng=rng)
-            case "replay":
-                signal = self._recorded()
             case _:
-                raise DataError(f"kind is '{self._kind}'; it should be one of {', '.join(KINDS)}")
+                signal = self._recorded()
         return self._shape(signal, period)
 
     def _recorded(self) -> FloatArray:
@@ -107,13 +113,20 @@ class Excitation(ManagedNode):
     def start(self) -> None:
         """Be ready; nothing moves before ~/start."""
         self._next: int | None = None
+        self._repeat = 0
         self._input = self._shape.rest
-        self._state = "idle"
+        self._state, self._failed, self._busy = "idle", False, False
+        self._did: dict[str, object] = {}
         self._publisher = self.create_publisher(
             self._command.kind, self._command.path.topic, qos.STREAM
         )
         self._experiment = self.create_publisher(String, "~/experiment", qos.DOCUMENT)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
+        self._bags = {
+            name: self.create_client(Trigger, f"{self._recorder}/{name}")
+            for name in ("start", "stop")
+            if self._recorder
+        }
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -121,9 +134,9 @@ class Excitation(ManagedNode):
         self.create_timer(1.0, self._report, clock=steady)
 
     def stop(self) -> None:
-        """Fade to rest before going."""
-        while self._next is not None or self._input != self._shape.rest:
-            self._next = None
+        """Go to rest before going."""
+        self._call_off("stopped with the node")
+        while self._input != self._shape.rest:
             self._to_rest()
             time.sleep(self._period)
         self._publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
@@ -133,12 +146,12 @@ class Excitation(ManagedNode):
             if self._input != self._shape.rest:
                 self._to_rest()
             return
-        self._input = float(self._inputs_in_all[self._next])
+        self._input = float(self._once[self._next])
         self._send(self._start_ns + self._next * round(self._period * 1e9))
         self._next += 1
-        if self._next == len(self._inputs_in_all):
-            self._next, self._state = None, "done"
-            self._report()
+        if self._next == len(self._once):
+            self._next = None
+            self._end_repeat()
 
     def _to_rest(self) -> None:
         step = self._shape.slew * self._period
@@ -148,36 +161,107 @@ class Excitation(ManagedNode):
     def _send(self, stamp_ns: int) -> None:
         self._publisher.publish(self._command.make(stamp_ns, self._input))
 
+    def _begin_repeat(self) -> None:
+        """Play at once, or when the recorder has a new bag."""
+        if self._recorder:
+            self._say(f"repeat {self._repeat + 1}: asking for a bag")
+            asked = self._bags["start"].call_async(Trigger.Request())
+            asked.add_done_callback(self._on_bag_begun)
+        else:
+            self._play(self.get_clock().now().nanoseconds)
+
+    def _on_bag_begun(self, asked: Any) -> None:
+        if not self._busy:  # ~/stop came first
+            return
+        if not asked.result().success:
+            self._fail(f"no bag from the recorder: {asked.result().message}")
+            return
+        self._play(self.get_clock().now().nanoseconds)
+
+    def _play(self, start_ns: int) -> None:
+        self._next, self._start_ns = 0, start_ns
+        self._did = {
+            "kind": self._kind, "signal": str(self._command.path), "period": self._period,
+            "duration": self._duration, "repeat": self._repeat + 1, "repeats": self._repeats,
+            "pause": self._pause, "seed": self._seed, "lowest_hz": self._lowest_hz,
+            "highest_hz": self._highest_hz, "hold": self._hold, "limits": vars(self._shape),
+            "start_ns": self._start_ns, "repeat_group": self._group,
+        }  # fmt: skip
+        self._experiment.publish(String(data=json.dumps(self._did)))
+        self._say(f"repeat {self._repeat + 1} of {self._repeats}")
+
+    def _end_repeat(self) -> None:
+        if self._recorder:
+            self._say(f"repeat {self._repeat + 1}: closing the bag")
+            asked = self._bags["stop"].call_async(Trigger.Request())
+            asked.add_done_callback(self._on_bag_closed)
+        else:  # the next one goes on where this one ends
+            self._next_repeat(self._start_ns + len(self._once) * round(self._period * 1e9))
+
+    def _on_bag_closed(self, asked: Any) -> None:
+        if not asked.result().success:
+            self._fail(f"the bag is not whole: {asked.result().message}")
+        elif self._busy:
+            self._next_repeat(None)
+
+    def _next_repeat(self, start_ns: int | None) -> None:
+        self._repeat += 1
+        if self._repeat == self._repeats:
+            self._finish("done")
+        elif start_ns is None:
+            self._begin_repeat()
+        else:
+            self._play(start_ns)
+
+    def _finish(self, state: str, *, whole: bool = True) -> None:
+        """Say how it ended; a repeat that is not whole is no repeat."""
+        self._next, self._busy = None, False
+        ended = {"ended": state} | ({} if whole else {"repeat_group": ""})
+        self._experiment.publish(String(data=json.dumps(self._did | ended)))
+        self._say(state)
+
+    def _fail(self, why: str) -> None:
+        self._failed = True
+        self._finish(why, whole=False)
+
+    def _call_off(self, state: str) -> None:
+        if not self._busy:
+            return
+        self._finish(state, whole=False)
+        if self._recorder:
+            self._bags["stop"].call_async(Trigger.Request())
+
     def _on_start(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success = self._next is None
-        answer.message = "running" if answer.success else "it runs already"
-        if answer.success:
-            self._next, self._state = 0, "running"
-            self._start_ns = self.get_clock().now().nanoseconds
-            did = {
-                "kind": self._kind, "signal": str(self._command.path), "period": self._period,
-                "duration": self._duration, "repeats": self._repeats, "pause": self._pause,
-                "seed": self._seed, "lowest_hz": self._lowest_hz, "highest_hz": self._highest_hz,
-                "hold": self._hold, "limits": vars(self._shape), "start_ns": self._start_ns,
-            }  # fmt: skip
-            self._experiment.publish(String(data=json.dumps(did)))
-            self._report()
+        if self._busy:
+            answer.message = "it runs already"
+        elif not all(client.service_is_ready() for client in self._bags.values()):
+            answer.message = f"there is no recorder {self._recorder}; start it with at_once:=false"
+        else:
+            self._busy, self._failed, self._repeat = True, False, 0
+            self._did = {}
+            self._begin_repeat()
+            answer.success, answer.message = True, "running"
         return answer
 
     def _on_stop(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        answer.success, answer.message = True, "stopping"
-        if self._next is not None:
-            self._next, self._state = None, "stopped when asked to"
-            self._report()
+        answer.success, answer.message = True, "stopping" if self._busy else "nothing runs"
+        self._call_off("stopped when asked to")
         return answer
 
+    def _say(self, state: str) -> None:
+        self._state = state
+        self._report()
+
     def _report(self) -> None:
-        total = len(self._inputs_in_all)
-        values = {"input": f"{self._input:.6g}", "of": str(total), "sample": str(self._next)}
+        values = {
+            "input": f"{self._input:.6g}",
+            "sample": str(self._next),
+            "of": str(len(self._once)),
+            "repeat": str(self._repeat + 1),
+        }
+        level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(
-            status(now, self.get_name(), DiagnosticStatus.OK, self._state, values)
-        )
+        self._diagnostics.publish(status(now, self.get_name(), level, self._state, values))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -36,6 +36,10 @@ class ModelIdentifier(ManagedNode):
             self, "bags", [""], "bags or folders of bags, read when ~/identify is called"
         )
         self._bags = [Path(bag) for bag in bags if bag]
+        last: Any = declare(
+            self, "last", 0, "only the last so many of the bags; 0: all", between=(0, 10_000)
+        )
+        self._last = last
         self._config = Path(declare_text(self, "config", "", "the robot's YAML configuration"))
         self._out = Path(declare_text(self, "out", "", "folder for model.json and its proof"))
 
@@ -65,7 +69,9 @@ class ModelIdentifier(ManagedNode):
         answer.success = self._work is None
         answer.message = "started" if answer.success else f"busy: {self._said.what}"
         if answer.success:
-            self._work = BackgroundIdentification(self._bags, self._config, self._out)
+            self._work = BackgroundIdentification(
+                self._bags, self._config, self._out, last=self._last
+            )
         return answer
 
     def _on_cancel(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:

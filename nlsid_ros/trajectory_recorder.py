@@ -261,18 +261,22 @@ class TrajectoryRecorder(ManagedNode):
             self._recording.lose(topic, count)
 
     def _on_experiment(self, message: String) -> None:
-        """Keep what an excitation says it does; an empty object says that it does nothing."""
+        """Keep what an excitation says it does; how one ended is for the bag it was in."""
         try:
             said = _json.parse_document(message.data)
         except NlsidError as error:
             self.get_logger().warning(f"{self._said_by} is not in the bag's metadata: {error}")
             return
-        self._experiment = {EXPERIMENT: message.data} if said else {}
+        ended = "ended" in said
+        if ended and not self._experiment:  # latched, of an experiment before this recorder
+            return
         group = said.get("repeat_group")
+        now = {EXPERIMENT: message.data}
         if isinstance(group, str):
-            self._experiment["repeat_group"] = group
+            now["repeat_group"] = group
         if self._recording is not None:
-            self._recording.annotate(self._experiment)
+            self._recording.annotate(now)
+        self._experiment = {} if ended else now
 
     def _keep_up(self) -> None:
         if self._recording is None:

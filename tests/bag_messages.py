@@ -72,15 +72,16 @@ def speed_bag(
     speeds: Iterable[float],
     commands: Iterable[float],
     *,
+    start_ns: int = START_NS,
     stamps_ns: Iterable[int] | None = None,
     custom: dict[str, str] | None = None,
 ) -> Path:
     """A bag of speeds on /odom and commands on /cmd_vel, one of each every 25 ms by default."""
     pairs = list(zip(speeds, commands, strict=True))
-    stamps = list(stamps_ns or (START_NS + k * PERIOD_NS for k in range(len(pairs))))
+    stamps = list(stamps_ns or (start_ns + k * PERIOD_NS for k in range(len(pairs))))
     with BagWriter(path, custom=custom) as bag:
         for k, (stamp, (speed, value)) in enumerate(zip(stamps, pairs, strict=True)):
-            log = START_NS + k * PERIOD_NS
+            log = start_ns + k * PERIOD_NS
             times = {"log_time_ns": log, "publish_time_ns": log}
             bag.write(CMD, CMD_TYPE, command(stamp, value), **times)
             bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)

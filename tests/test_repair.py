@@ -1,11 +1,20 @@
 """What a killed recorder leaves is found and made a whole bag again."""
 
 import shutil
+import struct
 from pathlib import Path
 
 import pytest
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
 
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import definitions_from
+from bags.recordings.message_types import decode
 from bags.recordings.repair import repair, unfinished_bags
 from bags.recordings.writer import BagWriter
 from nlsid_core.errors import BagError
@@ -45,6 +54,62 @@ def test_every_complete_chunk_of_a_killed_bag_is_kept(tmp_path: Path, cut: int) 
     ]
     assert unfinished_bags(tmp_path) == []
     assert [p.name for p in tmp_path.iterdir()] == ["trial"]
+
+
+def test_before_its_repair_mcap_reads_the_complete_chunks_and_rosbags_nothing(
+    tmp_path: Path,
+) -> None:
+    bag = killed_bag(tmp_path / "trial", cut=1000)
+    kept: list[bytes] = []
+    with (
+        (bag / "trial.mcap").open("rb") as stream,
+        pytest.raises((EndOfFile, RecordLengthLimitExceeded)),
+    ):
+        kept.extend(r.data for r in StreamReader(stream).records if isinstance(r, Message))
+    with pytest.raises(FileNotFoundError, match="Expected metadata file"):
+        Reader(bag)
+    with pytest.raises(BagError, match="was not closed"):
+        Bag(bag)
+    repair(bag)
+    with AnyReader([bag]) as reader:
+        assert [bytes(data) for _, _, data in reader.messages()] == kept
+    with (bag / "trial.mcap").open("rb") as stream:
+        finished = [m.data for *_, m in make_reader(stream, validate_crcs=True).iter_messages()]
+    assert finished == kept
+
+
+def test_of_a_split_bag_only_the_last_file_is_rewritten_and_custom_types_stay_known(
+    tmp_path: Path,
+) -> None:
+    texts = {"my_robot/msg/Arm": "float64 x\n"}
+    definition = definitions_from(texts)["my_robot/msg/Arm"]
+    bag = BagWriter(tmp_path / "run", in_place=True, split_seconds=1.0, custom={"robot": "arm"})
+    bag.add_topic("/arm", definition.msgtype, definition=definition)
+    for k in range(25):
+        data = b"\0\1\0\0" + struct.pack("<d", float(k))
+        times = {"log_time_ns": k * 10**8, "publish_time_ns": k * 10**8}
+        bag.write("/arm", definition.msgtype, data, **times)
+    bag.close_chunk()
+    bag.abandon()
+    assert (tmp_path / "run" / ".reserve").stat().st_size > 0
+    files = [tmp_path / "run" / f"run_{k}.mcap" for k in range(3)]
+    before = [file.read_bytes() for file in files]
+    assert unfinished_bags(tmp_path) == [tmp_path / "run"]
+    assert repair(tmp_path / "run") == 25
+    assert [file.read_bytes() for file in files][:2] == before[:2]
+    assert files[2].read_bytes() != before[2]
+    with Bag(tmp_path / "run") as source:
+        assert source.custom == {"robot": "arm"}
+        msgtype, types = source.types_on("/arm")
+        messages = list(source.messages())
+    assert [decode(m.data, msgtype, types).x for m in messages] == list(range(25))  # type: ignore[attr-defined]
+    with AnyReader([tmp_path / "run"]) as reader:
+        assert reader.message_count == 25
+        [connection] = {c.msgtype for c in reader.connections}
+        assert [reader.deserialize(d, connection).x for *_, d in reader.messages()] == list(  # type: ignore[attr-defined]
+            range(25)
+        )
+    assert not (tmp_path / "run" / ".reserve").exists()
 
 
 def test_a_bag_that_is_being_written_is_left_alone(tmp_path: Path) -> None:

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from bags.chain.config import load_config
 from bags.chain.steps import identify_bags
+from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
-from nlsid_core.errors import NlsidError
+from bags.signals.arrivals import SNAPSHOT
+from nlsid_core.errors import BagError, NlsidError
 
 
 @dataclass(frozen=True)
@@ -23,14 +25,17 @@ class Progress:
 
 
 class BackgroundIdentification:
-    """`identify_bags` in a fresh process, which inherits nothing but its arguments."""
+    """`identify_bags` in a fresh process, which inherits nothing but its arguments.
 
-    def __init__(self, bags: Sequence[Path], config: Path, out: Path) -> None:
+    last: only the last so many of the bags, see `last_bags`; 0: all.
+    """
+
+    def __init__(self, bags: Sequence[Path], config: Path, out: Path, *, last: int = 0) -> None:
         context = multiprocessing.get_context("spawn")
         self._progress = Progress("starting", 0.0)
         self._receiver, sender = context.Pipe(duplex=False)
         self._process = context.Process(
-            target=_identify, args=(list(bags), config, out, sender), daemon=True
+            target=_identify, args=(list(bags), config, out, last, sender), daemon=True
         )
         self._process.start()
         sender.close()
@@ -54,10 +59,28 @@ class BackgroundIdentification:
             self._progress = Progress("cancelled", self._progress.fraction, done=True)
 
 
-def _identify(bags: list[Path], config: Path, out: Path, sender: Connection) -> None:
+def last_bags(paths: Sequence[Path], count: int) -> list[Path]:
+    """The last `count` finished recordings among bags and folders of bags, the newest last.
+
+    A recording that is not closed yet and a snapshot (its messages are in a recording too) do not
+    count. Raises BagError if there are not so many.
+    """
+    started: list[tuple[int, Path]] = []
+    for path in expand_bags(paths):
+        with Bag(path, unfinished=True) as bag:
+            first = next(bag.messages(), None)
+            if bag.ending is None and SNAPSHOT not in bag.custom and first is not None:
+                started.append((first.log_time_ns, path))
+    if len(started) < count:
+        there = ", ".join(map(str, paths))
+        raise BagError(f"{count} recordings are asked for, {len(started)} are finished in {there}")
+    return [path for _, path in sorted(started)[-count:]]
+
+
+def _identify(bags: list[Path], config: Path, out: Path, last: int, sender: Connection) -> None:
     try:
         identify_bags(
-            expand_bags(bags),
+            last_bags(bags, last) if last else expand_bags(bags),
             load_config(config),
             out,
             progress=lambda what, fraction: sender.send(Progress(what, fraction)),

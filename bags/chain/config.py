@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from nlsid_core.errors import DataError
 from nlsid_core.identification import LinearClass, ModelClass, StateAffineClass
@@ -55,9 +55,16 @@ class GridConfig(_Section):
 
 
 class SplitConfig(_Section):
-    """Names of the bags that are only used to score."""
+    """What is only used to score: the bags named, or else the share of every bag at its end."""
 
     test: tuple[str, ...] = Field(default=(), strict=False)
+    share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> "SplitConfig":
+        if self.test and self.share is not None:
+            raise ValueError("name test bags or give a share, not both")
+        return self
 
 
 class IdentificationConfig(_Section):

@@ -20,7 +20,7 @@ from nlsid_core.identification import (
     identify,
     validate,
 )
-from nlsid_core.trajectory import Dataset
+from nlsid_core.trajectory import Dataset, Trajectory
 
 Progress = Callable[[str, float], None]
 
@@ -119,7 +119,10 @@ def read_split(
         max_gap=config.grid.max_gap,
         progress=lambda done, total: progress("reading bags", done / total),
     )
-    return split(_labelled(dataset, response, excitation), config.split.test)
+    labelled = _labelled(dataset, response, excitation)
+    if config.split.share is not None:
+        return cut(labelled, config.split.share)
+    return split(labelled, config.split.test)
 
 
 def _labelled(dataset: Dataset, response: SignalConfig, excitation: SignalConfig) -> Dataset:
@@ -143,6 +146,21 @@ def split(dataset: Dataset, test: Sequence[str]) -> tuple[Dataset, Dataset]:
     if len(present) == len(dataset):
         raise DataError("all of the bags are test trials; give some to train on")
     return dataset.without(present), dataset.select(present)
+
+
+def cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:
+    """(training, test): every trial's start, and the `share` of it at its end."""
+    parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
+    for trial in dataset:
+        count = round(share * len(trial.t))
+        if not 2 <= count <= len(trial.t) - 2:
+            raise DataError(
+                f"{trial.name}: {share:g} of {len(trial.t)} samples, at least 2 of each"
+            )
+        for part, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
+            y, u = trial.y[rows], trial.u[rows]
+            part.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
+    return Dataset(tuple(parts[0])), Dataset(tuple(parts[1]))
 
 
 def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:

@@ -11,6 +11,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.writer import BagWriter
 
 GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
+SNAPSHOT: Final = "snapshot"  # the custom datum of a bag of last seconds: how many of them
 SMOOTHING: Final = 0.02  # weight of the newest interval in the mean period
 
 
@@ -85,7 +86,7 @@ class Recent:
 
         definitions: of the topics' types by topic; those that are not in it have standard types.
         """
-        with BagWriter(path, custom=custom) as bag:
+        with BagWriter(path, custom={**(custom or {}), SNAPSHOT: f"{self.seconds:g} s"}) as bag:
             for topic, definition in (definitions or {}).items():
                 bag.add_topic(topic, definition.msgtype, definition=definition)
             for arrival in self._arrivals:

@@ -93,13 +93,40 @@ def test_repeats_are_the_same_signal_within_the_limits() -> None:
     assert np.ptp(inputs) > 0.3
     assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
     assert inputs[-1] == 0.0
-    [experiment] = map(json.loads, did)
-    assert (experiment["kind"], experiment["repeats"]) == ("multisine", 2)
-    assert experiment["limits"]["highest"] == 0.4
+    said = [json.loads(text) for text in did]
+    assert [(each["repeat"], each.get("ended", "")) for each in said] == [
+        (1, ""), (2, ""), (2, "done"),
+    ]  # fmt: skip
+    assert {each["repeat_group"] for each in said} == {said[0]["repeat_group"]}
+    assert said[0]["repeat_group"].startswith("/cmd_vel:twist.linear.x, multisine, sha256:")
+    assert (said[0]["kind"], said[0]["repeats"]) == ("multisine", 2)
+    assert said[0]["limits"]["highest"] == 0.4
+
+
+@pytest.mark.parametrize("kind", ["chirp", "prbs", "steps"])
+def test_every_kind_stays_within_the_limits(kind: str) -> None:
+    parameters: dict[str, object] = {
+        "kind": kind,
+        "period": 0.02,
+        "duration": 2.0,
+        "pause": 0.1,
+        "hold": 0.1,
+        "lowest_hz": 1.0,
+        "highest_hz": 4.0,
+    }
+    sent, _ = excite(parameters)
+    inputs = np.array([u for _, u in sent])
+    assert len(inputs) >= 80
+    assert -0.1 <= inputs.min() < 0.0
+    assert 0.2 < inputs.max() <= 0.4
+    assert np.abs(np.diff(inputs, prepend=0.0)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+    assert inputs[-1] == 0.0
 
 
 def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
-    sent, _ = excite({"kind": "steps", "period": 0.02, "pause": 0.0}, stop_after=1.5)
+    sent, did = excite({"kind": "steps", "period": 0.02, "pause": 0.0}, stop_after=1.5)
+    assert json.loads(did[-1])["ended"] == "stopped when asked to"
+    assert json.loads(did[-1])["repeat_group"] == "", "half a repeat is none"
     inputs = [u for _, u in sent]
     assert inputs[-1] == 0.0
     assert len(inputs) < 200

@@ -1,0 +1,121 @@
+"""Excitation, plant and recorder together: a bag per repeat, and repeats known as such."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from std_srvs.srv import Trigger
+
+from bags.signals.grid import read_dataset
+from bags.signals.reader import bag_metadata
+from nlsid_ros import qos
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+COMMAND, RESPONSE = "/cmd_vel:twist.linear.x", "/odom:twist.twist.linear.x"
+LIMITS: dict[str, object] = {"lowest": -0.3, "highest": 0.3, "slew": 5.0, "fade": 0.2}
+SIGNAL: dict[str, object] = {"period": 0.01, "duration": 2.0, "pause": 0.3, "highest_hz": 4.0}
+
+
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_domain_of_this_run(monkeypatch)
+
+
+def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repeats(
+    tmp_path: Path,
+) -> None:
+    bags = tmp_path / "trials"
+    bags.mkdir()
+    said: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        said.extend(s.message for s in message.status if s.name == "excitation")
+
+    recorded: dict[str, object] = {
+        "topics": "[/odom, /cmd_vel]",
+        "bag": bags / "trial",
+        "at_once": False,
+    }
+    excitation = LIMITS | SIGNAL | {"repeats": 3, "recorder": "trajectory_recorder"}
+    with (
+        node_here("test_operator") as (node, spin_until),
+        process("nlsid_ros.plant", kind="pendulum") as plant,
+        process("nlsid_ros.trajectory_recorder", **recorded) as recorder,
+        process("nlsid_ros.excitation", **excitation) as exciting,
+    ):
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
+        start = node.create_client(Trigger, "/excitation/start")
+        bag = node.create_client(Trigger, "/trajectory_recorder/start")
+        spin_until(lambda: start.service_is_ready() and bag.service_is_ready())
+        spin_until(lambda: node.count_subscribers("/odom") == 1)
+        spin_until(lambda: node.count_subscribers("/cmd_vel") == 2)
+        spin_until(lambda: "idle" in said)
+        answer = start.call_async(Trigger.Request())
+        spin_until(answer.done)
+        assert answer.result().success, answer.result().message
+        spin_until(lambda: "done" in said)
+        for process_ in (exciting, recorder, plant):
+            stop(process_)
+
+    trials = [bags / name for name in ("trial", "trial_2", "trial_3")]
+    assert sorted(bags.iterdir()) == trials
+    for number, trial in enumerate(trials, start=1):
+        custom = bag_metadata(trial)
+        assert json.loads(custom["experiment"])["repeat"] == number
+        assert int(custom["/cmd_vel received"]) >= 230
+        assert custom["/cmd_vel lost"] == "0"
+    data = read_dataset(
+        trials, responses=[RESPONSE], excitations=[COMMAND], period=0.01, max_gap=0.5, tolerance=0.5
+    )
+    [(group, members)] = data.repeats().items()
+    assert group.startswith("/cmd_vel:twist.linear.x, multisine, sha256:")
+    assert len(members) == 3
+    assert all(np.ptp(member.u) > 0.3 and np.ptp(member.y) > 0.01 for member in members)
+
+
+def test_without_the_recorder_it_was_told_of_nothing_moves() -> None:
+    excitation = LIMITS | SIGNAL | {"recorder": "trajectory_recorder"}
+    with (
+        node_here("test_operator") as (node, spin_until),
+        process("nlsid_ros.excitation", **excitation) as exciting,
+    ):
+        start = node.create_client(Trigger, "/excitation/start")
+        spin_until(start.service_is_ready)
+        answer = start.call_async(Trigger.Request())
+        spin_until(answer.done)
+        assert not answer.result().success
+        assert "there is no recorder trajectory_recorder" in answer.result().message
+        stop(exciting)
+
+
+def test_a_recorder_that_is_busy_stops_the_experiment_before_it_moves(tmp_path: Path) -> None:
+    said: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        said.extend(s.message for s in message.status if s.name == "excitation")
+
+    excitation = LIMITS | SIGNAL | {"recorder": "trajectory_recorder"}
+    with (
+        node_here("test_operator") as (node, spin_until),
+        process(
+            "nlsid_ros.trajectory_recorder", topics="[/odom]", bag=tmp_path / "own"
+        ) as recorder,
+        process("nlsid_ros.excitation", **excitation) as exciting,
+    ):
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
+        start = node.create_client(Trigger, "/excitation/start")
+        bag = node.create_client(Trigger, "/trajectory_recorder/start")
+        spin_until(lambda: start.service_is_ready() and bag.service_is_ready())
+        spin_until(lambda: "idle" in said)
+        answers = [start.call_async(Trigger.Request()) for _ in range(1)]
+        spin_until(answers[0].done)
+        spin_until(lambda: any("no bag from the recorder: recording" in text for text in said))
+        for process_ in (exciting, recorder):
+            stop(process_)

@@ -1,0 +1,138 @@
+"""Recorder, excitation and identifier: their lifecycles, and parameters that are refused."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rclpy.node import Node
+
+from bags.chain.shipped import config_file
+from bags.recordings.bag import Bag
+from bags.samples import f1tenth
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+NODES: dict[str, dict[str, object]] = {
+    "trajectory_recorder": {"topics": "[/joints]"},
+    "excitation": {"highest": 0.4, "slew": 1.0},
+    "model_identifier": {"bags": f"['{f1tenth()[0]}']", "config": config_file("f1tenth.yaml")},
+}
+CYCLE = (
+    (Transition.TRANSITION_CONFIGURE, State.PRIMARY_STATE_INACTIVE),
+    (Transition.TRANSITION_ACTIVATE, State.PRIMARY_STATE_ACTIVE),
+    (Transition.TRANSITION_DEACTIVATE, State.PRIMARY_STATE_INACTIVE),
+    (Transition.TRANSITION_CLEANUP, State.PRIMARY_STATE_UNCONFIGURED),
+)
+OWN = {"use_sim_time", "start_type_description_service"}  # rclpy's
+
+
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_domain_of_this_run(monkeypatch)
+
+
+def call(
+    node: Node, spin_until: Callable[[Callable[[], bool]], None], kind: type, name: str, ask: object
+) -> object:
+    client = node.create_client(kind, name)
+    spin_until(client.service_is_ready)
+    answer = client.call_async(ask)
+    spin_until(answer.done)
+    node.destroy_client(client)
+    result: object = answer.result()
+    return result
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_a_node_goes_through_its_lifecycle_twice(name: str, tmp_path: Path) -> None:
+    settings = NODES[name] | {"autostart": False}
+    if name == "trajectory_recorder":
+        settings["bag"] = tmp_path / "run"
+    if name == "model_identifier":
+        settings["out"] = tmp_path / "out"
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}", **settings) as running,
+    ):
+        for transition, state in CYCLE * 2:
+            request = ChangeState.Request(transition=Transition(id=transition))
+            done = call(node, spin_until, ChangeState, f"/{name}/change_state", request)
+            assert done.success  # type: ignore[attr-defined]
+            now = call(node, spin_until, GetState, f"/{name}/get_state", GetState.Request())
+            assert now.current_state.id == state  # type: ignore[attr-defined]
+        stop(running)
+    if name == "trajectory_recorder":
+        for bag in (tmp_path / "run", tmp_path / "run_2"):
+            with Bag(bag) as source:
+                assert source.ending is None
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_runs(
+    name: str, tmp_path: Path
+) -> None:
+    settings = NODES[name] | {"autostart": False}
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}", **settings, __ns="/robot") as running,
+    ):
+        full = f"/robot/{name}"
+        listed = call(
+            node, spin_until, ListParameters, f"{full}/list_parameters", ListParameters.Request()
+        )
+        names = [
+            each
+            for each in listed.result.names  # type: ignore[attr-defined]
+            if each not in OWN and not each.startswith("qos_overrides")
+        ]
+        assert len(names) >= 4
+        ask = DescribeParameters.Request(names=names)
+        described = call(node, spin_until, DescribeParameters, f"{full}/describe_parameters", ask)
+        for each in described.descriptors:  # type: ignore[attr-defined]
+            assert each.description, each.name
+            assert each.read_only, each.name
+            if each.type == ParameterType.PARAMETER_DOUBLE:
+                assert len(each.floating_point_range) == 1, each.name
+            if each.type == ParameterType.PARAMETER_INTEGER:
+                assert len(each.integer_range) == 1, each.name
+            value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="other")
+            change = SetParameters.Request(parameters=[Parameter(name=each.name, value=value)])
+            answer = call(node, spin_until, SetParameters, f"{full}/set_parameters", change)
+            [result] = answer.results  # type: ignore[attr-defined]
+            assert not result.successful
+            assert each.name in result.reason
+        stop(running)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("trajectory_recorder", {"split_time": -1.0}, "Min: 0.0, Max: 1000000.0, value: -1.0"),
+        ("trajectory_recorder", {"snapshot": 5}, "parameter snapshot (s kept in memory"),
+        ("excitation", {"period": 0.0}, "parameter period (s between commands)"),
+        ("excitation", {"repeats": 0}, "parameter repeats (how often it is played)"),
+        ("excitation", {"kind": "noise"}, "kind is 'noise'; it should be one of multisine"),
+        ("excitation", {"highest_hz": 1000.0}, "half the sample rate"),
+        ("excitation", {"command": "/cmd_vel:twist.speed"}, "speed"),
+        ("model_identifier", {"last": -1}, "parameter last (only the last so many of the bags"),
+        ("model_identifier", {"bags": "['']"}, "set the parameters bags and out"),
+        ("model_identifier", {"config": "nowhere.yaml", "out": "out"}, "nowhere.yaml"),
+    ],
+)
+def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
+    name: str, wrong: dict[str, object], message: str
+) -> None:
+    with process(f"nlsid_ros.{name}", **(NODES[name] | wrong)) as node:
+        output = node.communicate(timeout=20)[0]
+    assert node.returncode == 1
+    assert message in output
+    assert "Traceback" not in output
