@@ -10,11 +10,17 @@ import json
 import random
 import tempfile
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import rclpy
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from sensor_msgs.msg import JointState
 
@@ -100,10 +106,11 @@ def throughput(recorder: list[str], bag: Path, seconds: float) -> dict[str, floa
 
 
 def kills(folder: Path, count: int) -> dict[str, float]:
-    """Kill the recorder at random times; the worst time lost and the bags that are whole after
-    repair.
+    """Kill the recorder at random times: the worst time lost before repair, and how many of the
+    bags rosbags and mcap read to their ends after it, every message of them.
     """
-    rng, losses, readable = random.Random(1), [], 0
+    rng, losses = random.Random(1), []
+    by_rosbags = by_mcap = 0
     with python(*sending(1e6, 1)) as sender:
         for index in range(count):
             bag = folder / f"killed_{index}"
@@ -116,13 +123,30 @@ def kills(folder: Path, count: int) -> dict[str, float]:
                 recorder.kill()
                 killed_ns = time.time_ns()
                 recorder.wait()
+            left = read_what_is_left(file)
+            losses.append((killed_ns - header_stamp_ns(left[-1])) / 1e9)
             repair(bag)
-            with Bag(bag) as source:
-                stamps = [header_stamp_ns(m.data) for m in source.messages(TOPICS[:1])]
-            readable += bool(stamps)
-            losses.append((killed_ns - stamps[-1]) / 1e9)
+            with AnyReader([bag]) as reader:
+                by_rosbags += [bytes(data) for *_, data in reader.messages()] == left
+            with file.open("rb") as stream:
+                read = make_reader(stream, validate_crcs=True).iter_messages()
+                by_mcap += [message.data for *_, message in read] == left
         sender.kill()
-    return {"kills": count, "bags_readable": readable, "worst_loss_s": max(losses)}
+    return {
+        "kills": count,
+        "bags_read_by_rosbags": by_rosbags,
+        "bags_read_by_mcap": by_mcap,
+        "worst_loss_s": max(losses),
+    }
+
+
+def read_what_is_left(file: Path) -> list[bytes]:
+    """The messages in a file that a kill left, as mcap reads it record by record."""
+    left: list[bytes] = []
+    with file.open("rb") as stream, suppress(EndOfFile, RecordLengthLimitExceeded):
+        records = StreamReader(stream, validate_crcs=True).records
+        left.extend(record.data for record in records if isinstance(record, Message))
+    return left
 
 
 def main() -> None:

@@ -68,7 +68,7 @@ def test_before_its_repair_mcap_reads_the_complete_chunks_and_rosbags_nothing(
         kept.extend(r.data for r in StreamReader(stream).records if isinstance(r, Message))
     with pytest.raises(FileNotFoundError, match="Expected metadata file"):
         Reader(bag)
-    with pytest.raises(BagError, match="was not closed"):
+    with pytest.raises(BagError, match="truncated or unfinished"):
         Bag(bag)
     repair(bag)
     with AnyReader([bag]) as reader:

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -130,6 +131,18 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None
     assert len(kept) > 500
     lost = sent[len(kept) :]
     assert all((killed_ns - stamp_ns) / 1e9 <= 1.0 for stamp_ns in lost)
+
+    with process(RECORDER, topics=["/joints"], bag=tmp_path / "next") as recorder:
+        while not (tmp_path / "next").exists():
+            time.sleep(0.05)
+        assert recorder.poll() is None
+        output = stop(recorder)
+    assert f"{bag} was not closed; repaired, {len(kept)} messages kept" in output
+    with AnyReader([bag]) as reader:
+        assert [header_stamp_ns(bytes(data)) for *_, data in reader.messages()] == kept
+    with (bag / "killed.mcap").open("rb") as stream:
+        finished = [m.data for *_, m in make_reader(stream, validate_crcs=True).iter_messages()]
+    assert list(map(header_stamp_ns, finished)) == kept
 
 
 def test_sigterm_closes_the_bag(tmp_path: Path) -> None:
