@@ -41,14 +41,15 @@ def subscribe(
     return subscription
 
 
-def take(subscription: Subscription, callback: Received, most: int = BATCH) -> None:
-    """Call back for at most `most` of the messages that are waiting now."""
+def take(subscription: Subscription, callback: Received, most: int = BATCH) -> int:
+    """Call back for at most `most` of the messages that are waiting now; how many there were."""
     with subscription.handle:
-        for _ in range(most):
+        for count in range(most):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
-                return
+                return count
             callback(*taken)
+    return most
 
 
 @dataclass
@@ -57,8 +58,11 @@ class Source:
 
     subscription: Subscription
     lost: Any
+    incompatible: Any
     on_lost: Callable[[int], None]
+    on_incompatible: Callable[[int], None]
     callback: Received | None = None
+    begun: bool = False
 
 
 class Polled:
@@ -70,9 +74,19 @@ class Polled:
         self._sources: list[Source] = []
 
     def subscribe(
-        self, kind: Any, topic: str, profile: QoSProfile, *, on_lost: Callable[[int], None]
+        self,
+        kind: Any,
+        topic: str,
+        profile: QoSProfile,
+        *,
+        on_lost: Callable[[int], None],
+        on_incompatible: Callable[[int], None],
     ) -> Source:
-        """Subscribe to the serialised messages; `on_lost` hears how many more the DDS lost."""
+        """Subscribe to the serialised messages.
+
+        `on_lost` hears how many more of them DDS lost, `on_incompatible` how many more publishers
+        offer less than `profile` asks for.
+        """
         subscription = self._node.create_subscription(
             kind,
             topic,
@@ -82,32 +96,50 @@ class Polled:
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        kind_of_event = _rclpy.rcl_subscription_event_type_t.RCL_SUBSCRIPTION_MESSAGE_LOST
+        kinds = _rclpy.rcl_subscription_event_type_t
         with subscription.handle:
-            lost = _rclpy.EventHandle(subscription.handle, kind_of_event)
-        self._sources.append(Source(subscription, lost, on_lost))
+            lost, incompatible = (
+                _rclpy.EventHandle(subscription.handle, kind_of_event)
+                for kind_of_event in (
+                    kinds.RCL_SUBSCRIPTION_MESSAGE_LOST,
+                    kinds.RCL_SUBSCRIPTION_REQUESTED_INCOMPATIBLE_QOS,
+                )
+            )
+        self._sources.append(Source(subscription, lost, incompatible, on_lost, on_incompatible))
         return self._sources[-1]
 
     def take(self) -> None:
-        """Call back for the messages that are waiting now, and for those that were lost."""
+        """Call back for the messages that are waiting now, and for the events.
+
+        What DDS calls lost with the first messages was sent while the subscription was made.
+        """
         for source in self._sources:
+            begun, depth = source.begun, source.subscription.qos_profile.depth
             if source.callback is not None:
-                take(source.subscription, source.callback, source.subscription.qos_profile.depth)
-            with source.lost:
-                lost = source.lost.take_event()
-            if lost is not None and lost.total_count_change:
-                source.on_lost(lost.total_count_change)
+                source.begun |= take(source.subscription, source.callback, depth) > 0
+            if (count := _news(source.lost)) and begun:
+                source.on_lost(count)
+            if count := _news(source.incompatible):
+                source.on_incompatible(count)
 
     def drop(self, source: Source) -> None:
         """Unsubscribe."""
         self._sources.remove(source)
-        source.lost.destroy_when_not_in_use()
+        for event in (source.lost, source.incompatible):
+            event.destroy_when_not_in_use()
         self._node.destroy_subscription(source.subscription)
 
     def drop_all(self) -> None:
         """Unsubscribe from everything."""
         for source in list(self._sources):
             self.drop(source)
+
+
+def _news(event: Any) -> int:
+    """By how much an event's count has risen."""
+    with event:
+        taken = event.take_event()
+    return 0 if taken is None else int(taken.total_count_change)
 
 
 class _Asleep(CallbackGroup):

@@ -81,7 +81,8 @@ def _page(node: ManagedNode, made: Iterable[Any]) -> str:
             way = "publishes" if hasattr(entity, "publish") else "subscribes"
             row = (entity.topic_name, entity.msg_type, way, _describe(entity.qos_profile))
         elif hasattr(entity, "srv_name"):
-            row = (entity.srv_name, entity.srv_type, "serves", "")
+            way = "calls" if hasattr(entity, "call_async") else "serves"
+            row = (entity.srv_name, entity.srv_type, way, "")
         else:
             continue
         rows.append((row[0].replace(f"/{name}/", "~/"), _type_name(row[1]), *row[2:]))

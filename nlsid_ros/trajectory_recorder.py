@@ -11,10 +11,9 @@ lost messages, rate, jitter and gaps go to /diagnostics every second and into th
 import sys
 from collections.abc import Callable
 from datetime import datetime
-from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from std_msgs.msg import String
@@ -31,25 +30,17 @@ from nlsid_core import _json
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
-from nlsid_ros.draining import Polled, Source
+from nlsid_ros.draining import Polled, Received
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.subscribing import Listener, Subscriptions, Wanted
 from nlsid_ros.type_descriptions import TypeDescriptions
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
 POLL = 0.05  # s between taking what has arrived; waking rclpy costs as much as 100 messages
-UNASKED = {"/rosout", "/parameter_events"}  # every node has them; a pattern does not mean them
 REPORT = 1.0  # s between diagnostics
 EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said it did
-
-
-class Undefined(NamedTuple):
-    """A topic that is subscribed to, whose type's definition is being looked for."""
-
-    source: Source
-    msgtype: str
-    type_hash: str
 
 
 class TrajectoryRecorder(ManagedNode):
@@ -100,8 +91,8 @@ class TrajectoryRecorder(ManagedNode):
             "/excitation/experiment",
             "topic whose JSON goes into the bag's metadata; empty: none",
         )
-        self._topics = dict(_topic_and_type(entry) for entry in topics if entry)
-        if not self._topics:
+        self._wanted = [Wanted.parse(entry) for entry in topics if entry]
+        if not self._wanted:
             raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
         self._given = [Path(path) for path in given if path]
         self._bags = 0
@@ -113,10 +104,11 @@ class TrajectoryRecorder(ManagedNode):
                 f"compression is '{self._compression}'; it should be one of "
                 + ", ".join(COMPRESSIONS)
             )
-        if any(_is_pattern(topic) and kind for topic, kind in self._topics.items()):
-            raise DataError("a pattern cannot have a type; topics found by it have their own")
-        for msgtype in filter(None, self._topics.values()):
-            message_class(msgtype)
+        for wanted in self._wanted:
+            if wanted.is_pattern and wanted.msgtype:
+                raise DataError("a pattern cannot have a type; topics found by it have their own")
+            if wanted.msgtype:
+                message_class(wanted.msgtype)
         self._definitions = read_definitions(self._given)
         for bag in unfinished_bags(Path(self._name).parent) if self._repair else []:
             try:
@@ -128,12 +120,8 @@ class TrajectoryRecorder(ManagedNode):
 
     def start(self) -> None:
         """Subscribe to what is there already, and open a bag unless that is to wait."""
-        self._waiting = {t: kind for t, kind in self._topics.items() if not _is_pattern(t)}
-        self._expected = list(self._waiting)
-        self._patterns = [topic for topic in self._topics if _is_pattern(topic)]
-        self._undefined: dict[str, Undefined] = {}
+        self._expected: list[str] = []
         self._recorded: dict[str, Definition] = {}
-        self._refused: dict[str, str] = {}
         self._recent = Recent(self._snapshot) if self._snapshot else None
         self._snapshots = 0
         self._experiment: dict[str, str] = {}
@@ -142,11 +130,17 @@ class TrajectoryRecorder(ManagedNode):
             self._begin()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._polled = Polled(self)
-        self._types = TypeDescriptions(self, self._definitions)
+        self._topics = Subscriptions(
+            self,
+            self._polled,
+            TypeDescriptions(self, self._definitions),
+            Listener(expect=self._expect, begin=self._begin_topic, lose=self._lose),
+        )
+        self._topics.want(self._wanted)
         if self._said_by:
             self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
         self.create_timer(POLL, self._polled.take)
-        self.create_timer(DISCOVERY, self._connect)
+        self.create_timer(DISCOVERY, self._topics.look)
         self.create_timer(self._period, self._keep_up)
         self.create_timer(REPORT, self._report)
         for name, serve in (
@@ -157,7 +151,7 @@ class TrajectoryRecorder(ManagedNode):
             ("snapshot", self._on_snapshot),
         ):
             self.create_service(Trigger, f"~/{name}", _answering(serve))
-        self._connect()
+        self._topics.look()
 
     def stop(self) -> None:
         """Take what has arrived, write what came of each topic into the bag, and close it."""
@@ -186,60 +180,21 @@ class TrajectoryRecorder(ManagedNode):
         for topic, definition in self._recorded.items():
             self._recording.add_topic(topic, definition)
         self._recording.annotate(self._experiment)
-        self.get_logger().info(f"recording {', '.join(self._topics)} to {path}")
+        self.get_logger().info(
+            f"recording {', '.join(each.topic for each in self._wanted)} to {path}"
+        )
         return path
 
-    def _connect(self) -> None:
-        """Subscribe to topics that have publishers now, record those whose type is defined."""
-        self._find()
-        for topic, asked in list(self._waiting.items()):
-            publishers = self.get_publishers_info_by_topic(topic)
-            if not publishers:
-                continue
-            del self._waiting[topic]
-            msgtype = asked or publishers[0].topic_type
-            try:
-                kind = message_class(msgtype)
-            except NlsidError as error:
-                self._refuse(topic, error)
-                continue
-            profile = qos.recording_of([publisher.qos_profile for publisher in publishers])
-            source = self._polled.subscribe(
-                kind, topic, profile, on_lost=partial(self._lose, topic)
-            )
-            self._undefined[topic] = Undefined(source, msgtype, str(publishers[0].topic_type_hash))
-        for topic, found in list(self._undefined.items()):
-            try:
-                definition = self._types.find(found.msgtype, found.type_hash)
-                if definition is None:
-                    continue
-                if self._recording is not None:
-                    self._recording.add_topic(topic, definition)
-            except NlsidError as error:
-                self._polled.drop(found.source)
-                self._refuse(topic, error)
-            else:
-                self._recorded[topic] = definition
-                found.source.callback = partial(
-                    self._record, topic, definition.msgtype, definition.is_stamped
-                )
-            del self._undefined[topic]
+    def _expect(self, topic: str) -> None:
+        self._expected.append(topic)
+        if self._recording is not None:
+            self._recording.expect(topic)
 
-    def _refuse(self, topic: str, error: NlsidError) -> None:
-        self._refused[topic] = str(error)
-        self.get_logger().error(f"{topic} is not recorded: {error}")
-
-    def _find(self) -> None:
-        """Wait for topics that match a pattern too."""
-        if not self._patterns:
-            return
-        for topic, _ in self.get_topic_names_and_types():
-            known = topic in self._expected or topic in UNASKED
-            if not known and any(fnmatchcase(topic, pattern) for pattern in self._patterns):
-                self._waiting[topic] = ""
-                self._expected.append(topic)
-                if self._recording is not None:
-                    self._recording.expect(topic)
+    def _begin_topic(self, topic: str, definition: Definition) -> Received:
+        if self._recording is not None:
+            self._recording.add_topic(topic, definition)
+        self._recorded[topic] = definition
+        return partial(self._record, topic, definition.msgtype, definition.is_stamped)
 
     def _record(
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
@@ -327,11 +282,12 @@ class TrajectoryRecorder(ManagedNode):
         if recording is not None:
             values = {"bag": str(recording.bag.path)} | recording.counts()
             text = "paused" if recording.paused else "recording"
-            if warnings := recording.warnings():
+            unheard = [f"{t}: {what}" for t, what in self._topics.warnings.items()]
+            if warnings := recording.warnings() + unheard:
                 level, text = DiagnosticStatus.WARN, "; ".join(warnings)
-        if self._refused:
+        if problems := self._topics.problems:
             level = DiagnosticStatus.ERROR
-            text = "; ".join(f"{topic}: {why}" for topic, why in self._refused.items())
+            text = "; ".join(f"{topic}: {why}" for topic, why in problems.items())
         if recording is not None and recording.ended:
             level, text = DiagnosticStatus.ERROR, recording.ended
         now = self.get_clock().now().to_msg()
@@ -351,15 +307,6 @@ def _answering(
         return response
 
     return answer
-
-
-def _is_pattern(topic: str) -> bool:
-    return "*" in topic or "?" in topic
-
-
-def _topic_and_type(entry: str) -> tuple[str, str]:
-    topic, _, msgtype = entry.partition(":=")
-    return topic if topic.startswith("/") else f"/{topic}", msgtype
 
 
 def main(args: list[str] | None = None) -> None:

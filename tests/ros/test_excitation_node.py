@@ -1,6 +1,7 @@
 """The excitation node over DDS: within its limits, repeated exactly, stopped when asked."""
 
 import json
+import signal
 import time
 from pathlib import Path
 
@@ -131,6 +132,30 @@ def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
     assert inputs[-1] == 0.0
     assert len(inputs) < 200
     assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ended_by_a_signal_it_leaves_the_robot_at_rest(how: signal.Signals) -> None:
+    sent: list[float] = []
+
+    def hear(message: TwistStamped) -> None:
+        sent.append(message.twist.linear.x)
+
+    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0, "lowest": 0.3}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(EXCITATION, **(LIMITS | steps | {"rest": 0.3})) as running,
+    ):
+        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+        start = node.create_client(Trigger, "/excitation/start")
+        spin_until(start.service_is_ready)
+        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+        start.call_async(Trigger.Request())
+        spin_until(lambda: bool(sent) and sent[-1] > 0.35)
+        running.send_signal(how)
+        spin_until(lambda: running.poll() is not None and sent[-1] == 0.3)
+        assert running.returncode == 0
+    assert np.abs(np.diff(sent)).max() <= 2.0 * 0.02 * (1 + 1e-9)
 
 
 def test_a_recorded_command_is_replayed_within_the_limits() -> None:

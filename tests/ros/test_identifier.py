@@ -1,5 +1,6 @@
 """`model_identifier` over DDS: the last recordings, called off, and never in anyone's way."""
 
+import signal
 import time
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from std_srvs.srv import Trigger
 
 from bags.chain.shipped import config_file
 from bags.monitoring import documents
+from bags.samples import f1tenth
 from nlsid_core import _json
 from nlsid_core.certificate import check
 from nlsid_core.models import DifferenceEquation
@@ -118,4 +120,26 @@ def test_a_folder_without_recordings_is_named(tmp_path: Path) -> None:
         identify.call_async(Trigger.Request())
         spin_until(lambda: any("empty is not a bag and holds none" in text for text in said))
         stop(identifier)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_ended_by_a_signal_it_takes_its_worker_with_it(tmp_path: Path, how: signal.Signals) -> None:
+    settings = {
+        "bags": f"['{f1tenth()[0].parent}']",
+        "config": config_file("f1tenth.yaml"),
+        "out": tmp_path / "out",
+    }
+    with (
+        node_here("test_operator") as (node, spin_until),
+        process(IDENTIFIER, **settings) as identifier,
+    ):
+        identify = node.create_client(Trigger, "/model_identifier/identify")
+        spin_until(identify.service_is_ready)
+        answer = identify.call_async(Trigger.Request())
+        spin_until(answer.done)
+        children = Path(f"/proc/{identifier.pid}/task/{identifier.pid}/children").read_text()
+        assert children.split()
+        stop(identifier, how)
+        spin_until(lambda: not any(Path(f"/proc/{child}").exists() for child in children.split()))
     assert not (tmp_path / "out").exists()

@@ -245,6 +245,17 @@ def test_messages_that_dds_lost_are_counted(robot: Robot, tmp_path: Path) -> Non
     assert lost + received == sent + 21
 
 
+def test_a_later_publisher_that_offers_less_is_named(robot: Robot, tmp_path: Path) -> None:
+    with process(RECORDER, topics="[/joints]", bag=tmp_path / "run") as recorder:
+        robot.ready()
+        robot.publish(3)
+        hasty = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        robot.node.create_publisher(JointState, "/joints", hasty)
+        robot.spin_until(lambda: robot.has_said("/joints: 1 publishers that came later offer less"))
+        output = stop(recorder)
+    assert "/joints: 1 publishers that came later offer less" in output
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 12 MB in memory."""
