@@ -88,7 +88,7 @@ class TrajectoryRecorder(ManagedNode):
         self._said_by = declare_text(
             self,
             "experiment",
-            "/excitation/experiment",
+            "excitation/experiment",
             "topic whose JSON goes into the bag's metadata; empty: none",
         )
         self._wanted = [Wanted.parse(entry) for entry in topics if entry]

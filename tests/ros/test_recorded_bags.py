@@ -175,6 +175,35 @@ def test_a_type_nobody_describes_is_refused_by_name_and_the_others_go_on(
     assert data_by_three_readers(bag, "/joints") == [robot.sent] * 3
 
 
+@pytest.mark.parametrize("described", [True, False])
+def test_a_definition_that_is_not_the_publishers_is_not_used(
+    robot: Robot, tmp_path: Path, described: bool
+) -> None:
+    other = tmp_path / "nav_msgs" / "msg" / "Goals.msg"
+    other.parent.mkdir(parents=True)
+    other.write_text("float64 x\n")
+    settings = {
+        "topics": "[/goals]",
+        "bag": tmp_path / "run",
+        "definitions": f"[{other}]",
+        "start_type_description_service": described,
+    }
+    goals = robot.node.create_publisher(Goals, "/goals", qos.STREAM)
+    with process(RECORDER, **settings) as recorder:
+        robot.ready(goals)
+        goals.publish(Goals())
+        if described:
+            robot.spin_until(lambda: robot.received("/goals", 1))
+        else:
+            robot.spin_until(lambda: robot.has_said(f"'{GOALS}' is published with hash RIHS01_"))
+        stop(recorder)
+    with Bag(tmp_path / "run") as source:
+        assert source.count("/goals") == int(described)
+        if described:
+            _, types = source.types_on("/goals")
+            assert [name for name, _ in types.fielddefs[GOALS][1]] == ["header", "goals"]
+
+
 def test_bags_begin_and_end_when_asked_and_nothing_between_them_is_lost(
     robot: Robot, tmp_path: Path
 ) -> None:
