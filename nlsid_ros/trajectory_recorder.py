@@ -10,6 +10,7 @@ lost messages, rate, jitter and gaps go to /diagnostics every second and into th
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Recent
 from bags.signals.recording import Recording
 from nlsid_core import _json
-from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.draining import Polled, Received
@@ -201,14 +202,15 @@ class TrajectoryRecorder(ManagedNode):
     ) -> None:
         arrival_ns = info["received_timestamp"]
         stamp_ns = arrival_ns
-        if stamped and len(data) >= 12:
-            stamp_ns = header_stamp_ns(data)
+        if stamped:
+            with suppress(BagError):  # serialised by rules whose header we do not know
+                stamp_ns = header_stamp_ns(data)
         publish_ns = stamp_ns if stamp_ns >= 0 else arrival_ns
         arrival = Arrival(topic, msgtype, data, arrival_ns, publish_ns)
         if self._recent is not None:
             self._recent.add(arrival)
         if self._recording is not None:
-            self._recording.add(arrival, stamp_ns)
+            self._recording.add(arrival, stamp_ns, info["publication_sequence_number"])
 
     def _lose(self, topic: str, count: int) -> None:
         self.get_logger().warning(f"{topic}: {count} messages lost", throttle_duration_sec=REPORT)
@@ -272,7 +274,7 @@ class TrajectoryRecorder(ManagedNode):
         self._snapshots += 1
         base = self._recording.bag.path if self._recording is not None else Path(self._name or NAME)
         path = base.with_name(f"{base.name}_snapshot_{self._snapshots}")
-        count = self._recent.save(path, definitions=self._recorded, custom=self._experiment)
+        count = self._recent.save(path, definitions=self._recorded)
         return True, f"{count} messages in {path}"
 
     def _report(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bags.recordings.bag import Bag
-from bags.signals.arrivals import Arrival, Recent, Regularity
+from bags.signals.arrivals import Arrival, Recent, Regularity, Sequence
 from tests.bag_messages import CMD, CMD_TYPE, START_NS, command
 
 PERIOD_NS = 1_000_000
@@ -22,6 +22,19 @@ def test_rate_jitter_and_gaps_are_those_of_the_stamps() -> None:
     assert regularity.gaps == 3
     assert regularity.rate == pytest.approx(1000.0, rel=0.02)
     assert regularity.jitter == pytest.approx(5e-5 * 2**0.5, rel=0.3)
+
+
+def test_a_publishers_count_tells_what_is_missing_until_there_is_another_publisher() -> None:
+    sequence = Sequence()
+    for number in (7, 8, 11, 12, 20):
+        sequence.update(number)
+    assert sequence.missing == 2 + 7
+    for number in (1, 2, 4):  # it came back
+        sequence.update(number)
+    assert sequence.missing == 2 + 7 + 1
+    for number in (300, 5, 301, 6):  # another one beside it
+        sequence.update(number)
+    assert sequence.missing == 0
 
 
 def test_the_last_seconds_are_kept_and_nothing_older(tmp_path: Path) -> None:

@@ -62,6 +62,29 @@ class Regularity:
 
 
 @dataclass
+class Sequence:
+    """Messages missing from a publisher's own count of what it sent.
+
+    A count that begins anew is a publisher that came back. With several publishers on the topic, of
+    which the middleware does not say who sent what, nothing can be said: `missing` stays 0.
+    """
+
+    missing: int = 0
+    _last: int | None = None
+    _several: bool = False
+
+    def update(self, number: int) -> None:
+        """Take the next message's number."""
+        last, self._last = self._last, number
+        if last is None or self._several or number == 1:
+            return
+        if number <= last:
+            self._several, self.missing = True, 0
+            return
+        self.missing += number - last - 1
+
+
+@dataclass
 class Recent:
     """The arrivals of the last `seconds`, to be kept when something happened."""
 
@@ -75,18 +98,12 @@ class Recent:
         while self._arrivals[0].log_time_ns < oldest:
             self._arrivals.popleft()
 
-    def save(
-        self,
-        path: Path,
-        *,
-        definitions: Mapping[str, Definition] | None = None,
-        custom: Mapping[str, str] | None = None,
-    ) -> int:
+    def save(self, path: Path, *, definitions: Mapping[str, Definition] | None = None) -> int:
         """Write a bag of what is remembered; how many messages. Raises BagError if it exists.
 
         definitions: of the topics' types by topic; those that are not in it have standard types.
         """
-        with BagWriter(path, custom={**(custom or {}), SNAPSHOT: f"{self.seconds:g} s"}) as bag:
+        with BagWriter(path, custom={SNAPSHOT: f"{self.seconds:g} s"}) as bag:
             for topic, definition in (definitions or {}).items():
                 bag.add_topic(topic, definition.msgtype, definition=definition)
             for arrival in self._arrivals:

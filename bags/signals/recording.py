@@ -6,7 +6,7 @@ from typing import Final
 
 from bags.recordings.definitions import Definition
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Regularity
+from bags.signals.arrivals import Arrival, Regularity, Sequence
 
 UNFINISHED: Final = "; the bag is unfinished and will be repaired when a recorder starts beside it"
 
@@ -24,12 +24,14 @@ class Recording:
         self.paused = False
         self._least_free = least_free  # MB
         self._lost: dict[str, int] = {}
+        self._sequence: dict[str, Sequence] = {}
         self._regularity: dict[str, Regularity] = {}
         self._closed = False
 
     def expect(self, topic: str) -> None:
         """List a topic although nothing is known of it yet."""
         self._lost.setdefault(topic, 0)
+        self._sequence.setdefault(topic, Sequence())
         self._regularity.setdefault(topic, Regularity())
 
     def add_topic(self, topic: str, definition: Definition) -> None:
@@ -37,12 +39,16 @@ class Recording:
         self.expect(topic)
         self.bag.add_topic(topic, definition.msgtype, definition=definition)
 
-    def add(self, arrival: Arrival, stamp_ns: int) -> None:
-        """Take a message; `stamp_ns` is what its regularity is judged by."""
+    def add(self, arrival: Arrival, stamp_ns: int, number: int | None = None) -> None:
+        """Take a message; `stamp_ns` is what its regularity is judged by, `number` its publisher's
+        count.
+        """
         if self._closed:
             return
         topic, msgtype, data, log_ns, publish_ns = arrival
         self._regularity[topic].update(stamp_ns)
+        if number is not None:
+            self._sequence[topic].update(number)
         if self.paused:
             return
         try:
@@ -51,8 +57,8 @@ class Recording:
             self._end(str(error))
 
     def lose(self, topic: str, count: int) -> None:
-        """Count messages that the middleware lost."""
-        self._lost[topic] = self._lost.get(topic, 0) + count
+        """Count messages that the middleware says it lost."""
+        self._lost[topic] += count
 
     def annotate(self, custom: Mapping[str, str]) -> None:
         """Add to the bag's metadata."""
@@ -94,10 +100,9 @@ class Recording:
     def counts(self) -> dict[str, str]:
         """What came on each topic, in words."""
         values = {}
-        for topic, lost in self._lost.items():
-            regularity = self._regularity[topic]
+        for topic, regularity in self._regularity.items():
             values[f"{topic} received"] = str(self.bag.counts.get(topic, 0))
-            values[f"{topic} lost"] = str(lost)
+            values[f"{topic} lost"] = str(self._lost_on(topic))
             values[f"{topic} gaps"] = str(regularity.gaps)
             values[f"{topic} rate [Hz]"] = f"{regularity.rate:.4g}"
             values[f"{topic} jitter [ms]"] = f"{regularity.jitter * 1e3:.3g}"
@@ -106,11 +111,15 @@ class Recording:
     def warnings(self) -> list[str]:
         """What a person should look at."""
         silent = [topic for topic in self._lost if not self.bag.counts.get(topic)]
-        losing = [topic for topic, lost in self._lost.items() if lost]
+        losing = [topic for topic in self._lost if self._lost_on(topic)]
         return [
             *(f"nothing on {topic} yet" for topic in silent),
             *(f"messages lost on {topic}" for topic in losing),
         ]
+
+    def _lost_on(self, topic: str) -> int:
+        """By the middleware's count or by the publisher's, whichever knows of more."""
+        return max(self._lost[topic], self._sequence[topic].missing)
 
     def _end(self, why: str) -> None:
         self.ended = f"recording stopped: {why}"

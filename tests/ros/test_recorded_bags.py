@@ -274,6 +274,27 @@ def test_messages_that_dds_lost_are_counted(robot: Robot, tmp_path: Path) -> Non
     assert lost + received == sent + 21
 
 
+def test_what_overflowed_while_the_recorder_could_not_take_it_is_counted(
+    robot: Robot, tmp_path: Path
+) -> None:
+    bag = tmp_path / "run"
+    with process(RECORDER, topics="[/joints]", bag=bag) as recorder:
+        robot.ready()
+        robot.publish(10)
+        time.sleep(0.5)
+        recorder.send_signal(signal.SIGSTOP)
+        robot.publish(12_000, every=0.0)
+        recorder.send_signal(signal.SIGCONT)
+        time.sleep(0.5)
+        robot.publish(10, every=0.05)
+        robot.spin_until(lambda: robot.has_said("messages lost on /joints"))
+        stop(recorder)
+    with Bag(bag) as source:
+        lost, received = int(source.custom["/joints lost"]), source.count("/joints")
+    assert lost > 1000
+    assert lost + received == len(robot.sent)
+
+
 def test_a_later_publisher_that_offers_less_is_named(robot: Robot, tmp_path: Path) -> None:
     with process(RECORDER, topics="[/joints]", bag=tmp_path / "run") as recorder:
         robot.ready()
