@@ -53,11 +53,11 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
     """
     parsed: Typesdict = {}
     for msgtype, text in texts.items():
-        with defining(msgtype):
+        with defining(f"'{msgtype}'"):
             parsed.update(get_types_from_msg(text, msgtype))
     found = {}
     for msgtype in texts:
-        with defining(msgtype):
+        with defining(f"'{msgtype}'"):
             used = completed({msgtype: parsed[msgtype]}, parsed)
             refuse_what_code_cannot_be(used)
             types = get_typestore(Stores.EMPTY)

@@ -85,7 +85,7 @@ def ros2_definition(msgtype: str, embedded: MessageDefinition) -> MessageDefinit
     Raises BagError if it cannot be used.
     """
     standard = standard_types().fielddefs
-    with defining(msgtype):
+    with defining(f"'{msgtype}' in the bag"):
         parsed = _parse(msgtype, embedded) | {name: standard[name] for name in ROS1_DIFFERS}
         refuse_what_code_cannot_be(parsed)
         types = get_typestore(Stores.EMPTY)
@@ -105,7 +105,7 @@ def types_in_bag(msgtype: str, embedded: MessageDefinition) -> Typestore:
     if embedded.format == MessageDefinitionFormat.NONE:
         fields_of(msgtype, standard)
         return standard
-    with defining(msgtype):
+    with defining(f"'{msgtype}' in the bag"):
         parsed = completed(_parse(msgtype, embedded))
         if msgtype in parsed and all(
             name in standard.fielddefs and standard.fielddefs[name][1] == fields
@@ -125,14 +125,13 @@ def are_same(first: Typestore, second: Typestore) -> bool:
 
 
 @contextmanager
-def defining(msgtype: str) -> Iterator[None]:
-    """Turn what a definition that cannot be used raises into a BagError that names the type."""
+def defining(what: str) -> Iterator[None]:
+    """Turn what a definition that cannot be used raises into a BagError that names it."""
     try:
         yield
     except (TypesysError, ValueError, LookupError, RecursionError, SyntaxError) as error:
         raise BagError(
-            f"the definition of '{msgtype}' cannot be used: {type(error).__name__}: "
-            f"{str(error)[:200]}"
+            f"the definition of {what} cannot be used: {type(error).__name__}: {str(error)[:200]}"
         ) from error
 
 
