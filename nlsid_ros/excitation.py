@@ -58,7 +58,12 @@ class Excitation(ManagedNode):
         self._lowest_hz = number("lowest_hz", 0.1, "lowest frequency", between=(1e-6, 1e4))
         self._highest_hz = number("highest_hz", 2.0, "highest frequency", between=(1e-6, 1e4))
         self._hold = number("hold", 0.5, "s a step or a bit lasts", between=(1e-3, 1e4))
-        self._pause = number("pause", 2.0, "s of rest before each repeat", between=(0.0, 3600.0))
+        self._pause = number(
+            "pause",
+            2.0,
+            "s of rest before each repeat, and after it in its own bag",
+            between=(0.0, 3600.0),
+        )
         recorder = declare_text(
             self, "recorder", "", "node asked for a bag per repeat (at_once: false); empty: none"
         )
@@ -113,6 +118,7 @@ class Excitation(ManagedNode):
     def start(self) -> None:
         """Be ready; nothing moves before ~/start."""
         self._next: int | None = None
+        self._still = 0  # ticks until the bag of a repeat that is over is closed
         self._repeat = 0
         self._input = self._shape.rest
         self._state, self._failed, self._busy = "idle", False, False
@@ -145,6 +151,10 @@ class Excitation(ManagedNode):
         if self._next is None:
             if self._input != self._shape.rest:
                 self._to_rest()
+            if self._still:
+                self._still -= 1
+                if not self._still:
+                    self._close_bag()
             return
         self._input = float(self._once[self._next])
         self._send(self._start_ns + self._next * round(self._period * 1e9))
@@ -191,12 +201,15 @@ class Excitation(ManagedNode):
         self._say(f"repeat {self._repeat + 1} of {self._repeats}")
 
     def _end_repeat(self) -> None:
-        if self._recorder:
-            self._say(f"repeat {self._repeat + 1}: closing the bag")
-            asked = self._bags["stop"].call_async(Trigger.Request())
-            asked.add_done_callback(self._on_bag_closed)
+        if self._recorder:  # the response is heard for as long as a command may be held
+            self._still = max(1, round(self._pause / self._period))
         else:  # the next one goes on where this one ends
             self._next_repeat(self._start_ns + len(self._once) * round(self._period * 1e9))
+
+    def _close_bag(self) -> None:
+        self._say(f"repeat {self._repeat + 1}: closing the bag")
+        asked = self._bags["stop"].call_async(Trigger.Request())
+        asked.add_done_callback(self._on_bag_closed)
 
     def _on_bag_closed(self, asked: Any) -> None:
         if not asked.result().success:
@@ -215,7 +228,7 @@ class Excitation(ManagedNode):
 
     def _finish(self, state: str, *, whole: bool = True) -> None:
         """Say how it ended; a repeat that is not whole is no repeat."""
-        self._next, self._busy = None, False
+        self._next, self._still, self._busy = None, 0, False
         ended = {"ended": state} | ({} if whole else {"repeat_group": ""})
         self._experiment.publish(String(data=json.dumps(self._did | ended)))
         self._say(state)
