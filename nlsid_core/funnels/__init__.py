@@ -1,5 +1,6 @@
 """Funnels: a model and a policy in, a funnel with its proof out (thesis Part II)."""
 
+from nlsid_core.funnels.composition import compose_funnels
 from nlsid_core.funnels.discrete import TubeDesign, design_tube
 from nlsid_core.funnels.trajectory import FunnelDesign, Goal, design_funnel
 from nlsid_core.funnels.tvlqr import (
@@ -15,6 +16,7 @@ __all__ = [
     "Goal",
     "Tracking",
     "TubeDesign",
+    "compose_funnels",
     "design_funnel",
     "design_tube",
     "integrate_nominal",

@@ -29,6 +29,7 @@ from nlsid_core.funnels.sweep import Progress, sweep_rho
 from nlsid_core.funnels.tvlqr import Tracking, lyapunov, tvlqr
 
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
+START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 MARGIN = 5e-4  # of the L-steps' rate scale, in the sweep, at first
 RETRIES = 6
@@ -43,6 +44,12 @@ class Goal:
 
     centre: FloatArray
     P: FloatArray
+
+    @classmethod
+    def start_of(cls, funnel: Funnel) -> "Goal":
+        """A little less than where `funnel` starts, so that the two compose."""
+        P = START_ROOM * funnel.P[0] / funnel.rho[0]
+        return cls(funnel.x.ends()[0], np.asarray((P + P.T) / 2))
 
 
 @dataclass(frozen=True, eq=False)
