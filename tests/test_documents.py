@@ -148,7 +148,11 @@ def test_a_policy_of_every_kind_of_gain_reads_back_and_takes_many_states(
 
 def test_load_reads_whatever_the_file_declares(tmp_path: Path) -> None:
     field = VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0)
-    nouns = {"funnel": random_funnel(), "policy": random_policy("linear"), "field": field}
+    nouns: dict[str, Any] = {
+        "funnel": random_funnel(),
+        "policy": random_policy("linear"),
+        "field": field,
+    }
     for name, noun in (nouns | discrete_documents()).items():
         _json.write_document(tmp_path / name, noun.document())
         again = load(tmp_path / name)

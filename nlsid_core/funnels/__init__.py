@@ -2,7 +2,9 @@
 
 from nlsid_core.funnels.composition import compose_funnels
 from nlsid_core.funnels.discrete import TubeDesign, design_tube
-from nlsid_core.funnels.trajectory import FunnelDesign, Goal, design_funnel
+from nlsid_core.funnels.sampled import Sampled, sample_funnel
+from nlsid_core.funnels.setting import Goal
+from nlsid_core.funnels.trajectory import FunnelDesign, design_funnel
 from nlsid_core.funnels.tvlqr import (
     Tracking,
     integrate_nominal,
@@ -14,6 +16,7 @@ from nlsid_core.funnels.tvlqr import (
 __all__ = [
     "FunnelDesign",
     "Goal",
+    "Sampled",
     "Tracking",
     "TubeDesign",
     "compose_funnels",
@@ -22,5 +25,6 @@ __all__ = [
     "integrate_nominal",
     "lyapunov",
     "nominal_through",
+    "sample_funnel",
     "tvlqr",
 ]

@@ -4,6 +4,7 @@ Source: thesis Section 5.1.3.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from nlsid_core import _json
@@ -32,8 +33,8 @@ def compose_funnels(proofs: Sequence[Path | str], folder: Path | str) -> Path:
     if len(proofs) < 2:
         raise DataError(f"a composition needs two or more funnels, got {len(proofs)}")
     stages = [_Stage.read(i, Path(path)) for i, path in enumerate(proofs, start=1)]
-    multipliers = [_multiplier(i, *pair) for i, pair in
-                   enumerate(zip(stages[:-1], stages[1:], strict=True), start=1)]  # fmt: skip
+    steps = enumerate(pairwise(stages), start=1)
+    multipliers = [_multiplier(i, before, after) for i, (before, after) in steps]
     about = {}
     folder = Path(folder)
     for stage in stages:

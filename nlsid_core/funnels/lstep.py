@@ -57,10 +57,12 @@ def section_at(field: VectorField, policy: Policy, P: FloatArray, k: int, s: flo
     )
 
 
-def sections(field: VectorField, policy: Policy, P: FloatArray) -> list[tuple[Section, Section]]:
-    """The start and the end of every interval, each seen from inside it."""
+def sections(
+    field: VectorField, policy: Policy, P: FloatArray, *, count: int = 2
+) -> list[list[Section]]:
+    """`count` equally spaced instants of every interval, its ends included, seen from inside it."""
     return [
-        (section_at(field, policy, P, k, 0.0), section_at(field, policy, P, k, 1.0))
+        [section_at(field, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
         for k in range(len(policy.t) - 1)
     ]
 

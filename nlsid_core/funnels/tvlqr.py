@@ -53,9 +53,9 @@ def tvlqr(
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
-    Q = _definite(Q, field.n, "Q", strict=False)
-    R = _definite(R, field.m, "R", strict=True)
-    S_final = _definite(S_final, field.n, "S_final", strict=True)
+    Q = definite(Q, field.n, "Q", strict=False)
+    R = definite(R, field.m, "R", strict=True)
+    S_final = definite(S_final, field.n, "S_final", strict=True)
     if gain not in GAINS:
         raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
     R_inverse = np.linalg.inv(R)
@@ -87,8 +87,8 @@ def tvlqr(
 
 def lyapunov(field: VectorField, policy: Policy, *, Q: ArrayLike, P_final: ArrayLike) -> FloatArray:
     """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
-    Q = _definite(Q, field.n, "Q", strict=False)
-    P_final = _definite(P_final, field.n, "P_final", strict=True)
+    Q = definite(Q, field.n, "Q", strict=False)
+    P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
 
     def rate(t: float, P: FloatArray) -> FloatArray:
@@ -198,7 +198,8 @@ def _backward(
     return np.asarray((S + S.transpose(0, 2, 1)) / 2)
 
 
-def _definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
+def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
+    """M as a symmetric (n, n) array; DataError unless it is one, ⪰ 0 or, if strict, ≻ 0."""
     M = np.asarray(M, dtype=np.float64)
     if (
         M.shape != (n, n)
