@@ -62,7 +62,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     assert proved.unproved
     # What was proved of it, written as if it were all there is to prove.
     forged = FunnelDesign(field, setting.policy, found.funnel, setting.goal, 0.995, proved, ())
-    with pytest.raises(CertificateRejected, match="missing|no pieces"):
+    with pytest.raises(CertificateRejected, match=r"missing|no pieces"):
         check(forged.save(tmp_path)[-1])
 
 
@@ -71,7 +71,7 @@ def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> 
         sample_funnel(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1)), samples=3)
     sampled = sample_funnel(*hanging(), goal=GOAL)
     proved = design_funnel(*hanging(), goal=GOAL)
-    assert 1 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
+    assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
 
 
 def test_a_sample_at_one_end_only_is_refused() -> None:

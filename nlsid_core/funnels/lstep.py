@@ -15,7 +15,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.funnels.line import LineProgram
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
-MAX_DEGREE = 3  # of f: then Ẇ has degree 4, as much as the sphere program's squares
+MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,8 @@ class LSteps:
         if field.degree > MAX_DEGREE:
             raise DataError(
                 f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
-                "take a Taylor polynomial, and its remainder as an uncertain w"
+                "take a Taylor polynomial of lower degree, and its remainder as an uncertain w "
+                "with bounds"
             )
         self.field = field
         self.tolerance = tolerance
@@ -148,10 +149,14 @@ class LSteps:
 
 
 def sphere_program(field: VectorField) -> SphereProgram | LineProgram:
-    """The program for this field: nonlinear states last, degree 2 only where they occur."""
+    """The program for this field: squares of half the degree of Ẇ.
+
+    Up to degree 3, nonlinear states come last, and degree 2 only where they occur.
+    """
     n, count = field.n, len(field.nonlinear_states)
+    half = max(2, (field.degree + 2) // 2)
     if n == 1:
-        return LineProgram()
-    if count in (0, n):
-        return SphereProgram(n)
+        return LineProgram(half=half)
+    if half > 2 or count in (0, n):
+        return SphereProgram(n, half=half)
     return SphereProgram(n, tuple(range(n - count, n)))

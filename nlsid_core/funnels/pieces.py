@@ -1,7 +1,7 @@
 """From L-steps at the ends of pieces of time to a proof for every instant between them.
 
 The margin m of each L-step is turned into a strictly positive definite Gram matrix,
-m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)¾(1 + ½|z_nl|²), so that in between there is room. The checker
+m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)ν, so that in between there is room. The checker
 decides; a piece it does not prove is halved, with a new L-step in its middle.
 """
 
@@ -22,7 +22,7 @@ from nlsid_core.funnels.line import LineProgram
 from nlsid_core.funnels.lstep import LSteps, section_at
 from nlsid_core.funnels.sweep import Ends
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution, multinomials
 
 MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
 
@@ -122,7 +122,7 @@ def _pieces(
 ) -> Pieces:
     """The pieces of the proof for these parts, part by part, vertex by vertex."""
     n, program, vertices = funnel.n, steps.program, len(steps.vertices)
-    basis = with_one(program)
+    basis = proof_basis(program)
     triangle = np.triu_indices(len(basis))
     frames, mus, grams = [], [], []
     for end in (0, 1):
@@ -155,7 +155,7 @@ def _pieces(
     for b in range(len(A)):
         M = substitution(basis, A[b])
         grams[1][b] = M.T @ grams[1][b] @ M
-        full = monomials(n, [0, 1, 2])
+        full = monomials(n, Pieces.multiplier_degrees(basis))
         mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
     both = np.stack(grams, axis=1)
     return replace(
@@ -166,9 +166,20 @@ def _pieces(
     )
 
 
-def with_one(program: SphereProgram | LineProgram) -> IntArray:
-    """The program's basis with 1 in front."""
+def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
+    """1 and the program's basis; with half = 3 every monomial up to degree 3.
+
+    Off the sphere degrees 0 to 2·half have to be products of the basis, each of them.
+    """
+    if program.half > 2:
+        return np.vstack([monomials_of(program.n, q) for q in range(program.half + 1)])
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
+
+
+def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
+    """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
+    squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
+    return np.r_[0.25, 0.75 * squares]
 
 
 def draft(
@@ -179,7 +190,7 @@ def draft(
     kappa: FloatArray | None = None,
 ) -> Pieces:
     """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
-    basis, count = with_one(program), len(parts) * vertices
+    basis, count = proof_basis(program), len(parts) * vertices
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
     repeated = np.repeat(whole, vertices, axis=0)
     return Pieces(
@@ -209,10 +220,11 @@ def end_proof(
     constant: the share of m that stays a constant; the rest makes Q positive definite.
     """
     n = program.n
-    basis = with_one(program)
+    basis = proof_basis(program)
     Q = np.zeros((len(basis), len(basis)))
-    Q[1:, 1:] = program.gram(solution) * scale
-    spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
+    home = positions(program.basis, basis)
+    Q[np.ix_(home, home)] = program.gram(solution) * scale
+    spread = (1 - constant) * _spread(program, basis)
     spread[0] += constant
     Q[np.diag_indices(len(basis))] += scale * m * spread
     linear = np.array([j not in program.chosen for j in range(n)])
@@ -220,48 +232,58 @@ def end_proof(
     for j in np.flatnonzero(linear).tolist():
         place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
         Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
-    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below.
-    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in range(5)])
-    rows = np.concatenate([monomials_of(n, q) for q in range(5)])
+    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below: μ_q = d_q + |z|²μ_(q-2).
+    degrees = range(2 * program.half + 1)
+    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in degrees])
+    rows = np.concatenate([monomials_of(n, q) for q in degrees])
     pairs = positions((basis[:, None] + basis[None]).reshape(-1, n), rows)
     difference = np.bincount(pairs, Q.ravel(), len(rows)) - offset
-    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in range(5)])
+    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in degrees])
     squares = positions(2 * np.eye(n, dtype=np.int64), monomials_of(n, 2))
-    mu = [difference[starts[q] : starts[q + 1]] for q in range(3)]
-    mu[2] = mu[2] + mu[0][0] * np.isin(np.arange(len(mu[2])), squares)
+    mu: list[FloatArray] = []
+    for q in Pieces.multiplier_degrees(basis):
+        part = difference[starts[q] : starts[q + 1]]
+        if q >= 2:
+            homes = product_table(n, 2, q - 2)[squares]
+            lower = np.broadcast_to(mu[q - 2], homes.shape)
+            part = part + np.bincount(homes.ravel(), lower.ravel(), len(part))
+        mu.append(part)
     # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
     # with |z|² would put where the Gram matrix has no place for it.
-    for q in (1, 2):
+    for q in range(1, len(mu)):
         mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
     return Q, np.concatenate(mu)
 
 
 def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
-    """M with v(Az) = M v(z), v the monomials `rows` (k, n), of degree 2 at most.
+    """M with v(Az) = M v(z), v the monomials `rows` (k, n).
 
     Monomials that are not among the rows are dropped: with A triangular in the order of the
     nonlinear variables their coefficients are zero.
     """
-    n, k = len(A), len(rows)
-    places = {row.tobytes(): i for i, row in enumerate(rows)}
-    table = product_table(n, 1, 1)
-    second = monomials_of(n, 2)
-    M = np.zeros((k, k))
-    for i, row in enumerate(rows):
-        factors = np.repeat(np.arange(n), row)
-        if len(factors) == 0:
-            M[i, i] = 1.0
-        elif len(factors) == 1:
-            for j in range(n):
-                unit = np.eye(n, dtype=np.int64)[j].tobytes()
-                if unit in places:
-                    M[i, places[unit]] = A[factors[0], j]
-        else:
-            products = np.outer(A[factors[0]], A[factors[1]])
-            values = np.bincount(table.ravel(), products.ravel(), len(second))
-            for value, monomial in zip(values, second, strict=True):
-                if monomial.tobytes() in places:
-                    M[i, places[monomial.tobytes()]] = value
+    n = len(A)
+    homes = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
+    forms = np.zeros((n, n))
+    forms[:, homes] = A
+    powers: dict[tuple[int, ...], FloatArray] = {(0,) * n: np.ones(1)}
+
+    def power(exponent: tuple[int, ...]) -> FloatArray:
+        if exponent not in powers:
+            last = max(j for j, e in enumerate(exponent) if e)
+            lower = power(tuple(e - (j == last) for j, e in enumerate(exponent)))
+            table = product_table(n, 1, sum(exponent) - 1)
+            products = np.outer(forms[last], lower)
+            size = len(monomials_of(n, sum(exponent)))
+            powers[exponent] = np.bincount(table.ravel(), products.ravel(), size)
+        return powers[exponent]
+
+    M = np.zeros((len(rows), len(rows)))
+    degree = rows.sum(axis=1)
+    for q in np.unique(degree).tolist():
+        among = np.flatnonzero(degree == q)
+        columns = positions(rows[among], monomials_of(n, q))
+        for i in among.tolist():
+            M[i, among] = power(tuple(rows[i].tolist()))[columns]
     return M
 
 

@@ -16,8 +16,6 @@ from nlsid_core.funnels.lstep import sections
 from nlsid_core.funnels.setting import Goal, prepare
 from nlsid_core.funnels.sweep import Progress, sweep_rho
 
-MARGIN = 5e-5  # of the rate scale: what L-steps solved to 1e-5 of it can tell from zero
-
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
@@ -55,7 +53,7 @@ def sample_funnel(
     setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
     steps, policy = setting.steps, setting.policy
     instants = sections(steps.field, policy, setting.P, count=samples)
-    margin = MARGIN * setting.rate(setting.rho_final)
+    margin = setting.margin(setting.rho_final)
     rho, _ = sweep_rho(
         steps, instants, margin=margin, rho_final=setting.rho_final, progress=progress
     )

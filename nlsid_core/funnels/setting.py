@@ -20,6 +20,7 @@ from nlsid_core.funnels.tvlqr import Tracking, definite, lyapunov, tvlqr
 
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
+MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 
 
@@ -47,10 +48,10 @@ class Setting:
     rho_final: float
     goal: Goal
 
-    def rate(self, rho: float) -> float:
-        """How fast V changes on the boundary at the end, in 1/s: the scale of a margin."""
+    def margin(self, rho: float) -> float:
+        """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
         end = section_at(self.steps.field, self.policy, self.P, len(self.policy.t) - 2, 1.0)
-        return float(np.abs(self.steps.values(end, rho, 0)).mean())
+        return MARGIN * float(np.abs(self.steps.values(end, rho, 0)).mean())
 
 
 def prepare(

@@ -35,7 +35,6 @@ from nlsid_core.funnels.pieces import Proved, prove_pieces, unsolved
 from nlsid_core.funnels.setting import Goal, Setting, prepare, refuse_first
 from nlsid_core.funnels.sweep import Ends, Progress, sweep_rho
 
-MARGIN = 5e-4  # of the L-steps' rate scale, in the search, at first
 RETRIES = 6
 GROWTH = 4.0  # of the margin, where some piece is not proved
 CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
@@ -240,7 +239,7 @@ def _proved(
     """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
     steps, policy = setting.steps, setting.policy
     digest = _json.digest(policy.document())
-    margin = MARGIN * setting.rate(rho_final)
+    margin = setting.margin(rho_final)
     proved: Proved | None = None
     for _ in range(RETRIES):
         rho, ends = search(margin)
