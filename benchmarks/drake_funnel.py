@@ -10,10 +10,12 @@ proves for every t, and how long that takes, is printed beside them.
 
 import argparse
 import dataclasses
+import importlib.util
 import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"):
@@ -42,9 +44,8 @@ class DrakeAlternation:
     """The thesis's alternation for ρ(t) with Drake's symbolic programs and its Clarabel."""
 
     def __init__(self, motion: satellite.Nominal, limit: float) -> None:
-        from pydrake import solvers, symbolic
-
-        self.solvers, self.symbolic = solvers, symbolic
+        self.solvers: Any = importlib.import_module("pydrake.solvers")
+        self.symbolic: Any = importlib.import_module("pydrake.symbolic")
         self.motion, self.steps = motion, satellite.l_steps(motion)
         self.rho: FloatArray = np.exp(-satellite.DECAY * (1 - motion.t / motion.t[-1]))
         self.started, self.limit = time.perf_counter(), limit
@@ -174,11 +175,15 @@ class DrakeAlternation:
 def run(limit: float) -> dict[str, Any]:
     """Ours, proved and sampled, then Drake's."""
     field, nominal, weights = problem()
+    goal = goal_matrix()
+    searches: dict[str, Callable[[], Any]] = {
+        "proved": lambda: design_funnel(field, nominal, goal=goal, **weights),
+        "sampled": lambda: sample_funnel(field, nominal, goal=goal, samples=SAMPLES, **weights),
+    }
     timed = {}
-    for name, verb, options in (("proved", design_funnel, {}),
-                                ("sampled", sample_funnel, {"samples": SAMPLES})):  # fmt: skip
+    for name, search in searches.items():
         started = time.perf_counter()
-        found: Any = verb(field, nominal, goal=goal_matrix(), **weights, **options)  # type: ignore[operator]
+        found = search()
         timed[f"{name}_seconds"] = time.perf_counter() - started
         timed[f"{name}_volume"] = found.funnel.volume_integral()
     theirs = DrakeAlternation(satellite.nominal(), limit).run()
@@ -196,9 +201,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--limit", type=float, default=LIMIT, help="of Drake's time, in s")
     arguments = parser.parse_args()
-    try:
-        import pydrake  # noqa: F401
-    except ImportError:
+    if importlib.util.find_spec("pydrake") is None:
         sys.exit("Drake is not installed: pip install 'nlsid[bench]'")
     result = run(arguments.limit)
     print(f"satellite, 49 knots, {SAMPLES} samples an interval; {describe()}")

@@ -92,7 +92,7 @@ def test_the_sphere_program_of_degree_six_agrees_with_sums_of_squares(n: int) ->
     literal = solve(Program(names, (SumOfSquares(g - m, modulo=sphere),), maximise=m))
     assert found.m == pytest.approx(literal.objective, abs=1e-5)
     cloud = rng.normal(size=(20_000, n))
-    lowest = g(cloud / np.linalg.norm(cloud, axis=1)[:, None]).min()
+    lowest = float(np.min(g(cloud / np.linalg.norm(cloud, axis=1)[:, None])))
     assert found.m <= lowest + 1e-9
     with pytest.raises(ShapeError):
         sphere_proof(program, found, g)
@@ -101,4 +101,4 @@ def test_the_sphere_program_of_degree_six_agrees_with_sums_of_squares(n: int) ->
 def test_a_sphere_program_of_no_use_is_refused() -> None:
     for arguments in ({"half": 4}, {"half": 3, "nonlinear": (1,)}):
         with pytest.raises(DataError, match="half = "):
-            SphereProgram(2, **arguments)  # type: ignore[arg-type]
+            SphereProgram(2, **arguments)

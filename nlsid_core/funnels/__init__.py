@@ -2,6 +2,7 @@
 
 from nlsid_core.funnels.composition import compose_funnels
 from nlsid_core.funnels.discrete import TubeDesign, design_tube
+from nlsid_core.funnels.riccati import Feedback, discrete_tvlqr
 from nlsid_core.funnels.sampled import Sampled, sample_funnel
 from nlsid_core.funnels.setting import Goal
 from nlsid_core.funnels.trajectory import FunnelDesign, design_funnel
@@ -14,6 +15,7 @@ from nlsid_core.funnels.tvlqr import (
 )
 
 __all__ = [
+    "Feedback",
     "FunnelDesign",
     "Goal",
     "Sampled",
@@ -22,6 +24,7 @@ __all__ = [
     "compose_funnels",
     "design_funnel",
     "design_tube",
+    "discrete_tvlqr",
     "integrate_nominal",
     "lyapunov",
     "nominal_through",

@@ -179,7 +179,7 @@ def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
 def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
     """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
     squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
-    return np.r_[0.25, 0.75 * squares]
+    return np.concatenate([[0.25], 0.75 * squares])
 
 
 def draft(

@@ -63,7 +63,8 @@ class SphereProgram:
 
     n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
     are kept only if they contain one of them (default: all). half: of the degree of g, 2 or 3; 3
-    takes all variables as nonlinear. basis: (k, n) exponents of v, degree 1 first; weight: (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
+    takes all variables as nonlinear. basis: (k, n) exponents of v, lower degree first; weight:
+    (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
     points: (N, n) where g has to be evaluated.
 
     Raises DataError if there is no nonlinear variable, n < 2, or half is neither 2 nor 3.
