@@ -61,7 +61,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
     proved = prove_pieces(setting.steps, setting.policy, found.funnel)
     assert proved.unproved
     # What was proved of it, written as if it were all there is to prove.
-    forged = FunnelDesign(field, setting.policy, found.funnel, setting.goal, 0.995, proved, ())
+    forged = FunnelDesign(*parts, setting.goal, 0.995, proved, setting.first_guess(), ())
     with pytest.raises(CertificateRejected, match=r"missing|no pieces"):
         check(forged.save(tmp_path)[-1])
 

@@ -21,6 +21,7 @@ from nlsid_core.funnels.tvlqr import Tracking, definite, lyapunov, tvlqr
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
+DECAY = 3.0  # c of the thesis's first guess for the satellite
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 
 
@@ -47,6 +48,12 @@ class Setting:
     P: FloatArray
     rho_final: float
     goal: Goal
+
+    def first_guess(self) -> Funnel:
+        """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
+        t = self.policy.t
+        rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
+        return Funnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
 
     def margin(self, rho: float) -> float:
         """What a search leaves at first of the rate at which V changes at the end, in 1/s."""

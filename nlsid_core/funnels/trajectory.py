@@ -47,8 +47,9 @@ SEARCHES = ("sweep", "alternation")
 class FunnelDesign:
     """A funnel that is proved for every t, its policy, and how it was found.
 
-    margins: (pieces,) proved lower bounds of -V̇ on the boundary, in 1/s. history: (what, ∫ volume
-    dt). seconds: wall clock of each stage.
+    proved.margins: (pieces,) lower bounds of -V̇ on the boundary, in 1/s. first: a first guess to
+    compare with, of which nothing is proved. history: (what, ∫ volume dt). seconds: wall clock of
+    each stage.
     """
 
     field: VectorField
@@ -57,6 +58,7 @@ class FunnelDesign:
     goal: Goal
     goal_multiplier: float
     proved: Proved
+    first: Funnel
     history: tuple[tuple[str, float], ...]
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
@@ -169,7 +171,15 @@ def design_funnel(
     except CertificateRejected as refusal:
         raise Infeasible(f"{refusal}: choose another goal") from refusal
     return FunnelDesign(
-        steps.field, policy, funnel, target, multiplier, proved, tuple(history), seconds
+        field=steps.field,
+        policy=policy,
+        funnel=funnel,
+        goal=target,
+        goal_multiplier=multiplier,
+        proved=proved,
+        first=setting.first_guess(),
+        history=tuple(history),
+        seconds=seconds,
     )
 
 
