@@ -18,7 +18,10 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
-    """What `design_funnel` needs. Q: (n, n), R: (m, m); shape: "rho" or "P"."""
+    """What `design_funnel` takes, in its words. Q: (n, n), R: (m, m), rho: (K,) or none.
+
+    In a file, search, objective and rho may be left out.
+    """
 
     field: VectorField
     nominal: Nominal
@@ -27,6 +30,9 @@ class FunnelProblem:
     goal: Goal | None = None
     shape: str = "rho"
     gain: str = "constant"
+    search: str = "sweep"
+    objective: str = "volume"
+    rho: FloatArray | None = None
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -36,6 +42,9 @@ class FunnelProblem:
             "version": VERSION,
             "shape": self.shape,
             "gain": self.gain,
+            "search": self.search,
+            "objective": self.objective,
+            "rho": None if self.rho is None else self.rho.tolist(),
             "vector_field": self.field.document(),
             "nominal": {
                 "t": self.nominal.t.tolist(),
@@ -70,6 +79,11 @@ class FunnelProblem:
             _goal(document, field.n, source),
             _json.member(document, "shape", str, source=source),
             _json.member(document, "gain", str, source=source),
+            _json.member({"search": "sweep"} | document, "search", str, source=source),
+            _json.member({"objective": "volume"} | document, "objective", str, source=source),
+            None
+            if document.get("rho") is None
+            else _json.array(document, "rho", (None,), source=source),
         )
 
     def design(self, progress: Progress | None = None) -> FunnelDesign:
@@ -80,6 +94,9 @@ class FunnelProblem:
             goal=self.goal,
             shape=self.shape,
             gain=self.gain,
+            search=self.search,
+            objective=self.objective,
+            rho=self.rho,
             Q=self.Q,
             R=self.R,
             progress=progress,

@@ -1,6 +1,7 @@
 """Pictures of funnels around trajectories (extra `report`: matplotlib)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,7 +31,7 @@ def funnel_picture(design: FunnelDesign) -> Figure:
     """
     funnel = design.funnel
     figure = Figure(figsize=(12, 7), layout="constrained")
-    rows = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    rows: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))
     pairs = state_pairs(funnel.n)
     over_time = range(min(funnel.n, PROJECTIONS - len(pairs)))
     panels = np.atleast_1d(rows[0].subplots(1, len(pairs) + len(over_time)))

@@ -106,6 +106,7 @@ def alternate_rho(
     *,
     margin: float = 0.0,
     stop: float = STOP,
+    iterations: int = MAX_ITERATIONS,
     executor: Executor | None = None,
 ) -> Sampled:
     """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f) and, where the start has it, a margin in 1/s.
@@ -114,7 +115,7 @@ def alternate_rho(
     at both ends of an interval the constraint is an interval of ρ that contains the present one.
     """
     volumes = [funnel.volume_integral()]
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(iterations):
         ends = solve_ends(steps, policy, funnel, executor=executor)
         forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
         rho = funnel.rho.copy()
