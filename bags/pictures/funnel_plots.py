@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, png
 from nlsid_core import _json
+from nlsid_core._types import FloatArray
 from nlsid_core.continuous import Funnel
 from nlsid_core.funnels import FunnelDesign, Goal
 
@@ -140,7 +141,7 @@ def _margin(axes: Axes, design: FunnelDesign) -> None:
     axes.set_ylabel("certified -dV/dt on the boundary [1/s]")
 
 
-def _half_widths(funnel: Funnel, times: np.ndarray) -> np.ndarray:
+def _half_widths(funnel: Funnel, times: FloatArray) -> FloatArray:
     """(times, n) the largest |x_i - x0_i| in the tube."""
     shapes = np.array([funnel.shape(float(t)) for t in times])
-    return np.sqrt(np.diagonal(np.linalg.inv(shapes), axis1=1, axis2=2))
+    return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(shapes), axis1=1, axis2=2)))

@@ -274,7 +274,8 @@ def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
             table = product_table(n, 1, sum(exponent) - 1)
             products = np.outer(forms[last], lower)
             size = len(monomials_of(n, sum(exponent)))
-            powers[exponent] = np.bincount(table.ravel(), products.ravel(), size)
+            sums = np.bincount(table.ravel(), products.ravel(), size)
+            powers[exponent] = sums.astype(np.float64)
         return powers[exponent]
 
     M = np.zeros((len(rows), len(rows)))
