@@ -85,7 +85,7 @@ class DrakeAlternation:
         gamma = program.NewContinuousVariables(1, "gamma")[0]
         mu = program.NewFreePolynomial(every, 2)
         g = self._polynomial(self._terms(i), z)
-        sphere = self.symbolic.Polynomial(1 - z.dot(z), every)
+        sphere = self.symbolic.Polynomial(1 - sum(v * v for v in z), every)
         bound = self.symbolic.Polynomial(self.symbolic.Expression(gamma), every)
         program.AddSosConstraint(g - bound + mu * sphere, self.symbolic.MonomialBasis(every, 2))
         program.AddLinearCost(-gamma)
@@ -125,7 +125,7 @@ class DrakeAlternation:
                     terms[raised] = terms.get(raised, 0.0) - value
             program.AddSosConstraint(self._polynomial(terms, z), basis)
         program.AddLinearConstraint(rho[-1] == 1.0)
-        program.AddLinearCost(-rho.sum())
+        program.AddLinearCost(-sum(rho))
         result = self._solve(program)
         found = np.asarray(result.GetSolution(rho))
         if not result.is_success() and not np.isfinite(found).all():
