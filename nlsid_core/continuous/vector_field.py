@@ -32,7 +32,7 @@ class VectorField:
     bounds of w, which may vary arbitrarily in time within its box: bounded disturbances and
     uncertain parameters; w has to enter with degree at most one in each entry. valid: (D, 3) rows
     (j, low, high): the equations describe the system only where entry j of (x, u) is within; a
-    proved funnel stays there.
+    proved funnel stays there. Rows (j, low, high, span), (D, 4), hold in that time span only.
 
     Raises ShapeError or DataError on equations that do not fit.
     """
@@ -60,9 +60,19 @@ class VectorField:
             raise DataError(f"breaks should be increasing times, are {breaks}")
         names = ("t", *variable_names(self.n, self.m, len(bounds)))
         object.__setattr__(self, "names", names)
-        valid = np.array(self.valid, dtype=np.float64).reshape(-1, 3)
-        if not (np.isfinite(valid).all() and np.isin(valid[:, 0], range(self.n + self.m)).all()):
-            raise DataError(f"rows of valid should be (entry of (x, u), low, high), are {valid}")
+        valid = np.array(self.valid, dtype=np.float64)
+        if valid.size == 0:
+            valid = np.zeros((0, 3))
+        sound = valid.ndim == 2 and valid.shape[1] in (3, 4) and np.isfinite(valid).all()
+        if not (
+            sound
+            and np.isin(valid[:, 0], range(self.n + self.m)).all()
+            and np.isin(valid[:, 3:], range(len(self.pieces))).all()
+        ):
+            raise DataError(
+                "rows of valid should be (entry of (x, u), low, high), and the span where only "
+                f"one is meant; they are {valid.tolist()}"
+            )
         if not self.pieces or len(self.pieces) != len(breaks) + 1:
             raise ShapeError(f"{len(self.pieces)} sets of equations for {len(breaks)} breaks")
         pieces = []
@@ -185,6 +195,11 @@ class VectorField:
         """The index of the equations that hold from time t on."""
         return int(np.searchsorted(self.breaks, t, side="right"))
 
+    def validity(self, span: int) -> list[tuple[int, float, float]]:
+        """(entry of (x, u), low, high) for every bound that holds in this span."""
+        rows = self.valid[(self.valid[:, 3:] == span).all(axis=1)]
+        return [(int(j), low, high) for j, low, high in rows[:, :3].tolist()]
+
     def __call__(
         self,
         t: float,
@@ -255,7 +270,7 @@ class VectorField:
             pieces.append(tuple(read))
         breaks = _json.array(document, "breaks", (None,), source=source)
         rows = _json.member(document, "valid", list, source=source)
-        valid = _json.array(document, "valid", (len(rows), 3), source=source)
+        valid = _json.array(document, "valid", (len(rows), None), source=source)
         return cls(tuple(pieces), n, m, breaks, bounds, valid)
 
 

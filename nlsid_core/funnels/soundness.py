@@ -133,7 +133,9 @@ def follow(
     worst = np.zeros(len(X))
 
     def rate(s: float, states: FloatArray, w: FloatArray) -> FloatArray:
-        inputs = bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T
+        inputs = policy.clipped(
+            bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T
+        )
         when = float(t + s * (funnel.t[k + 1] - t))
         return dynamics(when, states, inputs, w, span=span)
 

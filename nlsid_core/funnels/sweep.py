@@ -16,6 +16,7 @@ from nlsid_core.sos.sphere import SphereSolution
 
 ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
 MAX_TRIES = 12
+NEAR = 1.01  # of a feasible ρ: closer to the largest is not worth another program
 LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
 
 Progress = Callable[[str, float], None]
@@ -79,6 +80,7 @@ def _largest(
 
     feasible, infeasible = 0.0, np.inf
     best: list[SphereSolution] | None = None
+    estimated = len(steps.limits) > 0  # then `predicted` may be too low, and more be possible
     for _ in range(MAX_TRIES):
         if cap <= LOWEST * after:
             break
@@ -90,8 +92,14 @@ def _largest(
         found = steps.solve(section, rho, duals)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
-            return rho, found
-        infeasible = min(infeasible, rho)
+            if not estimated or rho >= cap:
+                return rho, found
+            done = rho <= NEAR * feasible
+            feasible, best = rho, found
+            if done:
+                break
+        else:
+            infeasible = min(infeasible, rho)
         duals = found
     if best is None:
         raise Infeasible(

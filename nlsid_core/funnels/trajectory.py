@@ -111,6 +111,7 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
+    limits: ArrayLike | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
@@ -121,7 +122,8 @@ def design_funnel(
     the end. policy: default a time-varying LQR with Q and R (default identities), and P(t) its
     cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. shape "rho": P fixed,
     ρ(t) is swept backward; "P": P(t) itself is searched, alternating, from there. gain: how the
-    LQR's K varies between knots. executor: shares the independent L-steps of shape "P".
+    LQR's K varies between knots. limits: rows (input, low, high) at which inputs saturate; the
+    proof then covers every mode of them. executor: shares the independent L-steps of shape "P".
 
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
@@ -134,10 +136,13 @@ def design_funnel(
     refuse_nominal(field, nominal)
     Q = np.eye(field.n) if Q is None else np.asarray(Q, dtype=np.float64)
     R = np.eye(field.m) if R is None else np.asarray(R, dtype=np.float64)
-    steps = LSteps(field)
     wanted = _wanted_goal(goal, nominal, field.n)
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
+    if limits is not None:
+        policy = dataclasses.replace(policy, limits=np.asarray(limits, dtype=np.float64))
+    refuse_saturated(policy, shape)
+    steps = LSteps(field, policy)
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     steps.bound_pushes(S[-1])
@@ -182,6 +187,19 @@ def refuse_nominal(field: VectorField, nominal: Nominal) -> None:
             f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
             "or more knots"
         )
+
+
+def refuse_saturated(policy: Policy, shape: str) -> None:
+    """Raise unless the nominal's own inputs are within the policy's limits, and shape is rho."""
+    if len(policy.limits) and shape == "P":
+        raise DataError("shape P searches one polynomial at a time: with limits take shape rho")
+    for i, low, high in policy.limits.tolist():
+        u = policy.u.control[:, :, int(i)]
+        if not (low < u.min() and u.max() < high):
+            raise DataError(
+                f"the nominal's input {int(i)} needs [{u.min():.6g}, {u.max():.6g}], its limits are "
+                f"[{low:g}, {high:g}]: no room is left to correct anything"
+            )
 
 
 def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goal | None:
@@ -270,9 +288,11 @@ def validity_caps(field: VectorField, policy: Policy, P: FloatArray) -> FloatArr
     Raises DataError if the nominal itself does not.
     """
     caps = np.full(len(P), np.inf)
-    for j, low, high in field.valid.tolist():
-        entry = int(j)
-        for k in range(len(P) - 1):
+    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
+    for k in range(len(P) - 1):
+        for entry, low, high in field.validity(field.span(float(policy.t[k]))):
+            if entry in clipped and low <= clipped[entry][0] and clipped[entry][1] <= high:
+                continue
             centre, rows = policy.entry(entry, k)
             room = min(high - float(np.max(centre)), float(np.min(centre)) - low)
             if room <= 0:
