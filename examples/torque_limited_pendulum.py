@@ -58,7 +58,7 @@ def reaching(policy: Policy, points: int) -> tuple[FloatArray, FloatArray, IntAr
     By simulation of the saturated closed loop with the true sine, from t = 0.
     """
     angles, rates = (np.linspace(-span, span, points) for span in SPAN)
-    X = np.stack(np.meshgrid(angles, rates), axis=-1).reshape(-1, 2)
+    X: FloatArray = np.stack(np.meshgrid(angles, rates), axis=-1).reshape(-1, 2)
     h = FINAL_TIME / STEPS
     for step in range(STEPS):
         t = step * h
@@ -80,7 +80,7 @@ def area_fractions(policy: Policy, funnel: Funnel, points: int = 401) -> tuple[f
     angles, rates, reached = reaching(policy, points)
     cell = float((angles[1] - angles[0]) * (rates[1] - rates[0]))
     missed = np.stack(np.meshgrid(angles, rates), axis=-1)[reached == 0]
-    largest = float(funnel.value(0.0, missed).min())
+    largest = float(np.min(funnel.value(0.0, missed)))
     return funnel.volume(0.0) / (float(reached.sum()) * cell), 1 / largest
 
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlsid_core._types import FloatArray
-from nlsid_core.certificate.arithmetic import Arithmetic, Ball, Exact, Number
 from nlsid_core.certificate import saturation
+from nlsid_core.certificate.arithmetic import Arithmetic, Ball, Exact, Number
 from nlsid_core.certificate.graded import (
     Graded,
     add,

@@ -160,7 +160,7 @@ def refuse_singular(pieces: Pieces) -> None:
 
 
 def refuse_indefinite(pieces: Pieces) -> None:
-    """Raise CertificateRejected unless every S is positive definite: in between they are then too."""
+    """Raise CertificateRejected unless every S is positive definite, and so in between too."""
     n, count = pieces.T.shape[1], pieces.tau.shape[-1]
     for S in _square(pieces.tau.reshape(-1, count), n + 1):
         if not dyadic.is_positive_definite(Exact.of(S).values.tolist()):

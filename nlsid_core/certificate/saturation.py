@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core._types import ArrayLike, FloatArray, IntArray
 from nlsid_core.certificate.arithmetic import Arithmetic, Number
 from nlsid_core.certificate.graded import Graded, add, multiply, negative, positions
 from nlsid_core.continuous.policy import Policy
@@ -74,6 +74,6 @@ def _multiplier(triangles: FloatArray, n: int, arithmetic: Arithmetic) -> Graded
     return result
 
 
-def _column(chosen: IntArray, arithmetic: Arithmetic) -> Number:
+def _column(chosen: ArrayLike, arithmetic: Arithmetic) -> Number:
     """(B, 1, 1): 1 where chosen, else 0."""
     return arithmetic.of(np.asarray(chosen, dtype=np.float64)[:, None, None])

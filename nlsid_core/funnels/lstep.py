@@ -153,7 +153,7 @@ class LSteps:
         return np.asarray(self.program.points[:, linear] @ slope[linear])
 
     def in_mode(self, section: Section, rho: float, case: int) -> FloatArray:
-        """(L, N) at the program's points: what is nonnegative wherever the inputs are in the mode."""
+        """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         demand = section.u - x_bar @ section.K.T
         _, mode = self.split(case)
@@ -171,7 +171,7 @@ class LSteps:
         for case in range(self.cases):
             g = self.values(section, rho, case)
             warm = None if start is None else start[case]
-            tau = np.zeros((0, 0, 0))
+            tau: FloatArray = np.zeros((0, 0, 0))
             if len(self.limits):
                 tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
                 g = g - products

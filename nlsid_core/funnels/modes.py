@@ -1,7 +1,7 @@
 """Multipliers for one mode of limited inputs: τ_l ≥ 0 with g - Σ τ_l q_l as large as can be.
 
-maximise m subject to g - m - Σ τ_l q_l = v'Xv on |z| = 1, X ⪰ 0, τ_l = y'S_l y, S_l ≻ 0, y = (1, z),
-q_l ≥ 0 what holds in the mode: the L-step of `certificate.saturation`'s claim, as a cone program.
+maximise m subject to g - m - Σ τ_l q_l = v'Xv on |z| = 1, X ⪰ 0, τ_l = y'S_l y, S_l ≻ 0, y =
+(1, z), q_l ≥ 0 what holds in the mode: the L-step of `certificate.saturation`'s claim.
 """
 
 import numpy as np
@@ -47,21 +47,23 @@ def _solved(program: SphereProgram | LineProgram, g: FloatArray, q: FloatArray) 
     v = monomial_values(program.basis, program.points) * program.weight
     y = np.hstack([np.ones((points, 1)), program.points])
     products = _products(y)
-    rows = np.hstack([np.ones((points, 1)), _products(v), *(part[:, None] * products for part in q)])
+    rows = np.hstack(
+        [np.ones((points, 1)), _products(v), *(part[:, None] * products for part in q)]
+    )
     size = rows.shape[1]
     first, side = 1 + k * (k + 1) // 2, (n + 1) * (n + 2) // 2
     cost = np.zeros(size)
     cost[0] = -1.0
     trace = conic.svec(np.eye(n + 1))
-    for l in range(count):
-        cost[first + l * side : first + (l + 1) * side] = COST * trace
+    for start in range(first, size, side):
+        cost[start : start + side] = COST * trace
     below = sp.csr_matrix(([1.0], ([0], [0])), shape=(1, size))
     x = conic.solve(
         ConeProgram(
             P=sp.csc_matrix((size, size)),
             q=cost,
             A=sp.vstack([sp.csr_matrix(rows), below, -sp.eye(size, format="csr")[1:]], "csc"),
-            b=np.r_[g, g.max(), np.zeros(size - 1)],
+            b=np.r_[g, float(np.max(g)), np.zeros(size - 1)],
             cones=(
                 Cone("zero", points),
                 Cone("nonnegative", 1),
@@ -71,8 +73,7 @@ def _solved(program: SphereProgram | LineProgram, g: FloatArray, q: FloatArray) 
         ),
         tolerance=TOLERANCE,
     ).x
-    found = [conic.smat(x[first + l * side : first + (l + 1) * side]) for l in range(count)]
-    return np.array(found)
+    return np.array([conic.smat(x[i : i + side]) for i in range(first, size, side)])
 
 
 def _products(values: FloatArray) -> FloatArray:

@@ -278,9 +278,7 @@ def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
     return M
 
 
-def _joined(
-    steps: LSteps, done: list[tuple[Pieces, FloatArray]]
-) -> tuple[Pieces, FloatArray]:
+def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Pieces, FloatArray]:
     """All proved pieces in the order of time."""
     if not done:
         n = steps.program.n

@@ -195,9 +195,10 @@ def refuse_saturated(policy: Policy, shape: str) -> None:
         raise DataError("shape P searches one polynomial at a time: with limits take shape rho")
     for i, low, high in policy.limits.tolist():
         u = policy.u.control[:, :, int(i)]
-        if not (low < u.min() and u.max() < high):
+        least, most = float(np.min(u)), float(np.max(u))
+        if not (low < least and most < high):
             raise DataError(
-                f"the nominal's input {int(i)} needs [{u.min():.6g}, {u.max():.6g}], its limits are "
+                f"the nominal's input {int(i)} needs [{least:.6g}, {most:.6g}], its limits are "
                 f"[{low:g}, {high:g}]: no room is left to correct anything"
             )
 
