@@ -16,11 +16,11 @@ from nlsid_core.continuous.taylor import taylor_field
 from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, nominal_through
 
 GRAVITY = 9.81  # m/s²
-SECONDS, SEGMENTS = 2.0, (20, 50)
+SECONDS, SEGMENTS = 2.0, (20, 40)
 START, END = np.zeros(6), np.array([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 RADIUS = np.array([10.0, 10.0, 0.4, 10.0, 10.0, 20.0, 6.0, 100.0])  # around the motion
 Q, R = np.diag([10.0, 10.0, 10.0, 2.0, 2.0, 1.0]), np.diag([0.5, 0.02])
-LEVEL = 1.0  # of the goal, in the LQR's cost at the end
+LEVEL = 0.3  # of the goal, in the LQR's cost at the end
 
 
 def rate(x: Any, u: Any) -> Any:

@@ -8,8 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from bags.chain.problems import FunnelProblem
+from bags.commands.cli import app
 from examples import torque_limited_pendulum as pendulum
+from nlsid_core import _json
 from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.certificate import check
 from nlsid_core.certificate.arithmetic import Exact
@@ -18,7 +22,7 @@ from nlsid_core.certificate.funnel_pieces import Pieces
 from nlsid_core.certificate.graded import Graded, monomials_of
 from nlsid_core.continuous import Nominal, Policy, VectorField, constant_on
 from nlsid_core.errors import CertificateRejected, DataError, DocumentError
-from nlsid_core.funnels import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, integrate_nominal
 from nlsid_core.funnels.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.polynomial.values import monomial_values
 from tests.test_funnel_forgeries import Files, write
@@ -266,6 +270,21 @@ def test_a_nominal_beyond_the_limits_and_the_general_shape_are_refused() -> None
         design_funnel(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]])
     with pytest.raises(DataError, match="with limits take shape rho"):
         design_funnel(field, nominal, goal=GOAL, shape="P", limits=[[0, -6.0, 6.0]])
+
+
+def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:
+    field, _ = pendulum.problem()
+    asked = FunnelProblem(
+        field, still(field, 13, 0.3), pendulum.Q, pendulum.R, Goal(np.zeros(2), GOAL),
+        limits=np.array([[0, -LIMIT, LIMIT]]),
+    )  # fmt: skip
+    file = tmp_path / "problem.json"
+    _json.write_document(file, asked.document())
+    made = CliRunner().invoke(app, ["funnel", "--problem", str(file), "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert Policy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]
+    checked = CliRunner().invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
+    assert "u0 clipped to [-9, 9]" in " ".join(checked.output.split())
 
 
 @pytest.mark.slow

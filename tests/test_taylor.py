@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.known_problems import encloses
 from examples import cart_pole, planar_quadrotor
 from nlsid_core._types import FloatArray
 from nlsid_core.certificate import check
@@ -125,6 +126,14 @@ def test_a_narrower_box_than_the_funnel_needs_is_refused(design: FunnelDesign) -
     tight = VectorField(field.pieces, 2, 1, field.breaks, field.uncertain, rows)
     with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
         refuse_invalid(tight, design.policy, design.funnel)
+
+
+def test_the_benchmark_notices_a_remainder_that_is_not_covered() -> None:
+    field, _ = caught()
+    rng = np.random.default_rng(0)
+    assert encloses(field, swinging_truth, rng)
+    less = VectorField(field.pieces, 2, 1, field.breaks, 0.03 * field.uncertain, field.valid)
+    assert not encloses(less, swinging_truth, rng)
 
 
 @pytest.mark.slow

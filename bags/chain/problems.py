@@ -1,5 +1,6 @@
 """Funnel problems in files: dynamics, nominal, goal and weights as one JSON document."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,10 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
-    """What `design_funnel` needs. Q: (n, n), R: (m, m); shape: "rho" or "P"."""
+    """What `design_funnel` needs. Q: (n, n), R: (m, m); shape: "rho" or "P".
+
+    limits: (L, 3) rows (input, low, high) at which inputs saturate.
+    """
 
     field: VectorField
     nominal: Nominal
@@ -27,6 +31,7 @@ class FunnelProblem:
     goal: Goal | None = None
     shape: str = "rho"
     gain: str = "constant"
+    limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -45,6 +50,7 @@ class FunnelProblem:
             "goal": goal,
             "Q": self.Q.tolist(),
             "R": self.R.tolist(),
+            "limits": self.limits.tolist(),
         }
 
     @classmethod
@@ -70,6 +76,7 @@ class FunnelProblem:
             _goal(document, field.n, source),
             _json.member(document, "shape", str, source=source),
             _json.member(document, "gain", str, source=source),
+            _limits(document, source),
         )
 
     def design(self, progress: Progress | None = None) -> FunnelDesign:
@@ -82,8 +89,16 @@ class FunnelProblem:
             gain=self.gain,
             Q=self.Q,
             R=self.R,
+            limits=self.limits if len(self.limits) else None,
             progress=progress,
         )
+
+
+def _limits(document: Json, source: str) -> FloatArray:
+    if "limits" not in document:
+        return np.zeros((0, 3))
+    rows = _json.member(document, "limits", list, source=source)
+    return _json.array(document, "limits", (len(rows), 3), source=source)
 
 
 def _goal(document: Json, n: int, source: str) -> Goal | None:

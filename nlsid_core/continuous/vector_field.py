@@ -101,8 +101,7 @@ class VectorField:
     ) -> "VectorField":
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
-        Raises NotPolynomial naming the operation; a Taylor polynomial is then the way, with its
-        remainder as an uncertain w.
+        Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
         """
         bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
         given = tuple(inspect.signature(function).parameters)
@@ -119,8 +118,8 @@ class VectorField:
             traced = trace(called, {name: sizes[name] for name in given})
         except NotPolynomial as error:
             raise NotPolynomial(
-                f"{error}. Give its Taylor polynomial instead, and what it leaves out on "
-                "the states of interest as an uncertain w with bounds"
+                f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
+                "leave out; or give a polynomial, and what it leaves out as a bounded w"
             ) from error
         if traced.shape != (n,):
             raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")
