@@ -83,7 +83,8 @@ def encloses(field: VectorField, truth: Any, rng: np.random.Generator) -> bool:
     for span in range(len(field.pieces)):
         bounds = {j: (low, high) for j, low, high in field.validity(span)}
         box = np.array([bounds.get(j, UNBOUNDED) for j in range(field.n + field.m)])
-        X, U = np.split(rng.uniform(*box.T, size=(SAMPLES, len(box))), [field.n], axis=1)
+        points = rng.uniform(box[:, 0], box[:, 1], size=(SAMPLES, len(box)))
+        X, U = np.split(points, [field.n], axis=1)
         t = float(times[span]) if span else 0.0
         rates = np.array([field(t, X, U, w, span=span) for w in field.vertices()])
         true = truth(X, U)

@@ -243,6 +243,21 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     )
 
 
+def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1] + w[1], x[0] - x[0] ** 3 / 6 + u[0] + w[0] - 2 * w[2]])
+
+    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=[[2, -1.0, 1.0]])
+    found = design_funnel(field, still(field, 13, 0.6), goal=20 * np.eye(2), limits=[[0, -0.5, 1]])
+    assert found.proved.pieces.kappa is not None
+    assert demand(found, 0.0) > 0.6
+    assert check(found.save(tmp_path)[-1]).margin > 0
+    rng = np.random.default_rng(10)
+    run = simulate_boundary(field, found.policy, found.funnel, starts=2000, rng=rng, adversary=True)
+    assert run.violations == 0
+
+
 def test_a_policy_clips_what_it_asks_for_and_refuses_limits_that_are_none() -> None:
     t = np.array([0.0, 1.0])
     parts = (

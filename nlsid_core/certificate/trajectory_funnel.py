@@ -85,6 +85,7 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     bounds = ", ".join(
         f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain)
     )
+    unlimited = " and without other saturation" if clipped else " and without saturation"
     limited = set(policy.limits[:, 0].astype(int).tolist()).union(
         set.intersection(
             *({j - field.n for j, *_ in field.validity(i)} for i in range(len(field.pieces)))
@@ -100,7 +101,7 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
         assumptions=(
             "the state obeys the stored dynamics with the stored policy, applied continuously"
             + clipped
-            + ("" if set(range(field.m)) <= limited else " and without other saturation"),
+            + ("" if set(range(field.m)) <= limited else unlimited),
             *((f"at every time {bounds}",) if bounds else ()),
         ),
     )

@@ -68,7 +68,8 @@ class TaylorModel:
             return self._scaled(float(other), _is_power_of_two(float(other)))
         table, kept = _products(self.k)
         outer = np.outer(self.coefficients, other.coefficients)
-        total = np.bincount(table[kept], outer[kept], len(self.coefficients))
+        weighted = np.bincount(table[kept], outer[kept], len(self.coefficients))
+        total = weighted.astype(np.float64)
         size = np.abs(outer)
         error = self.error * other.size + other.error * self.size
         return self._made(
