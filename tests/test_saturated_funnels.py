@@ -223,6 +223,18 @@ def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> 
 # -- more inputs, bad input --------------------------------------------------------------------
 
 
+def test_a_saturated_funnel_comes_near_the_radius_known_in_closed_form() -> None:
+    """ẋ = x + clip(u, ±1), |x(1)| ≤ 0.2: at the limit x(0) = 1 - 0.8/e, and no start beyond it."""
+    field = VectorField.from_function(lambda x, u: np.array([x[0] + u[0]]), 1, 1)
+    found = design_funnel(
+        field, still(field, 41, 1.0), goal=np.array([[25.0]]), limits=[[0, -1.0, 1.0]]
+    )
+    radius = 1 / np.sqrt(found.funnel.shape(0.0)[0, 0])
+    best = 1 - 0.8 / np.e
+    assert 0.97 * best <= radius < best
+    assert radius * found.policy.K(0.0)[0, 0] > 1.5  # it asks for far more than there is
+
+
 def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     def pair(x: Any, u: Any) -> Any:
         return np.array([x[0] + x[0] ** 3 / 6 + u[0], x[1] / 2 + x[0] / 4 + u[1]])
