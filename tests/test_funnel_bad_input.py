@@ -199,15 +199,15 @@ def test_a_nominal_that_disobeys_is_told_by_how_much_where_and_in_which_state() 
     ("function", "operation"),
     [
         (lambda x: np.array([np.sin(x[0])]), "sin"),
-        (lambda x: np.array([1 / x[0]]), "divi"),
-        (lambda x: np.array([x[0] ** 0.5]), r"0\.5"),
+        (lambda x: np.array([1 / x[0]]), "division"),
+        (lambda x: np.array([x[0] ** 0.5]), r"power 0\.5"),
         (lambda x: np.array([abs(x[0])]), "abs"),
     ],
 )
 def test_dynamics_that_are_not_polynomial_name_the_operation_and_offer_taylor(
     function: Callable[[Any], Any], operation: str
 ) -> None:
-    told = f"{operation}.*Give its Taylor polynomial instead, .* as an uncertain w with bounds"
+    told = f"{operation} .*taylor_field makes cubics along a motion, .* as a bounded w"
     _, nominal = hanging()
     still = integrate_nominal(
         VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0), lambda _: [],

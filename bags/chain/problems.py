@@ -1,5 +1,6 @@
 """Funnel problems in files: dynamics, nominal, goal and weights as one JSON document."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,8 @@ VERSION = 1
 class FunnelProblem:
     """What `design_funnel` takes, in its words. Q: (n, n), R: (m, m), rho: (K,) or none.
 
-    In a file, search, objective and rho may be left out.
+    limits: (L, 3) rows (input, low, high) at which inputs saturate. In a file, search, objective,
+    rho and limits may be left out.
     """
 
     field: VectorField
@@ -33,6 +35,7 @@ class FunnelProblem:
     search: str = "sweep"
     objective: str = "volume"
     rho: FloatArray | None = None
+    limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -54,6 +57,7 @@ class FunnelProblem:
             "goal": goal,
             "Q": self.Q.tolist(),
             "R": self.R.tolist(),
+            "limits": self.limits.tolist(),
         }
 
     @classmethod
@@ -84,6 +88,7 @@ class FunnelProblem:
             None
             if document.get("rho") is None
             else _json.array(document, "rho", (None,), source=source),
+            _limits(document, source),
         )
 
     def design(self, progress: Progress | None = None) -> FunnelDesign:
@@ -99,8 +104,16 @@ class FunnelProblem:
             rho=self.rho,
             Q=self.Q,
             R=self.R,
+            limits=self.limits if len(self.limits) else None,
             progress=progress,
         )
+
+
+def _limits(document: Json, source: str) -> FloatArray:
+    if "limits" not in document:
+        return np.zeros((0, 3))
+    rows = _json.member(document, "limits", list, source=source)
+    return _json.array(document, "limits", (len(rows), 3), source=source)
 
 
 def _goal(document: Json, n: int, source: str) -> Goal | None:

@@ -88,7 +88,12 @@ def refuse_start(funnel: Funnel, ends: Sequence[Ends]) -> None:
 
 
 def refuse_shape(steps: LSteps) -> None:
-    """Raise DataError where V-steps do not apply: a pushed field, or one of degree above 3."""
+    """Raise DataError where V-steps do not apply: pushes, limits, or a degree above 3."""
+    if len(steps.limits):
+        raise DataError(
+            "V-steps (shape P, alternation) search one polynomial at a time: with limits take "
+            "shape rho by the sweep"
+        )
     if steps.kappa is not None:
         raise DataError("V-steps take w at its corners: they are for fewer than three pushes")
     if steps.field.degree > MAX_DEGREE:

@@ -79,14 +79,14 @@ def prove_pieces(
         pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
         margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
         by_part = np.asarray(np.isfinite(margins).reshape(len(solvable), -1).all(axis=1))
-        keep = np.repeat(by_part, len(steps.vertices))
+        keep = np.repeat(by_part, steps.cases)
         if keep.any():
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
         failed = [part for part, good in zip(solvable, by_part.tolist(), strict=True) if not good]
         unproved += [part for part in failed if part.level == MAX_LEVEL]
         waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
-    return Proved(*_joined(steps.program, done), unproved=tuple(unproved))
+    return Proved(*_joined(steps, done), unproved=tuple(unproved))
 
 
 def _solved(
@@ -120,11 +120,11 @@ def _pieces(
     parts: list[Part],
     known: dict[tuple[int, float], list[SphereSolution]],
 ) -> Pieces:
-    """The pieces of the proof for these parts, part by part, vertex by vertex."""
-    n, program, vertices = funnel.n, steps.program, len(steps.vertices)
+    """The pieces of the proof for these parts, part by part, case by case."""
+    n, program = funnel.n, steps.program
     basis = proof_basis(program)
     triangle = np.triu_indices(len(basis))
-    frames, mus, grams = [], [], []
+    frames, mus, grams, taus = [], [], [], []
     for end in (0, 1):
         T, rho, rows = [], [], []
         for part in parts:
@@ -132,10 +132,14 @@ def _pieces(
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
             section = section_at(steps.field, policy, funnel.P, i, s)
-            T += [np.sqrt(rho_here) * section.base] * vertices
-            rho += [rho_here] * vertices
+            T += [np.sqrt(rho_here) * section.base] * steps.cases
+            rho += [rho_here] * steps.cases
             rows += known[i, s]
-        blank = draft(program, parts, np.array(T), vertices, steps.kappa)
+        blank = draft(steps, parts, np.array(T))
+        scale = np.diff(funnel.t)[blank.interval] * rho
+        tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
+        tau = tau.reshape(len(rows), -1, n + 1, n + 1)
+        blank = replace(blank, tau=_sides(tau, tau))
         c, _ = closed_loop_polynomial(steps.field, policy, funnel, blank, Ball)
         at_end = {q: part.approximate()[:, -end] for q, part in c.items()}
         mu, gram = [], []
@@ -147,6 +151,7 @@ def _pieces(
             one = end_proof(program, solution, target, h * rho[b], solution.m + growth)
             gram.append(one[0])
             mu.append(one[1] / rho[b])
+        taus.append(tau)
         frames.append(np.array(T))
         mus.append(np.array(mu))
         grams.append(np.array(gram))
@@ -157,13 +162,24 @@ def _pieces(
         grams[1][b] = M.T @ grams[1][b] @ M
         full = monomials(n, Pieces.multiplier_degrees(basis))
         mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
+        around = np.eye(n + 1)
+        around[1:, 1:] = A[b]
+        taus[1][b] = around.T @ taus[1][b] @ around
     both = np.stack(grams, axis=1)
     return replace(
         blank,
         T=frames[0],
         mu=np.stack(mus, axis=1),
         gram=both[..., triangle[0], triangle[1]],
+        tau=_sides(*taus),
     )
+
+
+def _sides(start: FloatArray, end: FloatArray) -> FloatArray:
+    """(B, 2, L, (n+1)(n+2)/2) upper triangles of two (B, L, n+1, n+1)."""
+    both = np.stack([start, end], axis=1)
+    i, j = np.triu_indices(both.shape[-1])
+    return np.asarray(both[..., i, j])
 
 
 def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
@@ -182,27 +198,24 @@ def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray
     return np.concatenate([[0.25], 0.75 * squares])
 
 
-def draft(
-    program: SphereProgram | LineProgram,
-    parts: list[Part],
-    T: FloatArray,
-    vertices: int,
-    kappa: FloatArray | None = None,
-) -> Pieces:
-    """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
-    basis, count = proof_basis(program), len(parts) * vertices
+def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
+    """Pieces that state frames T (parts x cases, n, n) only: μ, Q and S are zero."""
+    basis, count = proof_basis(steps.program), len(parts) * steps.cases
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
-    repeated = np.repeat(whole, vertices, axis=0)
+    repeated = np.repeat(whole, steps.cases, axis=0)
+    vertices, limited, n = len(steps.vertices), len(steps.limits), steps.program.n
     return Pieces(
         basis,
         interval=repeated[:, 0],
-        vertex=np.tile(np.arange(vertices), len(parts)),
+        vertex=np.tile(np.arange(steps.cases) % vertices, len(parts)),
         level=repeated[:, 1],
         index=repeated[:, 2],
         T=T,
         mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
         gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
-        kappa=kappa,
+        mode=np.tile(np.repeat(steps.modes, vertices, axis=0), (len(parts), 1)),
+        tau=np.zeros((count, 2, limited, (n + 1) * (n + 2) // 2)),
+        kappa=steps.kappa,
     )
 
 
@@ -288,12 +301,11 @@ def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
     return M
 
 
-def _joined(
-    program: SphereProgram | LineProgram, done: list[tuple[Pieces, FloatArray]]
-) -> tuple[Pieces, FloatArray]:
+def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Pieces, FloatArray]:
     """All proved pieces in the order of time."""
     if not done:
-        return draft(program, [], np.zeros((0, program.n, program.n)), 1), np.zeros(0)
+        n = steps.program.n
+        return draft(steps, [], np.zeros((0, n, n))), np.zeros(0)
     pieces = stacked([part for part, _ in done])
     margins = np.concatenate([m for _, m in done])
     order = np.lexsort((pieces.vertex, pieces.index / 2.0**pieces.level, pieces.interval))
@@ -302,7 +314,7 @@ def _joined(
 
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
-    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram")
+    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram", "mode", "tau")
     whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
     return replace(parts[0], **whole)
 

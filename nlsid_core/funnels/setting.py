@@ -4,7 +4,7 @@ Everything that can be wrong with what a user gives is found here, before anythi
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
 from nlsid_core.continuous.funnel import ellipsoid_inside
 from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.funnels.lstep import LSteps, section_at
+from nlsid_core.funnels.lstep import LSteps, refuse_degree, section_at
 from nlsid_core.funnels.tvlqr import Tracking, definite, lyapunov, tvlqr
 
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
@@ -70,6 +70,7 @@ def prepare(
     Q: ArrayLike | None,
     R: ArrayLike | None,
     gain: str,
+    limits: ArrayLike | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -79,12 +80,17 @@ def prepare(
     refuse_nominal(field, nominal)
     Q = definite(np.eye(field.n) if Q is None else Q, field.n, "Q", strict=False)
     R = definite(np.eye(field.m) if R is None else R, field.m, "R", strict=True)
-    steps = LSteps(field)
+    refuse_degree(field)
     wanted = _wanted_goal(goal, nominal, field.n)
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
-    steps.bound_pushes(tracking.S[-1])
-    rho_final, target = _final(steps, tracking.policy, tracking.S, wanted)
-    return Setting(steps, tracking.policy, tracking.S, rho_final, target)
+    policy, S = tracking.policy, tracking.S
+    if limits is not None:
+        policy = replace(policy, limits=np.asarray(limits, dtype=np.float64))
+    refuse_saturated(policy)
+    steps = LSteps(field, policy)
+    steps.bound_pushes(S[-1])
+    rho_final, target = _final(steps, policy, S, wanted)
+    return Setting(steps, policy, S, rho_final, target)
 
 
 def refuse_first(setting: Setting, rho: FloatArray) -> None:
@@ -117,6 +123,18 @@ def refuse_nominal(field: VectorField, nominal: Nominal) -> None:
             f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
             "or more knots"
         )
+
+
+def refuse_saturated(policy: Policy) -> None:
+    """Raise DataError unless the nominal's own inputs are within the policy's limits."""
+    for i, low, high in policy.limits.tolist():
+        u = policy.u.control[:, :, int(i)]
+        least, most = float(np.min(u)), float(np.max(u))
+        if not (low < least and most < high):
+            raise DataError(
+                f"the nominal's input {int(i)} needs [{least:.6g}, {most:.6g}], its limits are "
+                f"[{low:g}, {high:g}]: no room is left to correct anything"
+            )
 
 
 def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goal | None:

@@ -16,6 +16,7 @@ from nlsid_core.sos.sphere import SphereSolution
 
 ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
 MAX_TRIES = 12
+NEAR = 1.01  # of a feasible ρ: closer to the largest is not worth another program
 LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
 
 Progress = Callable[[str, float], None]
@@ -88,20 +89,35 @@ def _largest(
     def slack(rho: float, phi: float) -> float:
         return phi + (after - rho) / here(rho) / h - margin
 
+    feasible, infeasible = 0.0, np.inf
+    best: list[SphereSolution] | None = None
+    estimated = len(steps.limits) > 0  # then `predicted` may be too low, and more be possible
     for _ in range(MAX_TRIES):
         if cap <= LOWEST * after:
             break
         known = duals
         rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
-                    LOWEST * after, cap)  # fmt: skip
+                    LOWEST * after, min(cap, infeasible))  # fmt: skip
+        if best is not None and rho <= feasible:
+            break
         found = steps.solve(section, here(rho), duals)
-        if slack(rho, min(s.m for s in found)) >= -ACCEPT * margin:
-            return rho, found
-        cap, duals = rho, found
-    raise Infeasible(
-        f"no rho at t = {section.t:.6g} s keeps solutions inside: the linearisation may not be "
-        "stabilised there. Try more knots, another P (Q and R of the LQR), or a smaller goal."
-    )
+        left = slack(rho, min(s.m for s in found))
+        if left >= -ACCEPT * margin:
+            if not estimated or rho >= cap:
+                return rho, found
+            done = rho <= NEAR * feasible
+            feasible, best = rho, found
+            if done:
+                break
+        else:
+            infeasible = min(infeasible, rho)
+        duals = found
+    if best is None:
+        raise Infeasible(
+            f"no rho at t = {section.t:.6g} s keeps solutions inside: the linearisation may not be "
+            "stabilised there. Try more knots, another P (Q and R of the LQR), or a smaller goal."
+        )
+    return feasible, best
 
 
 def _root(slack: Callable[[float], float], low: float, high: float) -> float:

@@ -114,6 +114,7 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
+    limits: ArrayLike | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
@@ -123,7 +124,8 @@ def design_funnel(
     its matrix around the nominal's end; by default the largest set that the closed loop keeps at
     the end. policy: default a time-varying LQR with Q and R (default identities), and P(t) its
     cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. gain: how the
-    LQR's K varies between knots.
+    LQR's K varies between knots. limits: rows (input, low, high) at which inputs saturate; the
+    proof then covers every mode of them.
 
     shape "rho": P(t) stays. search "sweep": ρ(t) is swept backward; "alternation": the thesis's,
     from a first ρ (K,) if given, else from an exponential one. shape "P": P(t) itself is searched
@@ -139,7 +141,9 @@ def design_funnel(
     if rho is not None and search != "alternation":
         raise DataError("a first rho is where the alternation starts: give search='alternation'")
     started = time.perf_counter()
-    setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
+    setting = prepare(
+        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits
+    )
     steps, policy = setting.steps, setting.policy
     if shape == "P":
         refuse_shape(steps)
@@ -189,9 +193,11 @@ def validity_caps(field: VectorField, policy: Policy, P: FloatArray) -> FloatArr
     Raises DataError if the nominal itself does not.
     """
     caps = np.full(len(P), np.inf)
-    for j, low, high in field.valid.tolist():
-        entry = int(j)
-        for k in range(len(P) - 1):
+    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
+    for k in range(len(P) - 1):
+        for entry, low, high in field.validity(field.span(float(policy.t[k]))):
+            if entry in clipped and low <= clipped[entry][0] and clipped[entry][1] <= high:
+                continue
             centre, rows = policy.entry(entry, k)
             room = min(high - float(np.max(centre)), float(np.min(centre)) - low)
             if room <= 0:

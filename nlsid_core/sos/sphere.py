@@ -45,7 +45,8 @@ class SphereSolution:
 
     m: shown up to rounding by X (k, k); upper: the dual bound, from y (N,). Both in the unit of g.
     gap: (upper - m) relative to the spread of g. centred: an earlier iterate (X, y, m) of the
-    normalised problem, far enough from the boundary to start a similar problem from.
+    normalised problem, far enough from the boundary to start a similar problem from. tau: (L, n+1,
+    n+1) Gram matrices of multipliers chosen before, whose products are in g.
     """
 
     m: float
@@ -55,6 +56,7 @@ class SphereSolution:
     gap: float
     iterations: int
     centred: tuple[FloatArray, FloatArray, float]
+    tau: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
