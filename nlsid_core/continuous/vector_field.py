@@ -323,18 +323,6 @@ def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:
     )
 
 
-def joined(fields: Sequence[VectorField], breaks: ArrayLike) -> VectorField:
-    """One vector field that follows the given ones in turn, changing at the times `breaks`."""
-    first = fields[0]
-    return VectorField(
-        tuple(part for f in fields for part in f.pieces),
-        first.n,
-        first.m,
-        np.asarray(breaks, dtype=np.float64),
-        first.uncertain,
-    )
-
-
 def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntArray, FloatArray]:
     if not any(len(p) for p in equations):
         empty = np.zeros((1, len(names)), dtype=np.int64)
