@@ -132,6 +132,11 @@ def proof_exchanged(files: Files) -> None:
     files["stage2.proof.json"] = files["stage1.proof.json"]
 
 
+def stages_without_end(files: Files) -> None:
+    """A million multipliers for three stages."""
+    files["composition.proof.json"]["proof"]["multipliers"] = [0.5] * 1_000_000
+
+
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (swapped_order, "stage 1 ends at 2.0 s, stage 2 starts at 0.0 s"),
     (start_shrunk, "stage 2.*do not represent"),
@@ -140,6 +145,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (stage_left_out, "stage 1 ends at 1.0 s, stage 2 starts at 2.0 s"),
     (multiplier_raised, "not proved to end inside stage 2"),
     (proof_exchanged, "about another"),
+    (stages_without_end, "of 1000001 stages is about .* 2 to 100 of them"),
 ]
 
 

@@ -1,6 +1,7 @@
 """Lemmas 5.2 and 5.3, and the thesis's literal formulation with time in the program."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,7 @@ def test_a_rate_or_sigma_that_means_nothing_is_refused() -> None:
 # -- the literal formulation, thesis (6.4) -----------------------------------------------------
 
 
+@cache
 def hanging() -> FunnelDesign:
     """A pendulum to third order in two states."""
 

@@ -264,6 +264,7 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     assert made.exit_code == 0, made.output
     assert "pieces proved" in made.output
     assert Funnel.load(tmp_path / "funnel.json").tf == 2.0
+    assert (tmp_path / "funnel.png").is_file()
     checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
     assert checked.exit_code == 0
     assert "PROVED funnel" in checked.output

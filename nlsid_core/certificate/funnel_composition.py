@@ -36,16 +36,16 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     multipliers = _json.array(proof, "multipliers", (None,), source="proof").tolist()
     count = len(multipliers) + 1
     parts = (*trajectory_funnel.ABOUT, PROOF)
-    expected = {role(i, part) for i in range(1, count + 1) for part in parts}
+    stages = range(1, min(count, MAX_STAGES) + 1)
+    expected = {role(i, part) for i in stages for part in parts}
     if not 2 <= count <= MAX_STAGES or set(about) != expected:
         raise CertificateRejected(
             f"a {KIND} of {count} stages is about {', '.join(parts)} of each of them, 2 to "
             f"{MAX_STAGES} of them; this one is about {len(about)} files"
         )
-    decisions = [_stage(i, about, mode) for i in range(1, count + 1)]
+    decisions = [_stage(i, about, mode) for i in stages]
     funnels = [
-        Funnel.from_document(about[role(i, "funnel")], source=role(i, "funnel"))
-        for i in range(1, count + 1)
+        Funnel.from_document(about[role(i, "funnel")], source=role(i, "funnel")) for i in stages
     ]
     for i, multiplier in enumerate(multipliers, start=1):
         refuse_step(i, funnels[i - 1], funnels[i], multiplier)
