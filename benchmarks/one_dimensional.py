@@ -2,7 +2,8 @@
 
     python -m benchmarks.one_dimensional [--json] [--plot FILE]
 
-Known: the best symmetric funnel covers 87.2 % of the true set.
+Known: the best symmetric funnel covers 87.2 % of the true set. `ratio` is the mean radius over the
+best one, `area` the fraction of the true set that is proved; both for 40 and 160 knots.
 """
 
 import argparse
@@ -34,6 +35,9 @@ def run() -> dict[str, Any]:
         result[f"pieces_{knots}"] = len(found.proved.pieces)
         steps = LSteps(problem(knots)[0])
         start = exponential_start(steps, found.policy, found.funnel.P)
+        two = alternate_rho(steps, found.policy, start, stop=0.0, iterations=2)
+        two_radii = radius(two.funnel, TIMES)
+        result[f"two_alternations_ratio_{knots}"] = float((two_radii / best).mean())
         iterates = alternate_rho(steps, found.policy, start, stop=1e-3)
         result[f"start_ratio_{knots}"] = float((radius(start, TIMES) / best).mean())
         result[f"alternation_ratio_{knots}"] = float((radius(iterates.funnel, TIMES) / best).mean())

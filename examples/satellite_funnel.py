@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from examples.satellite import DECAY, FINAL_TIME, GOAL, KNOTS, dynamics, nominal_input
+from examples.satellite import FINAL_TIME, GOAL, KNOTS, dynamics, nominal_input
 from nlsid_core._types import FloatArray
 from nlsid_core.certificate import check
-from nlsid_core.continuous import Funnel, Nominal, VectorField
-from nlsid_core.funnels import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.continuous import Nominal, VectorField
+from nlsid_core.funnels import design_funnel, integrate_nominal
 
 PUBLISHED_SECONDS = 13429.0  # thesis: 223 min 49 s on 12 cores, exact in time
 LQR_SCALE = 1.3045  # MATHS.md section 9: P_G in the order [ω; σ] times this is the LQR's cost
@@ -27,13 +27,6 @@ def problem(knots: int = KNOTS) -> tuple[VectorField, Nominal, dict[str, Any]]:
     field = VectorField.from_function(dynamics, 6, 3)
     t = np.linspace(0.0, FINAL_TIME, knots)
     return field, integrate_nominal(field, nominal_input, t=t, final=np.zeros(6)), WEIGHTS
-
-
-def initial_funnel(design: FunnelDesign) -> Funnel:
-    """The thesis's first guess ρ(t) = exp(-c (t_f - t)/t_f), with the design's P(t)."""
-    funnel = design.funnel
-    rho = np.exp(-DECAY * (funnel.tf - funnel.t) / (funnel.tf - funnel.t0))
-    return Funnel(funnel.x, funnel.P, rho, funnel.vector_field, funnel.policy)
 
 
 def main() -> tuple[float, float]:

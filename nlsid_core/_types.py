@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 FloatArray: TypeAlias = NDArray[np.floating[Any]]  # float64 in fact; NumPy's stubs say less
 IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
 Json: TypeAlias = dict[str, Any]
 
-__all__ = ["ArrayLike", "FloatArray", "IntArray", "Json"]
+__all__ = ["ArrayLike", "BoolArray", "FloatArray", "IntArray", "Json"]

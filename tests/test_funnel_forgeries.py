@@ -148,6 +148,27 @@ def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
         check(write(forged, tmp_path, rebind=True), mode="rigorous")
 
 
+@pytest.mark.parametrize("forge", [multiplier_sign, goal_shrunk])
+def test_the_exact_mode_refuses_as_well(
+    files: Files, tmp_path: Path, forge: Callable[[Files], None]
+) -> None:
+    forged = json.loads(json.dumps(files))
+    forge(forged)
+    with pytest.raises(CertificateRejected, match=dict(FORGERIES)[forge]):
+        check(write(forged, tmp_path, rebind=True), mode="exact")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
+def test_the_exact_mode_refuses_every_forgery(
+    files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
+) -> None:
+    forged = json.loads(json.dumps(files))
+    forge(forged)
+    with pytest.raises(CertificateRejected, match=reason):
+        check(write(forged, tmp_path, rebind=True), mode="exact")
+
+
 @pytest.mark.parametrize("forge", [rho_at_one_knot, gain_lower, nominal_shifted, other_inertia])
 def test_a_forged_file_is_refused_by_its_digest(
     files: Files, tmp_path: Path, forge: Callable[[Files], None]

@@ -1,5 +1,6 @@
 """Funnel problems in files: dynamics, nominal, goal and weights as one JSON document."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,11 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
-    """What `design_funnel` needs. Q: (n, n), R: (m, m); shape: "rho" or "P"."""
+    """What `design_funnel` takes, in its words. Q: (n, n), R: (m, m), rho: (K,) or none.
+
+    limits: (L, 3) rows (input, low, high) at which inputs saturate. In a file, search, objective,
+    rho and limits may be left out.
+    """
 
     field: VectorField
     nominal: Nominal
@@ -27,6 +32,10 @@ class FunnelProblem:
     goal: Goal | None = None
     shape: str = "rho"
     gain: str = "constant"
+    search: str = "sweep"
+    objective: str = "volume"
+    rho: FloatArray | None = None
+    limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -36,6 +45,9 @@ class FunnelProblem:
             "version": VERSION,
             "shape": self.shape,
             "gain": self.gain,
+            "search": self.search,
+            "objective": self.objective,
+            "rho": None if self.rho is None else self.rho.tolist(),
             "vector_field": self.field.document(),
             "nominal": {
                 "t": self.nominal.t.tolist(),
@@ -45,6 +57,7 @@ class FunnelProblem:
             "goal": goal,
             "Q": self.Q.tolist(),
             "R": self.R.tolist(),
+            "limits": self.limits.tolist(),
         }
 
     @classmethod
@@ -70,6 +83,12 @@ class FunnelProblem:
             _goal(document, field.n, source),
             _json.member(document, "shape", str, source=source),
             _json.member(document, "gain", str, source=source),
+            _json.member({"search": "sweep"} | document, "search", str, source=source),
+            _json.member({"objective": "volume"} | document, "objective", str, source=source),
+            None
+            if document.get("rho") is None
+            else _json.array(document, "rho", (None,), source=source),
+            _limits(document, source),
         )
 
     def design(self, progress: Progress | None = None) -> FunnelDesign:
@@ -80,10 +99,21 @@ class FunnelProblem:
             goal=self.goal,
             shape=self.shape,
             gain=self.gain,
+            search=self.search,
+            objective=self.objective,
+            rho=self.rho,
             Q=self.Q,
             R=self.R,
+            limits=self.limits if len(self.limits) else None,
             progress=progress,
         )
+
+
+def _limits(document: Json, source: str) -> FloatArray:
+    if "limits" not in document:
+        return np.zeros((0, 3))
+    rows = _json.member(document, "limits", list, source=source)
+    return _json.array(document, "limits", (len(rows), 3), source=source)
 
 
 def _goal(document: Json, n: int, source: str) -> Goal | None:

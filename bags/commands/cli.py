@@ -1,4 +1,4 @@
-"""The command line `nlsid`: identify, funnel, check, monitor, live, demo; `bag` for recordings."""
+"""The command line `nlsid`: identify, funnel, compose, check, monitor, live, demo, `bag` tools."""
 
 import importlib.util
 import sys
@@ -24,6 +24,7 @@ from bags.recordings.folders import expand_bags
 from nlsid_core.certificate import Mode
 from nlsid_core.certificate import check as check_proof
 from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
+from nlsid_core.funnels import compose_funnels
 from nlsid_core.monitor import Status
 
 app = typer.Typer(
@@ -110,6 +111,18 @@ def funnel(
     out.print(show.funnel_table(design))
     for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
         out.print(f"wrote {out_dir / name}", soft_wrap=True)
+
+
+@app.command()
+def compose(
+    proofs: Annotated[
+        list[Path], typer.Argument(help="funnel.proof.json files, in the order of time.")
+    ],
+    out_dir: OutOption,
+) -> None:
+    """Bind funnels that follow each other into one claim: composition.proof.json, for `check`."""
+    path = compose_funnels(proofs, out_dir)
+    out.print(f"wrote {path} and {4 * len(proofs)} files of its stages", soft_wrap=True)
 
 
 @app.command()

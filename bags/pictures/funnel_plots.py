@@ -1,17 +1,23 @@
 """Pictures of funnels around trajectories (extra `report`: matplotlib)."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, png
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, png
 from nlsid_core import _json
+from nlsid_core._types import FloatArray
 from nlsid_core.continuous import Funnel
-from nlsid_core.funnels import FunnelDesign
+from nlsid_core.funnels import FunnelDesign, Goal
 
-DECAY = 3.0  # of the first guess ρ = exp(-c (t_f - t)/(t_f - t₀)) drawn for comparison
-OUTLINES = 25
+OUTLINES = 80  # ellipses of a projected tube: their shadows join into one
+RINGS = 6  # of them drawn with a line
+PROJECTIONS = 3  # at most
+DECADE = 10.0  # of margins that differ by more the logarithm is drawn
 
 
 def write_funnel_picture(path: Path, design: FunnelDesign) -> None:
@@ -20,49 +26,122 @@ def write_funnel_picture(path: Path, design: FunnelDesign) -> None:
 
 
 def funnel_picture(design: FunnelDesign) -> Figure:
-    """The tube onto its first two states with the nominal; volume; certified margin over time."""
+    """Above, the tube with its nominal: onto pairs of states, and over time where there is room.
+
+    Below, the volume beside the first guess's, the widths, and the certified margin over time.
+    """
     funnel = design.funnel
-    figure = Figure(figsize=(12, 3.6), layout="constrained")
-    tube, volume, margin = figure.subplots(1, 3)
-    times = np.linspace(funnel.t0, funnel.tf, 200)
-    if funnel.n > 1:
-        for t in np.linspace(funnel.t0, funnel.tf, OUTLINES):
-            tube.fill(*funnel.outline(float(t), (0, 1)).T, color=BLUE, alpha=0.12, lw=0)
-        path = funnel.x(times)
-        tube.plot(path[:, 0], path[:, 1], color=INK, lw=LINE, label="nominal")
-        tube.set_xlabel("x0")
-        tube.set_ylabel("x1")
-    else:
-        middle = funnel.x(times)[:, 0]
-        width = np.array([1 / np.sqrt(funnel.shape(float(t))[0, 0]) for t in times])
-        tube.fill_between(times, middle - width, middle + width, color=BLUE, alpha=0.2, lw=0)
-        tube.plot(times, middle, color=INK, lw=LINE, label="nominal")
-        tube.set_xlabel("time [s]")
-        tube.set_ylabel("x0")
-    tube.legend(frameon=False)
-    first = Funnel(
-        funnel.x,
-        funnel.P / funnel.rho[:, None, None],
-        np.exp(-DECAY * (funnel.tf - funnel.t) / (funnel.tf - funnel.t0)),
-        "",
-        "",
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    rows: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    pairs = state_pairs(funnel.n)
+    over_time = range(min(funnel.n, PROJECTIONS - len(pairs)))
+    panels = np.atleast_1d(rows[0].subplots(1, len(pairs) + len(over_time)))
+    for axes, pair in zip(panels, pairs, strict=False):
+        _tube(axes, funnel, pair, design.goal)
+    for i, axes in zip(over_time, panels[len(pairs) :], strict=True):
+        _tube_over_time(axes, funnel, i)
+    panels[0].legend(frameon=False, fontsize=8)
+    volume, widths, margin = rows[1].subplots(1, 3)
+    _volume(volume, design)
+    _widths(widths, funnel)
+    _margin(margin, design)
+    for axes in (*panels, volume, widths, margin):
+        axes.grid(alpha=0.25, lw=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+        axes.xaxis.label.set_size(9)
+        axes.yaxis.label.set_size(9)
+    figure.suptitle(
+        f"funnel proved from {funnel.t0:g} to {funnel.tf:g} s: {len(design.proved.pieces)} pieces, "
+        f"least margin {np.min(design.proved.margins):.2g} 1/s",
+        fontsize=11,
+        x=0.01,
+        ha="left",
     )
-    volume.plot(
-        times, [first.volume(float(t)) for t in times], color=GREY, lw=LINE, label="scaled start"
-    )
-    volume.plot(
-        times, [funnel.volume(float(t)) for t in times], color=BLUE, lw=LINE, label="proved"
-    )
-    volume.set_xlabel("time [s]")
-    volume.set_ylabel("volume")
-    volume.legend(frameon=False)
-    pieces = design.proved.pieces
+    return figure
+
+
+def state_pairs(n: int) -> list[tuple[int, int]]:
+    """Which states are drawn against each other: 0-1, 2-3, 4-5, and the last two if n is odd."""
+    pairs = [(i, i + 1) for i in range(0, n - 1, 2)][:PROJECTIONS]
+    if n % 2 and 1 < n < 2 * PROJECTIONS:
+        pairs.append((n - 2, n - 1))
+    return pairs
+
+
+def _tube(axes: Axes, funnel: Funnel, pair: tuple[int, int], goal: Goal) -> None:
+    times = np.linspace(funnel.t0, funnel.tf, OUTLINES)
+    shadows = [funnel.outline(float(t), pair) for t in times]
+    axes.add_collection(PolyCollection(shadows, facecolors="#dbe8f4", edgecolors="none", zorder=1))
+    for t in np.linspace(funnel.t0, funnel.tf, RINGS):
+        ring = funnel.outline(float(t), pair)
+        axes.plot(*ring.T, color=BLUE, lw=0.7, alpha=0.8, zorder=2,
+                  label="tube" if t == funnel.t0 else None)  # fmt: skip
+    path = funnel.x(np.linspace(funnel.t0, funnel.tf, 400))[:, list(pair)]
+    axes.plot(*path.T, color=INK, lw=LINE, label="nominal", zorder=4)
+    axes.plot(*path[0], "o", color=INK, ms=5, mfc="white", label="start", zorder=5)
+    axes.plot(*path[-1], "o", color=INK, ms=5, label="end", zorder=5)
+    end = Funnel(
+        funnel.x, np.array([goal.P] * len(funnel.t)), np.ones(len(funnel.t)), "", ""
+    ).outline(funnel.tf, pair)
+    shifted = end + (goal.centre - funnel.nominal(funnel.tf))[list(pair)]
+    axes.plot(*shifted.T, color=ORANGE, lw=LINE, ls="--", label="goal", zorder=3)
+    axes.set_xlabel(f"x{pair[0]}")
+    axes.set_ylabel(f"x{pair[1]}")
+    axes.autoscale_view()
+
+
+def _tube_over_time(axes: Axes, funnel: Funnel, i: int) -> None:
+    times = np.linspace(funnel.t0, funnel.tf, 400)
+    middle, width = funnel.x(times)[:, i], _half_widths(funnel, times)[:, i]
+    axes.fill_between(times, middle - width, middle + width, color="#dbe8f4", lw=0, label="tube")
+    axes.plot(times, middle, color=INK, lw=LINE, label="nominal")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(f"x{i}")
+
+
+def _volume(axes: Axes, design: FunnelDesign) -> None:
+    times = np.linspace(design.funnel.t0, design.funnel.tf, 300)
+    for funnel, color, label in (
+        (design.first, GREY, "first guess, not proved"),
+        (design.funnel, BLUE, "proved"),
+    ):
+        volumes = [funnel.volume(float(t)) for t in times]
+        axes.plot(times, volumes, color=color, lw=1.5 * LINE, label=label)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("volume of {V ≤ 1}")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _widths(axes: Axes, funnel: Funnel) -> None:
+    times = np.linspace(funnel.t0, funnel.tf, 300)
+    widths = _half_widths(funnel, times)
+    for i in range(funnel.n):
+        color = (BLUE, ORANGE, INK, GREY)[i % 4]
+        line = ("-", "--", ":")[i // 4 % 3]
+        axes.plot(times, widths[:, i], color=color, ls=line, lw=LINE, label=f"x{i}")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("half-width of the tube, each state")
+    axes.legend(frameon=False, fontsize=8, ncols=-(-funnel.n // 6))
+
+
+def _margin(axes: Axes, design: FunnelDesign) -> None:
+    pieces, funnel = design.proved.pieces, design.funnel
     h = np.diff(funnel.t)[pieces.interval] / 2.0**pieces.level
     start = funnel.t[pieces.interval] + pieces.index * h
-    margin.hlines(design.proved.margins, start, start + h, color=BLUE, lw=2)
-    margin.set_yscale("log")
-    margin.set_xlabel("time [s]")
-    margin.set_ylabel("proved -dV/dt on the boundary [1/s]")
-    for axes in (tube, volume, margin):
-        axes.grid(alpha=0.25, lw=0.5)
-    return figure
+    axes.hlines(design.proved.margins, start, start + h, color=BLUE, lw=2)
+    if np.max(design.proved.margins) > DECADE * np.min(design.proved.margins):
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0, 1.1 * float(np.max(design.proved.margins)))
+        axes.ticklabel_format(axis="y", scilimits=(-2, 3))
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("certified -dV/dt on the boundary [1/s]")
+
+
+def _half_widths(funnel: Funnel, times: FloatArray) -> FloatArray:
+    """(times, n) the largest |x_i - x0_i| in the tube."""
+    shapes = np.array([funnel.shape(float(t)) for t in times])
+    return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(shapes), axis1=1, axis2=2)))

@@ -44,6 +44,14 @@ def _trajectory_funnel(claim: Json, proof: Json, about: Mapping[str, Json], mode
     return trajectory_funnel.decide(claim, proof, about, mode)
 
 
+def _funnel_composition(
+    claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode
+) -> Decision:
+    from nlsid_core.certificate import funnel_composition
+
+    return funnel_composition.decide(claim, proof, about, mode)
+
+
 CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
@@ -57,6 +65,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "region_of_attraction": attraction.decide,
         "implicit_stability": implicit.decide,
         "trajectory_funnel": _trajectory_funnel,
+        "funnel_composition": _funnel_composition,
     }
 )
 
@@ -75,15 +84,11 @@ def check(path: Path | str, *, mode: Mode = "exact") -> Verdict:
         raise ValueError(f"mode is {mode!r}; known: exact, rigorous")
     path = Path(path)
     try:
-        document = _json.load_document(path)
-        _json.header(document, FORMAT, VERSION, source=path.name)
-        _refuse_damage(document, path.name)
-        claim = _json.member(document, "claim", dict, source=path.name)
-        proof = _json.member(document, "proof", dict, source=path.name)
+        claim, proof = read_proof(_json.load_document(path), source=path.name)
         kind = _json.member(claim, "kind", str, source=path.name)
         if kind not in CLAIMS:
             raise CertificateRejected(f"claim '{kind}' is unknown; known: {', '.join(CLAIMS)}")
-        about = _files_named_in(claim, path)
+        about = files_named_in(claim, path)
         decision = CLAIMS[kind](claim, proof, about, mode)
     except (DataError, ValueError, ArithmeticError) as error:
         if isinstance(error, CertificateRejected):
@@ -105,6 +110,14 @@ def proof_document(claim: Json, proof: Json) -> Json:
     return document | {"digest": _json.digest(document)}
 
 
+def read_proof(document: Json, *, source: str) -> tuple[Json, Json]:
+    """Claim and proof of a proof file's content; raises if it is not one, or damaged."""
+    _json.header(document, FORMAT, VERSION, source=source)
+    _refuse_damage(document, source)
+    claim = _json.member(document, "claim", dict, source=source)
+    return claim, _json.member(document, "proof", dict, source=source)
+
+
 def _refuse_damage(document: Json, source: str) -> None:
     stated = _json.member(document, "digest", str, source=source)
     content = {key: value for key, value in document.items() if key != "digest"}
@@ -112,8 +125,11 @@ def _refuse_damage(document: Json, source: str) -> None:
         raise CertificateRejected(f"{source}: content does not match its own digest (damaged)")
 
 
-def _files_named_in(claim: Json, path: Path) -> dict[str, Json]:
-    """Load every file the claim is about from the proof's folder and compare its digest."""
+def files_named_in(claim: Json, path: Path) -> dict[str, Json]:
+    """Load every file the claim is about from the proof's folder and compare its digest.
+
+    Raises CertificateRejected or CertificateMismatch as `check` does.
+    """
     about: dict[str, Json] = {}
     for role, binding in _json.member(claim, "about", dict, source=path.name).items():
         if not isinstance(binding, dict):

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlsid_core._types import FloatArray
+from nlsid_core.certificate import saturation
 from nlsid_core.certificate.arithmetic import Arithmetic, Ball, Exact, Number
 from nlsid_core.certificate.graded import (
     Graded,
@@ -30,7 +31,8 @@ def closed_loop_polynomial(
     """unit·c(s, z) for every piece, and unit, a positive integer (1 in floating point).
 
     c = dρ/ds - 2x̄'P(hf - dx₀/ds) - x̄'(dP/ds)x̄ + μ(ρ - x̄'Px̄), x̄ = Tz, s in [0, 1] on the piece;
-    derivatives are with respect to s on the whole interval, of length h.
+    derivatives are with respect to s on the whole interval, of length h. Where inputs are limited,
+    f is that of the piece's mode, and what holds in the mode is taken off with its multipliers.
     """
     n, k = field.n, pieces.interval
     loop = _Loop(field, policy, funnel, pieces, arithmetic)
@@ -61,6 +63,8 @@ def closed_loop_polynomial(
     mu = _multiplier(pieces, arithmetic)
     rest = add(multiply(mu, add(level, negative(W)), n), negative(bend))
     rest = add(rest, {0: rho_rate[:, None, None]})
+    for term in saturation.in_mode(loop.demands, policy, pieces, arithmetic):
+        rest = add(rest, negative(term))
     return add({q: unit * part for q, part in rest.items()}, negative(growth)), loop.unit
 
 
@@ -187,7 +191,10 @@ class _Loop:
             w = self._half_sum(1.0)
         forms: list[Graded] = [{0: time[:, :, None]}]
         forms += [{0: x[:, :, i][:, :, None], 1: T[:, None, i]} for i in range(self.field.n)]
-        forms += [{0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)]
+        self.demands: list[Graded] = [
+            {0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)
+        ]
+        forms += saturation.clipped(self.demands, self.policy, self.pieces, self.arithmetic)
         forms += [{0: w[:, None, i][:, :, None]} for i in range(w.shape[1])]
         return forms
 

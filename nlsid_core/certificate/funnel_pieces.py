@@ -36,6 +36,8 @@ class Pieces:
     T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
     2 less than twice the basis'. gram: (B, 2, k(k+1)/2) upper triangles, row by row, of Q there.
     kappa: (n_w,) powers of two; then what w adds to ẋ is bounded with them and `vertex` is 0.
+    mode: (B, L) of the policy's modes. tau: (B, 2, L, (n+1)(n+2)/2) upper triangles at both ends of
+    S ⪰ 0, y'Sy with y = (1, z) the multiplier of what holds in that mode, see `saturation`.
     """
 
     basis: IntArray
@@ -46,6 +48,8 @@ class Pieces:
     T: FloatArray
     mu: FloatArray
     gram: FloatArray
+    mode: IntArray
+    tau: FloatArray
     kappa: FloatArray | None = None
 
     def __len__(self) -> int:
@@ -118,6 +122,7 @@ def _margins(
     field: VectorField, policy: Policy, funnel: Funnel, pieces: Pieces, arithmetic: Arithmetic
 ) -> FloatArray:
     refuse_singular(pieces)
+    refuse_indefinite(pieces)
     c, unit = closed_loop_polynomial(field, policy, funnel, pieces, arithmetic)
     coefficients, rows = _together(c, arithmetic, pieces.basis.shape[1])
     N = coefficients.shape[1] - 1
@@ -152,6 +157,14 @@ def refuse_singular(pieces: Pieces) -> None:
         rows = Exact.of(T).values
         if not dyadic.is_positive_definite((rows @ rows.T).tolist()):
             raise CertificateRejected("coordinates x̄ = Tz of a piece are singular")
+
+
+def refuse_indefinite(pieces: Pieces) -> None:
+    """Raise CertificateRejected unless every S is positive definite, and so in between too."""
+    n, count = pieces.T.shape[1], pieces.tau.shape[-1]
+    for S in _square(pieces.tau.reshape(-1, count), n + 1):
+        if not dyadic.is_positive_definite(Exact.of(S).values.tolist()):
+            raise CertificateRejected("the multiplier of a mode of the inputs is not nonnegative")
 
 
 def _lowest(Q: FloatArray, shift: float, arithmetic: Arithmetic) -> float:

@@ -6,17 +6,19 @@ W = x̄'Px̄ and dW/ds = 2x̄'P(hf - dx₀/ds) + x̄'(dP/ds)x̄ along the closed
 W = ρ, thesis (5.5), Lemma 5.2. In Bernstein form c = Σ_k c_k(z) s^k (1-s)^(N-k), and it is enough
 that every c_k = v'Q_k v with Q_k ≻ 0. The file states μ and Q at both ends of each piece; in
 between μ is linear and Q_k is found here, by least-norm correction of the interpolated one.
-Pieces have to cover every interval, for every vertex of the box of w (f is affine in each entry).
+Pieces have to cover every interval, for every vertex of the box of w (f is affine in each entry)
+and every mode of a policy with limits (see `saturation`).
 """
 
 from collections.abc import Mapping
 from fractions import Fraction
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from nlsid_core import _json
-from nlsid_core._types import FloatArray, Json
+from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.certificate import containment
 from nlsid_core.certificate import polynomial_data as data
 from nlsid_core.certificate.funnel_pieces import Pieces, decide_pieces
@@ -64,19 +66,31 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
         )
         goal_text = ", and ends in the goal"
     refuse_invalid(field, policy, funnel)
-    pieces = read_pieces(proof, field.n)
+    pieces = read_pieces(proof, field.n, len(policy.limits))
     if pieces.kappa is not None:
         refuse_kappa(pieces.kappa, field)
-    refuse_gaps(pieces, field, funnel)
+    refuse_gaps(pieces, field, funnel, policy.modes())
     margin = decide_pieces(field, policy, funnel, pieces, mode)
     names = field.names[1:]
-    valid_text = "".join(
-        f", {names[int(j)]} within [{low:g}, {high:g}]" for j, low, high in field.valid.tolist()
+    if len(field.pieces) > 1 and len(field.valid):
+        valid_text = ", x and u within the bounds `valid` of each time span"
+    else:
+        valid_text = "".join(
+            f", {names[j]} within [{low:g}, {high:g}]" for j, low, high in field.validity(0)
+        )
+    clipped = "".join(
+        f", {names[field.n + int(i)]} clipped to [{low:g}, {high:g}]"
+        for i, low, high in policy.limits.tolist()
     )
     bounds = ", ".join(
         f"w{j} in [{low:g}, {high:g}]" for j, (low, high) in enumerate(field.uncertain)
     )
-    limited = set(range(field.n, field.n + field.m)) <= set(field.valid[:, 0].astype(int).tolist())
+    unlimited = " and without other saturation" if clipped else " and without saturation"
+    limited = set(policy.limits[:, 0].astype(int).tolist()).union(
+        set.intersection(
+            *({j - field.n for j, *_ in field.validity(i)} for i in range(len(field.pieces)))
+        )
+    )
     return Decision(
         statement=(
             f"funnel: every solution in it at a time in [{funnel.t0:g}, {funnel.tf:g}] s stays in "
@@ -86,7 +100,8 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
         margin=margin,
         assumptions=(
             "the state obeys the stored dynamics with the stored policy, applied continuously"
-            + ("" if limited else " and without saturation"),
+            + clipped
+            + ("" if set(range(field.m)) <= limited else unlimited),
             *((f"at every time {bounds}",) if bounds else ()),
         ),
     )
@@ -102,8 +117,11 @@ def refuse_goal(funnel: Funnel, centre: FloatArray, P: FloatArray, multiplier: f
         raise CertificateRejected("the funnel does not end in the goal ellipsoid")
 
 
-def read_pieces(proof: Json, n: int) -> Pieces:
-    """The pieces of a proof as arrays; DocumentError if they are not what they should be."""
+def read_pieces(proof: Json, n: int, limited: int) -> Pieces:
+    """The pieces of a proof as arrays; DocumentError if they are not what they should be.
+
+    limited: how many inputs have limits.
+    """
     basis = _json.array(proof, "basis", (None, n), source="proof")
     small = (basis >= 0).all() and (basis.sum(axis=1) <= MAX_BASIS_DEGREE).all()
     if not (small and (basis == np.round(basis)).all()):
@@ -119,21 +137,36 @@ def read_pieces(proof: Json, n: int) -> Pieces:
     size = len(exponents) * (len(exponents) + 1) // 2
     terms = Pieces.multiplier_size(exponents)
     whole: dict[str, list[int]] = {key: [] for key in ("interval", "vertex", "level", "index")}
-    T, mu, gram = [], [], []
+    T, mu, gram, mode, tau = [], [], [], [], []
+    sides = (n + 1) * (n + 2) // 2
+    keys = {*whole, "T", "mu", "gram"} | ({"mode", "tau"} if limited else set())
     for number, entry in enumerate(entries):
         source = f"piece {number}"
         if not isinstance(entry, dict):
             raise CertificateRejected(f"{source} should be an object")
-        data.only(entry, {*whole, "T", "mu", "gram"}, source=source)
+        data.only(entry, keys, source=source)
         for key, values in whole.items():
             values.append(_json.member(entry, key, int, source=source))
         T.append(_json.array(entry, "T", (n, n), source=source))
         mu.append(_json.array(entry, "mu", (2, terms), source=source))
         gram.append(_json.array(entry, "gram", (2, size), source=source))
+        if limited:
+            mode.append(_json.array(entry, "mode", (limited,), source=source))
+            tau.append(_json.array(entry, "tau", (2, limited, sides), source=source))
     columns = {key: np.array(values, dtype=np.int64) for key, values in whole.items()}
     kappa = _json.array(proof, "kappa", (None,), source="proof") if "kappa" in proof else None
+    modes = np.array(mode).reshape(len(entries), limited)
+    if not np.isin(modes, (-1, 0, 1)).all():
+        raise CertificateRejected("a mode should be -1 (low), 0 (free) or 1 (high) per limit")
     return Pieces(
-        exponents, **columns, T=np.array(T), mu=np.array(mu), gram=np.array(gram), kappa=kappa
+        exponents,
+        **columns,
+        T=np.array(T),
+        mu=np.array(mu),
+        gram=np.array(gram),
+        mode=modes.astype(np.int64),
+        tau=np.array(tau).reshape(len(entries), 2, limited, sides),
+        kappa=kappa,
     )
 
 
@@ -151,11 +184,14 @@ def refuse_invalid(field: VectorField, policy: Policy, funnel: Funnel) -> None:
     """Raise CertificateRejected unless x and u stay where the dynamics are valid, exactly.
 
     |g'x̄| ≤ d wherever W ≤ ρ if d²P - ρgg' ⪰ 0, which holds between knots if it does at them.
-    Centres and gains between knots are convex combinations of their control points.
+    Centres and gains between knots are convex combinations of their control points. An input with
+    limits inside those bounds stays there by itself.
     """
-    for j, low, high in field.valid.tolist():
-        entry = int(j)
-        for k in range(len(funnel.t) - 1):
+    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
+    for k in range(len(funnel.t) - 1):
+        for entry, low, high in field.validity(field.span(float(funnel.t[k]))):
+            if entry in clipped and low <= clipped[entry][0] and clipped[entry][1] <= high:
+                continue
             centre, rows = policy.entry(entry, k)
             middle = [Fraction(c) for c in centre.tolist()]
             room = min(Fraction(high) - max(middle), min(middle) - Fraction(low))
@@ -174,37 +210,36 @@ def refuse_invalid(field: VectorField, policy: Policy, funnel: Funnel) -> None:
                         )
 
 
-def refuse_gaps(pieces: Pieces, field: VectorField, funnel: Funnel) -> None:
-    """Raise CertificateRejected unless the pieces cover all time for every vertex of w."""
+def refuse_gaps(pieces: Pieces, field: VectorField, funnel: Funnel, modes: IntArray) -> None:
+    """Raise CertificateRejected unless the pieces cover all time, every vertex of w, every mode."""
     intervals = len(funnel.t) - 1
     vertices = len(field.vertices()) if pieces.kappa is None else 1
     missing = np.setdiff1d(field.breaks[(field.breaks > funnel.t0) & (field.breaks < funnel.tf)],
                            funnel.t)  # fmt: skip
     if len(missing):
         raise CertificateRejected(f"the dynamics change at {missing[0]:g} s, which is no knot")
-    covered: dict[tuple[int, int], Fraction] = {}
-    table = zip(pieces.interval.tolist(), pieces.vertex.tolist(), pieces.level.tolist(),
-                pieces.index.tolist(), strict=True)  # fmt: skip
-    for k, v, level, index in sorted(
-        table, key=lambda e: (e[0], e[1], Fraction(e[3], 2 ** min(e[2], 16)))
+    covered: dict[tuple[int, int, tuple[int, ...]], Fraction] = {}
+    table = zip(pieces.interval.tolist(), pieces.vertex.tolist(), map(tuple, pieces.mode.tolist()),
+                pieces.level.tolist(), pieces.index.tolist(), strict=True)  # fmt: skip
+    for k, v, mode, level, index in sorted(
+        table, key=lambda e: (*e[:3], Fraction(e[4], 2 ** min(e[3], 16)))
     ):
         if not (0 <= k < intervals and 0 <= v < vertices):
             raise CertificateRejected(f"a piece is about interval {k}, vertex {v}, which is none")
         if not (0 <= level <= 16 and 0 <= index < 2**level):
             raise CertificateRejected(f"part {index} of 2^{level} is none of an interval's parts")
-        start, end = covered.get((k, v), Fraction(0)), Fraction(index + 1, 2**level)
+        start, end = covered.get((k, v, mode), Fraction(0)), Fraction(index + 1, 2**level)
         if Fraction(index, 2**level) > start:
             raise CertificateRejected(
-                f"a piece is missing in interval {k} (vertex {v}): from s = {start}"
+                f"a piece is missing in interval {k} (vertex {v}, mode {mode}): from s = {start}"
             )
-        covered[k, v] = max(start, end)
-    for k in range(intervals):
-        for v in range(vertices):
-            if covered.get((k, v), Fraction(0)) < 1:
-                raise CertificateRejected(
-                    f"a piece is missing: interval {k} from {funnel.t[k]:g} to "
-                    f"{funnel.t[k + 1]:g} s (vertex {v}) is not covered"
-                )
+        covered[k, v, mode] = max(start, end)
+    for k, v, mode in product(range(intervals), range(vertices), map(tuple, modes.tolist())):
+        if covered.get((k, v, mode), Fraction(0)) < 1:
+            raise CertificateRejected(
+                f"a piece is missing: interval {k} from {funnel.t[k]:g} to {funnel.t[k + 1]:g} s "
+                f"(vertex {v}, mode {mode}) is not covered"
+            )
 
 
 def _refuse_strangers(
@@ -229,6 +264,7 @@ def _refuse_strangers(
 
 def document_pieces(pieces: Pieces) -> list[Any]:
     """The pieces as JSON, read back by `read_pieces`."""
+    limited = pieces.mode.shape[1] > 0
     return [
         {
             "interval": int(pieces.interval[i]),
@@ -239,5 +275,6 @@ def document_pieces(pieces: Pieces) -> list[Any]:
             "mu": pieces.mu[i].tolist(),
             "gram": pieces.gram[i].tolist(),
         }
+        | ({"mode": pieces.mode[i].tolist(), "tau": pieces.tau[i].tolist()} if limited else {})
         for i in range(len(pieces))
     ]

@@ -9,6 +9,7 @@ from nlsid_core.continuous.piecewise import (
     linear_through,
 )
 from nlsid_core.continuous.policy import Policy
+from nlsid_core.continuous.taylor import expand, taylor_field
 from nlsid_core.continuous.vector_field import VectorField
 
 __all__ = [
@@ -19,5 +20,7 @@ __all__ = [
     "VectorField",
     "constant_on",
     "cubic_through",
+    "expand",
     "linear_through",
+    "taylor_field",
 ]

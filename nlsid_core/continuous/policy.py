@@ -1,17 +1,19 @@
 """`Policy`: u = u₀(t) - K(t) (x - x₀(t)) around a nominal motion, all piecewise polynomials."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.continuous.piecewise import PiecewisePolynomial
 from nlsid_core.errors import DataError, ShapeError
 
 FORMAT = "nlsid/trajectory_policy"
 VERSION = 1
+MAX_LIMITED = 3  # inputs: 27 modes, each proved
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +21,8 @@ class Policy:
     """x: nominal states (n,), u: nominal inputs (m,), K: gains (m, n), on the same knots.
 
     K may be constant, linear or cubic on each piece. x has to be continuous. vector_field: digest
-    of the dynamics the policy was made for. Units are those of the dynamics, SI.
+    of the dynamics the policy was made for. Units are those of the dynamics, SI. limits: (L, 3)
+    rows (input, low, high): that input is clipped to [low, high].
 
     Raises ShapeError or DataError on parts that do not fit.
     """
@@ -28,6 +31,7 @@ class Policy:
     u: PiecewisePolynomial
     K: PiecewisePolynomial
     vector_field: str
+    limits: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         n, m = self.x.control.shape[2:], self.u.control.shape[2:]
@@ -38,6 +42,21 @@ class Policy:
                 raise DataError("x, u and K of a policy should have the same knots")
         if not self.x.is_continuous():
             raise DataError("the nominal states of a policy should be continuous")
+        limits = np.array(self.limits, dtype=np.float64).reshape(-1, 3)
+        inputs = limits[:, 0].tolist()
+        sound = np.isfinite(limits).all() and (limits[:, 1] < limits[:, 2]).all()
+        if not sound or not set(inputs) <= set(range(*m)) or len(set(inputs)) < len(inputs):
+            raise DataError(
+                f"rows of limits should be (input, low, high), low < high, each of {m[0]} inputs "
+                f"at most once; they are {limits.tolist()}"
+            )
+        if len(limits) > MAX_LIMITED:
+            raise DataError(
+                f"{len(limits)} limited inputs make 3^{len(limits)} modes; at most {MAX_LIMITED} "
+                "are decided: keep the others within their limits by rows of the dynamics' valid"
+            )
+        limits.setflags(write=False)
+        object.__setattr__(self, "limits", limits)
 
     @property
     def t(self) -> FloatArray:
@@ -47,7 +66,19 @@ class Policy:
     def __call__(self, t: float, X: ArrayLike) -> FloatArray:
         """Inputs (N, m) at time t for states X (N, n)."""
         X = np.asarray(X, dtype=np.float64)
-        return np.asarray(self.u(t) - (X - self.x(t)) @ self.K(t).T)
+        return self.clipped(self.u(t) - (X - self.x(t)) @ self.K(t).T)
+
+    def clipped(self, U: FloatArray) -> FloatArray:
+        """Inputs (N, m) within the limits."""
+        result = np.array(U, dtype=np.float64)
+        for i, low, high in self.limits.tolist():
+            result[:, int(i)] = np.clip(result[:, int(i)], low, high)
+        return result
+
+    def modes(self) -> IntArray:
+        """(3^L, L) every combination of 0: free, -1: at its low limit, 1: at its high limit."""
+        rows = list(product((0, -1, 1), repeat=len(self.limits)))
+        return np.array(rows, dtype=np.int64).reshape(len(rows), len(self.limits))
 
     def entry(self, j: int, k: int) -> tuple[FloatArray, FloatArray]:
         """Entry j of (x, u) on piece k: control points of its nominal, and rows g (r, n).
@@ -64,12 +95,13 @@ class Policy:
         return {
             "format": FORMAT,
             "version": VERSION,
-            "law": "u = u0(t) - K(t) (x - x0(t)); pieces in Bernstein form",
+            "law": "u = clip(u0(t) - K(t) (x - x0(t))); pieces in Bernstein form",
             "vector_field": self.vector_field,
             "t": self.t.tolist(),
             "x": self.x.control.tolist(),
             "u": self.u.control.tolist(),
             "K": self.K.control.tolist(),
+            "limits": self.limits.tolist(),
         }
 
     @classmethod
@@ -83,11 +115,13 @@ class Policy:
             K = _json.array(document, "K", (None, None, None, None), source=source)
         else:  # an autonomous system: JSON cannot tell the shape of nothing
             K = np.zeros((len(x), 1, 0, x.shape[2]))
+        rows = _json.member(document, "limits", list, source=source)
         return cls(
             PiecewisePolynomial(t, x),
             PiecewisePolynomial(t, u),
             PiecewisePolynomial(t, K),
             _json.member(document, "vector_field", str, source=source),
+            _json.array(document, "limits", (len(rows), 3), source=source),
         )
 
     @classmethod

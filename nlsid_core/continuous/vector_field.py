@@ -32,7 +32,7 @@ class VectorField:
     bounds of w, which may vary arbitrarily in time within its box: bounded disturbances and
     uncertain parameters; w has to enter with degree at most one in each entry. valid: (D, 3) rows
     (j, low, high): the equations describe the system only where entry j of (x, u) is within; a
-    proved funnel stays there.
+    proved funnel stays there. Rows (j, low, high, span), (D, 4), hold in that time span only.
 
     Raises ShapeError or DataError on equations that do not fit.
     """
@@ -60,9 +60,19 @@ class VectorField:
             raise DataError(f"breaks should be increasing times, are {breaks}")
         names = ("t", *variable_names(self.n, self.m, len(bounds)))
         object.__setattr__(self, "names", names)
-        valid = np.array(self.valid, dtype=np.float64).reshape(-1, 3)
-        if not (np.isfinite(valid).all() and np.isin(valid[:, 0], range(self.n + self.m)).all()):
-            raise DataError(f"rows of valid should be (entry of (x, u), low, high), are {valid}")
+        valid = np.array(self.valid, dtype=np.float64)
+        if valid.size == 0:
+            valid = np.zeros((0, 3))
+        sound = valid.ndim == 2 and valid.shape[1] in (3, 4) and np.isfinite(valid).all()
+        if not (
+            sound
+            and np.isin(valid[:, 0], range(self.n + self.m)).all()
+            and np.isin(valid[:, 3:], range(len(self.pieces))).all()
+        ):
+            raise DataError(
+                "rows of valid should be (entry of (x, u), low, high), and the span where only "
+                f"one is meant; they are {valid.tolist()}"
+            )
         if not self.pieces or len(self.pieces) != len(breaks) + 1:
             raise ShapeError(f"{len(self.pieces)} sets of equations for {len(breaks)} breaks")
         pieces = []
@@ -91,8 +101,7 @@ class VectorField:
     ) -> "VectorField":
         """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
 
-        Raises NotPolynomial naming the operation; a Taylor polynomial is then the way, with its
-        remainder as an uncertain w.
+        Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
         """
         bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
         given = tuple(inspect.signature(function).parameters)
@@ -109,8 +118,8 @@ class VectorField:
             traced = trace(called, {name: sizes[name] for name in given})
         except NotPolynomial as error:
             raise NotPolynomial(
-                f"{error}. Give its Taylor polynomial instead, and what it leaves out on "
-                "the states of interest as an uncertain w with bounds"
+                f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
+                "leave out; or give a polynomial, and what it leaves out as a bounded w"
             ) from error
         if traced.shape != (n,):
             raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")
@@ -185,6 +194,11 @@ class VectorField:
         """The index of the equations that hold from time t on."""
         return int(np.searchsorted(self.breaks, t, side="right"))
 
+    def validity(self, span: int) -> list[tuple[int, float, float]]:
+        """(entry of (x, u), low, high) for every bound that holds in this span."""
+        rows = self.valid[(self.valid[:, 3:] == span).all(axis=1)]
+        return [(int(j), low, high) for j, low, high in rows[:, :3].tolist()]
+
     def __call__(
         self,
         t: float,
@@ -255,7 +269,7 @@ class VectorField:
             pieces.append(tuple(read))
         breaks = _json.array(document, "breaks", (None,), source=source)
         rows = _json.member(document, "valid", list, source=source)
-        valid = _json.array(document, "valid", (len(rows), 3), source=source)
+        valid = _json.array(document, "valid", (len(rows), None), source=source)
         return cls(tuple(pieces), n, m, breaks, bounds, valid)
 
 
@@ -306,18 +320,6 @@ def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:
         f"{letter}{i}"
         for letter, size in (("x", n), ("u", m), ("w", uncertain))
         for i in range(size)
-    )
-
-
-def joined(fields: Sequence[VectorField], breaks: ArrayLike) -> VectorField:
-    """One vector field that follows the given ones in turn, changing at the times `breaks`."""
-    first = fields[0]
-    return VectorField(
-        tuple(part for f in fields for part in f.pieces),
-        first.n,
-        first.m,
-        np.asarray(breaks, dtype=np.float64),
-        first.uncertain,
     )
 
 

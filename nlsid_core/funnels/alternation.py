@@ -7,45 +7,41 @@ relaxation, thesis (6.7), and proves nothing: only a proof for every t makes a f
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
 from nlsid_core.continuous import Funnel, Policy
-from nlsid_core.errors import Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.knots import KnotForms
 from nlsid_core.funnels.lstep import LSteps, section_at, sections
 from nlsid_core.funnels.pieces import Proved, prove_pieces, unsolved
+from nlsid_core.funnels.sampled import Sampled
 from nlsid_core.funnels.sweep import Ends, Progress, sweep_rho
-from nlsid_core.funnels.vstep import improve, largest_level
+from nlsid_core.funnels.vstep import MAX_DEGREE, improve, largest_level
 
 STOP = 0.025  # thesis: growth of the volume below which the alternation has converged
 MAX_ITERATIONS = 30
 TRUST = 0.5  # of P in the V-step: the volume is linearised at the present one
 SHAPE_MARGIN = 16.0  # times the sweep's margin: with P(t) free there is volume to pay it with
+OBJECTIVES = ("volume", "reference")
 ROOM = 10.0  # times the margin, at the start, so that the first V-step has somewhere to go
 HIGHEST_DECAY = 40.0  # of the exponential start
 
 
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """A funnel that holds at its knots, which is no proof, and ∫ volume dt of every iterate."""
-
-    funnel: Funnel
-    volumes: tuple[float, ...]
-
-
-def exponential_start(steps: LSteps, policy: Policy, P: FloatArray) -> Funnel:
-    """ρ(t) = exp(-c (t_f - t)/(t_f - t₀)), c the least whole number that holds (Prop 6.2).
+def exponential_start(
+    steps: LSteps, policy: Policy, P: FloatArray, *, rho_final: float = 1.0
+) -> Funnel:
+    """ρ(t) = ρ(t_f) exp(-c (t_f - t)/(t_f - t₀)), c the least whole number that holds (Prop 6.2).
 
     Raises Infeasible if none up to 40 does.
     """
     t = policy.t
     decay = 0.0
     while decay <= HIGHEST_DECAY:
-        rho = np.exp(-decay * (t[-1] - t) / (t[-1] - t[0]))
+        rho = rho_final * np.exp(-decay * (t[-1] - t) / (t[-1] - t[0]))
         funnel = Funnel(policy.x, P, rho, policy.vector_field, "")
         if least_margin(funnel, solve_ends(steps, policy, funnel)) > 0:
             return funnel
@@ -81,20 +77,57 @@ def least_margin(funnel: Funnel, ends: Sequence[Ends]) -> float:
     return float(min(margins))
 
 
-def alternate_rho(steps: LSteps, policy: Policy, funnel: Funnel, *, stop: float = STOP) -> Sampled:
-    """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f).
+def refuse_start(funnel: Funnel, ends: Sequence[Ends]) -> None:
+    """Raise Infeasible, with what to try, unless the L-steps at the knots of a first ρ hold."""
+    margin = least_margin(funnel, ends)
+    if margin <= 0:
+        raise Infeasible(
+            f"the first rho does not hold: its margin is {margin:.3g} 1/s at worst. Try one that "
+            "grows faster towards t_f, a smaller one, or none: an exponential one is then found"
+        )
+
+
+def refuse_shape(steps: LSteps) -> None:
+    """Raise DataError where V-steps do not apply: pushes, limits, or a degree above 3."""
+    if len(steps.limits):
+        raise DataError(
+            "V-steps (shape P, alternation) search one polynomial at a time: with limits take "
+            "shape rho by the sweep"
+        )
+    if steps.kappa is not None:
+        raise DataError("V-steps take w at its corners: they are for fewer than three pushes")
+    if steps.field.degree > MAX_DEGREE:
+        raise DataError(
+            f"V-steps (shape P, alternation) are for dynamics of degree up to {MAX_DEGREE}, not "
+            f"{steps.field.degree}: take shape rho by the sweep, or a Taylor polynomial of degree "
+            f"{MAX_DEGREE} with its remainder as an uncertain w"
+        )
+
+
+def alternate_rho(
+    steps: LSteps,
+    policy: Policy,
+    funnel: Funnel,
+    *,
+    margin: float = 0.0,
+    stop: float = STOP,
+    iterations: int = MAX_ITERATIONS,
+    executor: Executor | None = None,
+) -> Sampled:
+    """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f) and, where the start has it, a margin in 1/s.
 
     With the multipliers fixed, each V-step takes the largest ρ at a knot after the one behind it:
     at both ends of an interval the constraint is an interval of ρ that contains the present one.
     """
     volumes = [funnel.volume_integral()]
-    for _ in range(MAX_ITERATIONS):
-        ends = solve_ends(steps, policy, funnel)
+    for _ in range(iterations):
+        ends = solve_ends(steps, policy, funnel, executor=executor)
         forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
         rho = funnel.rho.copy()
         for k in range(len(rho) - 2, -1, -1):
             levels = []
             for constant, slope in forms.levels(k, rho[k + 1]):
+                constant[0] -= margin
                 try:
                     levels.append(largest_level(constant, slope, forms.basis))
                 except SolverError:

@@ -43,7 +43,7 @@ class KnotForms:
         for end in (0, 1):
             T = np.array([self.frames[k + end] for k in range(intervals)])
             parts = [Part(k, 0, 0) for k in range(intervals)]
-            blank = draft(steps.program, parts, np.repeat(T, v, axis=0), v)
+            blank = draft(steps, parts, np.repeat(T, v, axis=0))
             errors = np.empty((len(blank), n, _count(n, steps.field.degree)))
             for chosen in batches(steps.field, funnel, blank):
                 alike = blank.select(chosen)

@@ -13,8 +13,12 @@ from nlsid_core.sos.sphere import SphereSolution
 
 @dataclass(frozen=True, eq=False)
 class LineProgram:
-    """What `SphereProgram` is for two and more variables; v = (z, z²), points z = 1 and z = -1."""
+    """What `SphereProgram` is for two and more variables; v = (z, z²), points z = 1 and z = -1.
 
+    half: of the degree of the polynomial whose values are given; it has no part in the solution.
+    """
+
+    half: int = 2
     n: int = 1
     chosen: tuple[int, ...] = (0,)
     basis: IntArray = field(default_factory=lambda: np.array([[1], [2]]))

@@ -4,18 +4,19 @@ In coordinates x̄ = √ρ L⁻ᵀz, P = LL', the boundary is |z| = 1 at every t
 depend on ρ̇. Source: thesis (6.4), in the sphere form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.continuous import Policy, VectorField
 from nlsid_core.continuous.piecewise import bernstein
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.line import LineProgram
+from nlsid_core.funnels.modes import multipliers
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
-MAX_DEGREE = 3  # of f: then Ẇ has degree 4, as much as the sphere program's squares
+MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +58,12 @@ def section_at(field: VectorField, policy: Policy, P: FloatArray, k: int, s: flo
     )
 
 
-def sections(field: VectorField, policy: Policy, P: FloatArray) -> list[tuple[Section, Section]]:
-    """The start and the end of every interval, each seen from inside it."""
+def sections(
+    field: VectorField, policy: Policy, P: FloatArray, *, count: int = 2
+) -> list[list[Section]]:
+    """`count` equally spaced instants of every interval, its ends included, seen from inside it."""
     return [
-        (section_at(field, policy, P, k, 0.0), section_at(field, policy, P, k, 1.0))
+        [section_at(field, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
         for k in range(len(policy.t) - 1)
     ]
 
@@ -75,18 +78,32 @@ def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
     return T
 
 
-class LSteps:
-    """L-steps of one vector field; holds the sphere program and counts what is solved."""
+def refuse_degree(field: VectorField) -> None:
+    """Raise DataError for dynamics of a degree that no program here is for."""
+    if field.degree > MAX_DEGREE:
+        raise DataError(
+            f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
+            "take a Taylor polynomial of lower degree, and its remainder as an uncertain w "
+            "with bounds"
+        )
 
-    def __init__(self, field: VectorField, *, tolerance: float = 1e-5) -> None:
-        if field.degree > MAX_DEGREE:
-            raise DataError(
-                f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
-                "take a Taylor polynomial, and its remainder as an uncertain w"
-            )
+
+class LSteps:
+    """L-steps of one vector field; holds the sphere program and counts what is solved.
+
+    A case is a vertex of w in a mode of the policy: every vertex in the first mode comes first.
+    limits and modes: of the policy, if its inputs are clipped.
+    """
+
+    def __init__(
+        self, field: VectorField, policy: Policy | None = None, *, tolerance: float = 1e-5
+    ) -> None:
+        refuse_degree(field)
         self.field = field
         self.tolerance = tolerance
-        self.program = sphere_program(field)
+        self.limits = np.zeros((0, 3)) if policy is None else policy.limits
+        self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
+        self.program = sphere_program(field, reduced=len(self.limits) == 0)
         self.kappa: FloatArray | None = None
         self.vertices = field.vertices()
         self.solved = 0
@@ -102,10 +119,24 @@ class LSteps:
             self.kappa = np.exp2(np.round(-np.log2(largest)))
             self.vertices = self.field.uncertain.mean(axis=1)[None]
 
-    def values(self, section: Section, rho: float, vertex: int) -> FloatArray:
-        """-Ẇ/ρ at the program's points, straight from the vector field."""
+    @property
+    def cases(self) -> int:
+        """Vertices times modes."""
+        return len(self.vertices) * len(self.modes)
+
+    def split(self, case: int) -> tuple[int, IntArray]:
+        """The vertex and the mode of a case."""
+        mode, vertex = divmod(case, len(self.vertices))
+        return vertex, self.modes[mode]
+
+    def values(self, section: Section, rho: float, case: int) -> FloatArray:
+        """-Ẇ/ρ at the program's points, straight from the vector field in the case's mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        vertex, mode = self.split(case)
         u = section.u - x_bar @ section.K.T
+        for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
+            if side:
+                u[:, int(i)] = low if side < 0 else high
         w = self.vertices[vertex]
         rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
@@ -123,33 +154,66 @@ class LSteps:
         The reduced basis has no product for it; the proof's Gram matrix, which has 1, does.
         """
         linear = [j for j in range(self.program.n) if j not in self.program.chosen]
+        if not linear:
+            return np.zeros(len(self.program.points))
         rate = self.field(section.t, section.x[None], section.u[None], span=section.span)[0]
         slope = -2 * section.base.T @ section.P @ (rate - section.x_rate) / np.sqrt(rho)
         return np.asarray(self.program.points[:, linear] @ slope[linear])
 
+    def in_mode(self, section: Section, rho: float, case: int) -> FloatArray:
+        """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
+        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        demand = section.u - x_bar @ section.K.T
+        _, mode = self.split(case)
+        rows = []
+        for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
+            above, below = demand[:, int(i)] - low, high - demand[:, int(i)]
+            rows.append(above * below if side == 0 else -above if side < 0 else -below)
+        return np.array(rows).reshape(len(self.limits), len(x_bar))
+
     def solve(
         self, section: Section, rho: float, start: list[SphereSolution] | None = None
     ) -> list[SphereSolution]:
-        """φ for every vertex of w."""
+        """φ for every case."""
         found = []
-        for v in range(len(self.vertices)):
-            g = self.values(section, rho, v)
-            warm = None if start is None else start[v]
-            found.append(self.program.solve(g, tolerance=self.tolerance, start=warm))
+        for case in range(self.cases):
+            g = self.values(section, rho, case)
+            warm = None if start is None else start[case]
+            tau: FloatArray = np.zeros((0, 0, 0))
+            if len(self.limits):
+                tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
+                g = g - products
+            solved = self.program.solve(g, tolerance=self.tolerance, start=warm)
+            found.append(replace(solved, tau=tau))
             self.solved += 1
         return found
 
     def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
-        """An upper bound of φ at another ρ or section, from dual solutions: no program solved."""
-        bounds = [float(self.values(section, rho, v) @ d.y) for v, d in enumerate(duals)]
+        """An upper bound of φ at another ρ or section, from dual solutions: no program solved.
+
+        With limits it is an estimate: the multipliers of the mode stay what they are.
+        """
+        bounds = []
+        y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
+        for case, d in enumerate(duals):
+            g = self.values(section, rho, case)
+            if len(self.limits):
+                q = self.in_mode(section, rho, case)
+                g = g - np.einsum("ln,na,lab,nb->n", q, y, d.tau, y)
+            bounds.append(float(g @ d.y))
         return min(bounds)
 
 
-def sphere_program(field: VectorField) -> SphereProgram | LineProgram:
-    """The program for this field: nonlinear states last, degree 2 only where they occur."""
+def sphere_program(field: VectorField, *, reduced: bool = True) -> SphereProgram | LineProgram:
+    """The program for this field: squares of half the degree of Ẇ.
+
+    Up to degree 3, nonlinear states come last, and degree 2 only where they occur. reduced: False
+    keeps every product, for multipliers in all states.
+    """
     n, count = field.n, len(field.nonlinear_states)
+    half = max(2, (field.degree + 2) // 2)
     if n == 1:
-        return LineProgram()
-    if count in (0, n):
-        return SphereProgram(n)
+        return LineProgram(half=half)
+    if half > 2 or count in (0, n) or not reduced:
+        return SphereProgram(n, half=half)
     return SphereProgram(n, tuple(range(n - count, n)))

@@ -1,7 +1,6 @@
 """A motion to track and what follows it: direct transcription, time-varying LQR, observer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,21 +10,16 @@ from nlsid_core import _json, conic
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
+from nlsid_core.funnels.riccati import Feedback, discrete_tvlqr
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
+
+__all__ = ["Feedback", "observer_gain", "plan_motion", "track", "tvlqr"]
 
 ITERATIONS = 30  # of linearising the model around the last motion
 SETTLED = 1e-6  # largest defect of a motion, in half-widths of the data box, when it is done
 RESERVE = 0.1  # of the box's half-width, kept free for feedback and funnel
 SMOOTHNESS = 10.0  # weight of changes of the input against the input itself
-
-
-@dataclass(frozen=True, eq=False)
-class Feedback:
-    """K (N, p, n) of u = u_k - K_k x̄, and P (N + 1, n, n), the cost to go x̄'P_k x̄."""
-
-    K: FloatArray
-    P: FloatArray
 
 
 def plan_motion(
@@ -78,17 +72,10 @@ def tvlqr(
     """Time-varying LQR around a motion, weights relative to half the data box squared."""
     half_x, half_u = (np.diff(r, axis=1)[:, 0] / 2 for r in (model.x_range, model.u_range))
     Q, R = np.diag(state_weight / half_x**2), np.diag(input_weight / half_u**2)
-    A, B = model.linearised(x[-1], u[-1])
-    P = [solve_discrete_are(A, B, Q, R)]
-    K = []
-    for x_k, u_k in zip(x[-2::-1], u[::-1], strict=True):
-        A, B = model.linearised(x_k, u_k)
-        gain = np.linalg.solve(R + B.T @ P[-1] @ B, B.T @ P[-1] @ A)
-        closed = A - B @ gain
-        cost = Q + gain.T @ R @ gain + closed.T @ P[-1] @ closed
-        P.append((cost + cost.T) / 2)
-        K.append(gain)
-    return Feedback(np.array(K[::-1]), np.array(P[::-1]))
+    P_final = solve_discrete_are(*model.linearised(x[-1], u[-1]), Q, R)
+    linear = [model.linearised(x_k, u_k) for x_k, u_k in zip(x[:-1], u, strict=True)]
+    A, B = (np.array(part) for part in zip(*linear, strict=True))
+    return discrete_tvlqr(A, B, Q=Q, R=R, P_final=(P_final + P_final.T) / 2)
 
 
 def observer_gain(model: StateModel) -> FloatArray:

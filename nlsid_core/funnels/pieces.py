@@ -1,7 +1,7 @@
 """From L-steps at the ends of pieces of time to a proof for every instant between them.
 
 The margin m of each L-step is turned into a strictly positive definite Gram matrix,
-m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)¾(1 + ½|z_nl|²), so that in between there is room. The checker
+m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)ν, so that in between there is room. The checker
 decides; a piece it does not prove is halved, with a new L-step in its middle.
 """
 
@@ -22,7 +22,7 @@ from nlsid_core.funnels.line import LineProgram
 from nlsid_core.funnels.lstep import LSteps, section_at
 from nlsid_core.funnels.sweep import Ends
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution, multinomials
 
 MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
 
@@ -79,14 +79,14 @@ def prove_pieces(
         pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
         margins = piece_margins(steps.field, policy, funnel, pieces, "rigorous")
         by_part = np.asarray(np.isfinite(margins).reshape(len(solvable), -1).all(axis=1))
-        keep = np.repeat(by_part, len(steps.vertices))
+        keep = np.repeat(by_part, steps.cases)
         if keep.any():
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
         failed = [part for part, good in zip(solvable, by_part.tolist(), strict=True) if not good]
         unproved += [part for part in failed if part.level == MAX_LEVEL]
         waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
-    return Proved(*_joined(steps.program, done), unproved=tuple(unproved))
+    return Proved(*_joined(steps, done), unproved=tuple(unproved))
 
 
 def _solved(
@@ -120,11 +120,11 @@ def _pieces(
     parts: list[Part],
     known: dict[tuple[int, float], list[SphereSolution]],
 ) -> Pieces:
-    """The pieces of the proof for these parts, part by part, vertex by vertex."""
-    n, program, vertices = funnel.n, steps.program, len(steps.vertices)
-    basis = with_one(program)
+    """The pieces of the proof for these parts, part by part, case by case."""
+    n, program = funnel.n, steps.program
+    basis = proof_basis(program)
     triangle = np.triu_indices(len(basis))
-    frames, mus, grams = [], [], []
+    frames, mus, grams, taus = [], [], [], []
     for end in (0, 1):
         T, rho, rows = [], [], []
         for part in parts:
@@ -132,10 +132,14 @@ def _pieces(
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
             section = section_at(steps.field, policy, funnel.P, i, s)
-            T += [np.sqrt(rho_here) * section.base] * vertices
-            rho += [rho_here] * vertices
+            T += [np.sqrt(rho_here) * section.base] * steps.cases
+            rho += [rho_here] * steps.cases
             rows += known[i, s]
-        blank = draft(program, parts, np.array(T), vertices, steps.kappa)
+        blank = draft(steps, parts, np.array(T))
+        scale = np.diff(funnel.t)[blank.interval] * rho
+        tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
+        tau = tau.reshape(len(rows), -1, n + 1, n + 1)
+        blank = replace(blank, tau=_sides(tau, tau))
         c, _ = closed_loop_polynomial(steps.field, policy, funnel, blank, Ball)
         at_end = {q: part.approximate()[:, -end] for q, part in c.items()}
         mu, gram = [], []
@@ -147,6 +151,7 @@ def _pieces(
             one = end_proof(program, solution, target, h * rho[b], solution.m + growth)
             gram.append(one[0])
             mu.append(one[1] / rho[b])
+        taus.append(tau)
         frames.append(np.array(T))
         mus.append(np.array(mu))
         grams.append(np.array(gram))
@@ -155,43 +160,62 @@ def _pieces(
     for b in range(len(A)):
         M = substitution(basis, A[b])
         grams[1][b] = M.T @ grams[1][b] @ M
-        full = monomials(n, [0, 1, 2])
+        full = monomials(n, Pieces.multiplier_degrees(basis))
         mus[1][b] = substitution(full, A[b]).T @ mus[1][b]
+        around = np.eye(n + 1)
+        around[1:, 1:] = A[b]
+        taus[1][b] = around.T @ taus[1][b] @ around
     both = np.stack(grams, axis=1)
     return replace(
         blank,
         T=frames[0],
         mu=np.stack(mus, axis=1),
         gram=both[..., triangle[0], triangle[1]],
+        tau=_sides(*taus),
     )
 
 
-def with_one(program: SphereProgram | LineProgram) -> IntArray:
-    """The program's basis with 1 in front."""
+def _sides(start: FloatArray, end: FloatArray) -> FloatArray:
+    """(B, 2, L, (n+1)(n+2)/2) upper triangles of two (B, L, n+1, n+1)."""
+    both = np.stack([start, end], axis=1)
+    i, j = np.triu_indices(both.shape[-1])
+    return np.asarray(both[..., i, j])
+
+
+def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
+    """1 and the program's basis; with half = 3 every monomial up to degree 3.
+
+    Off the sphere degrees 0 to 2·half have to be products of the basis, each of them.
+    """
+    if program.half > 2:
+        return np.vstack([monomials_of(program.n, q) for q in range(program.half + 1)])
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
-def draft(
-    program: SphereProgram | LineProgram,
-    parts: list[Part],
-    T: FloatArray,
-    vertices: int,
-    kappa: FloatArray | None = None,
-) -> Pieces:
-    """Pieces that state frames T (parts x vertices, n, n) only: μ and Q are zero."""
-    basis, count = with_one(program), len(parts) * vertices
+def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
+    """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
+    squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
+    return np.concatenate([[0.25], 0.75 * squares])
+
+
+def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
+    """Pieces that state frames T (parts x cases, n, n) only: μ, Q and S are zero."""
+    basis, count = proof_basis(steps.program), len(parts) * steps.cases
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
-    repeated = np.repeat(whole, vertices, axis=0)
+    repeated = np.repeat(whole, steps.cases, axis=0)
+    vertices, limited, n = len(steps.vertices), len(steps.limits), steps.program.n
     return Pieces(
         basis,
         interval=repeated[:, 0],
-        vertex=np.tile(np.arange(vertices), len(parts)),
+        vertex=np.tile(np.arange(steps.cases) % vertices, len(parts)),
         level=repeated[:, 1],
         index=repeated[:, 2],
         T=T,
         mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
         gram=np.zeros((count, 2, len(basis) * (len(basis) + 1) // 2)),
-        kappa=kappa,
+        mode=np.tile(np.repeat(steps.modes, vertices, axis=0), (len(parts), 1)),
+        tau=np.zeros((count, 2, limited, (n + 1) * (n + 2) // 2)),
+        kappa=steps.kappa,
     )
 
 
@@ -209,10 +233,11 @@ def end_proof(
     constant: the share of m that stays a constant; the rest makes Q positive definite.
     """
     n = program.n
-    basis = with_one(program)
+    basis = proof_basis(program)
     Q = np.zeros((len(basis), len(basis)))
-    Q[1:, 1:] = program.gram(solution) * scale
-    spread = (1 - constant) * np.r_[0.25, 0.75 * program.weight**2]
+    home = positions(program.basis, basis)
+    Q[np.ix_(home, home)] = program.gram(solution) * scale
+    spread = (1 - constant) * _spread(program, basis)
     spread[0] += constant
     Q[np.diag_indices(len(basis))] += scale * m * spread
     linear = np.array([j not in program.chosen for j in range(n)])
@@ -220,57 +245,67 @@ def end_proof(
     for j in np.flatnonzero(linear).tolist():
         place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
         Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
-    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below.
-    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in range(5)])
-    rows = np.concatenate([monomials_of(n, q) for q in range(5)])
+    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below: μ_q = d_q + |z|²μ_(q-2).
+    degrees = range(2 * program.half + 1)
+    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in degrees])
+    rows = np.concatenate([monomials_of(n, q) for q in degrees])
     pairs = positions((basis[:, None] + basis[None]).reshape(-1, n), rows)
     difference = np.bincount(pairs, Q.ravel(), len(rows)) - offset
-    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in range(5)])
+    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in degrees])
     squares = positions(2 * np.eye(n, dtype=np.int64), monomials_of(n, 2))
-    mu = [difference[starts[q] : starts[q + 1]] for q in range(3)]
-    mu[2] = mu[2] + mu[0][0] * np.isin(np.arange(len(mu[2])), squares)
+    mu: list[FloatArray] = []
+    for q in Pieces.multiplier_degrees(basis):
+        part = difference[starts[q] : starts[q + 1]]
+        if q >= 2:
+            homes = product_table(n, 2, q - 2)[squares]
+            lower = np.broadcast_to(mu[q - 2], homes.shape)
+            part = part + np.bincount(homes.ravel(), lower.ravel(), len(part))
+        mu.append(part)
     # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
     # with |z|² would put where the Gram matrix has no place for it.
-    for q in (1, 2):
+    for q in range(1, len(mu)):
         mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
     return Q, np.concatenate(mu)
 
 
 def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
-    """M with v(Az) = M v(z), v the monomials `rows` (k, n), of degree 2 at most.
+    """M with v(Az) = M v(z), v the monomials `rows` (k, n).
 
     Monomials that are not among the rows are dropped: with A triangular in the order of the
     nonlinear variables their coefficients are zero.
     """
-    n, k = len(A), len(rows)
-    places = {row.tobytes(): i for i, row in enumerate(rows)}
-    table = product_table(n, 1, 1)
-    second = monomials_of(n, 2)
-    M = np.zeros((k, k))
-    for i, row in enumerate(rows):
-        factors = np.repeat(np.arange(n), row)
-        if len(factors) == 0:
-            M[i, i] = 1.0
-        elif len(factors) == 1:
-            for j in range(n):
-                unit = np.eye(n, dtype=np.int64)[j].tobytes()
-                if unit in places:
-                    M[i, places[unit]] = A[factors[0], j]
-        else:
-            products = np.outer(A[factors[0]], A[factors[1]])
-            values = np.bincount(table.ravel(), products.ravel(), len(second))
-            for value, monomial in zip(values, second, strict=True):
-                if monomial.tobytes() in places:
-                    M[i, places[monomial.tobytes()]] = value
+    n = len(A)
+    homes = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
+    forms = np.zeros((n, n))
+    forms[:, homes] = A
+    powers: dict[tuple[int, ...], FloatArray] = {(0,) * n: np.ones(1)}
+
+    def power(exponent: tuple[int, ...]) -> FloatArray:
+        if exponent not in powers:
+            last = max(j for j, e in enumerate(exponent) if e)
+            lower = power(tuple(e - (j == last) for j, e in enumerate(exponent)))
+            table = product_table(n, 1, sum(exponent) - 1)
+            products = np.outer(forms[last], lower)
+            size = len(monomials_of(n, sum(exponent)))
+            sums = np.bincount(table.ravel(), products.ravel(), size)
+            powers[exponent] = sums.astype(np.float64)
+        return powers[exponent]
+
+    M = np.zeros((len(rows), len(rows)))
+    degree = rows.sum(axis=1)
+    for q in np.unique(degree).tolist():
+        among = np.flatnonzero(degree == q)
+        columns = positions(rows[among], monomials_of(n, q))
+        for i in among.tolist():
+            M[i, among] = power(tuple(rows[i].tolist()))[columns]
     return M
 
 
-def _joined(
-    program: SphereProgram | LineProgram, done: list[tuple[Pieces, FloatArray]]
-) -> tuple[Pieces, FloatArray]:
+def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Pieces, FloatArray]:
     """All proved pieces in the order of time."""
     if not done:
-        return draft(program, [], np.zeros((0, program.n, program.n)), 1), np.zeros(0)
+        n = steps.program.n
+        return draft(steps, [], np.zeros((0, n, n))), np.zeros(0)
     pieces = stacked([part for part, _ in done])
     margins = np.concatenate([m for _, m in done])
     order = np.lexsort((pieces.vertex, pieces.index / 2.0**pieces.level, pieces.interval))
@@ -279,7 +314,7 @@ def _joined(
 
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
-    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram")
+    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram", "mode", "tau")
     whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
     return replace(parts[0], **whole)
 

@@ -5,6 +5,7 @@ A simulation proves nothing; one start that leaves would show that the proof or 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -74,15 +75,19 @@ def simulate_boundary(
     knot: int = 0,
     scale: float = 1.0,
     substeps: int = SUBSTEPS,
+    adversary: bool = False,
 ) -> Soundness:
-    """Follow `starts` random points of {V = scale²} at a knot to the end; w at random corners."""
+    """Follow `starts` random points of {V = scale²} at a knot to the end; w at random corners.
+
+    adversary: w at the corner that raises V most instead, anew at every step.
+    """
     violations, largest = 0, 0.0
     for first in range(0, starts, CHUNK):
         count = min(CHUNK, starts - first)
         X = _boundary(funnel, knot, count, rng, scale)
         worst = np.zeros(count)
         for k in range(knot, len(funnel.t) - 1):
-            X, V = follow(dynamics, policy, funnel, k, X, rng, substeps)
+            X, V = follow(dynamics, policy, funnel, k, X, rng, substeps, adversary=adversary)
             worst = np.maximum(worst, V)
         violations += int((worst > 1 + TOLERANCE).sum())
         largest = max(largest, float(np.max(worst)))
@@ -124,6 +129,8 @@ def follow(
     X: FloatArray,
     rng: np.random.Generator,
     substeps: int,
+    *,
+    adversary: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
     """States at the end of interval k from X (N, n) at its start, and the largest V on the way."""
     t, h = funnel.t[k], (funnel.t[k + 1] - funnel.t[k]) / substeps
@@ -133,13 +140,17 @@ def follow(
     worst = np.zeros(len(X))
 
     def rate(s: float, states: FloatArray, w: FloatArray) -> FloatArray:
-        inputs = bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T
+        inputs = policy.clipped(bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T)
         when = float(t + s * (funnel.t[k + 1] - t))
         return dynamics(when, states, inputs, w, span=span)
 
     for j in range(substeps):
         s, half, end = j / substeps, (j + 0.5) / substeps, (j + 1) / substeps
-        w = low + (high - low) * rng.integers(0, 2, size=(len(X), len(low)))
+        if adversary:
+            P = (1 - s) * funnel.P[k] + s * funnel.P[k + 1]
+            w = _worst(partial(rate, s, X), (X - bernstein(x, s)) @ P, low, high)
+        else:
+            w = low + (high - low) * rng.integers(0, 2, size=(len(X), len(low)))
         a = rate(s, X, w)
         b = rate(half, X + h / 2 * a, w)
         c = rate(half, X + h / 2 * b, w)
@@ -150,6 +161,22 @@ def follow(
         x_bar = X - bernstein(x, end)
         worst = np.maximum(worst, np.einsum("ni,ij,nj->n", x_bar, P / rho, x_bar))
     return X, worst
+
+
+def _worst(
+    rate: Callable[[FloatArray], FloatArray], slope: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """(N, n_w) the corner that makes slope'ẋ largest; ẋ is affine in each entry of w."""
+    middle = np.tile((low + high) / 2, (len(slope), 1))
+    chosen = middle.copy()
+    for j in range(len(low)):
+        ends = []
+        for value in (low[j], high[j]):
+            w = middle.copy()
+            w[:, j] = value
+            ends.append(np.einsum("ni,ni->n", slope, rate(w)))
+        chosen[:, j] = np.where(ends[1] > ends[0], high[j], low[j])
+    return chosen
 
 
 def _boundary(

@@ -27,6 +27,7 @@ from nlsid_core.errors import DataError, Infeasible, SolverError
 RTOL, ATOL = 1e-9, 1e-10  # of the integrations; P's interpolation error is far larger
 NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
 BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
+DIFFERENCE = 1e-5  # of a knot interval, for the slope of B: errors of 1e-10
 GAINS = ("constant", "linear", "cubic")
 
 
@@ -53,9 +54,9 @@ def tvlqr(
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
-    Q = _definite(Q, field.n, "Q", strict=False)
-    R = _definite(R, field.m, "R", strict=True)
-    S_final = _definite(S_final, field.n, "S_final", strict=True)
+    Q = definite(Q, field.n, "Q", strict=False)
+    R = definite(R, field.m, "R", strict=True)
+    S_final = definite(S_final, field.n, "S_final", strict=True)
     if gain not in GAINS:
         raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
     R_inverse = np.linalg.inv(R)
@@ -87,8 +88,8 @@ def tvlqr(
 
 def lyapunov(field: VectorField, policy: Policy, *, Q: ArrayLike, P_final: ArrayLike) -> FloatArray:
     """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
-    Q = _definite(Q, field.n, "Q", strict=False)
-    P_final = _definite(P_final, field.n, "P_final", strict=True)
+    Q = definite(Q, field.n, "Q", strict=False)
+    P_final = definite(P_final, field.n, "P_final", strict=True)
     nominal = Nominal(policy.x, policy.u)
 
     def rate(t: float, P: FloatArray) -> FloatArray:
@@ -164,10 +165,18 @@ def _cubic_gain(
     R_inverse: FloatArray,
     rate: Callable[[float, FloatArray], FloatArray],
 ) -> PiecewisePolynomial:
-    del rate
-    K = [R_inverse @ _linearised(field, nominal, t)[1].T @ S[k] for k, t in enumerate(nominal.t)]
-    slopes = np.gradient(np.array(K), nominal.t, axis=0)
-    return cubic_through(nominal.t, np.array(K), slopes)
+    """K = R⁻¹B'S with its slopes R⁻¹(B'Ṡ + Ḃ'S), Ṡ from the Riccati equation."""
+    t = nominal.t
+    step = DIFFERENCE * float(np.min(np.diff(t)))
+    B, ahead, behind = (
+        np.array([_linearised(field, nominal, float(s) + shift)[1] for s in t])
+        for shift in (0.0, step, -step)
+    )
+    B_rate = (ahead - behind) / (2 * step)
+    S_rate = np.array([rate(float(s), S[k]) for k, s in enumerate(t)])
+    values = R_inverse @ B.transpose(0, 2, 1) @ S
+    slopes = R_inverse @ (B.transpose(0, 2, 1) @ S_rate + B_rate.transpose(0, 2, 1) @ S)
+    return cubic_through(t, values, slopes)
 
 
 def _linearised(
@@ -198,7 +207,8 @@ def _backward(
     return np.asarray((S + S.transpose(0, 2, 1)) / 2)
 
 
-def _definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
+def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
+    """M as a symmetric (n, n) array; DataError unless it is one, ⪰ 0 or, if strict, ≻ 0."""
     M = np.asarray(M, dtype=np.float64)
     if (
         M.shape != (n, n)

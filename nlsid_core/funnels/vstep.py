@@ -15,7 +15,8 @@ from nlsid_core._types import FloatArray, IntArray
 from nlsid_core.certificate.graded import monomials_of, positions, product_table
 from nlsid_core.conic import Cone, ConeProgram
 
-DEGREE = 4  # of c in z
+MAX_DEGREE = 3  # of the dynamics
+DEGREE = MAX_DEGREE + 1  # of c in z
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """The fast path: the largest m with g(z) - m = v(z)'Xv(z) on |z| = 1, X ⪰ 0.
 
-v holds monomials of degree 1 and 2, g is any function in the span of their products (on the
-sphere every polynomial of degree ≤ 4), known only by its values at N unisolvent points:
+v holds monomials of degree half - 1 and half, half = 2 unless said otherwise, g is any function in
+the span of their products (on the sphere every polynomial of degree ≤ 2·half), known only by its
+values at N unisolvent points:
 
     maximise m      subject to  v_i'Xv_i + m = g_i  (i = 1..N),  X ⪰ 0
     minimise g'y    subject to  Σ y_i v_i v_i' = Z ⪰ 0,  Σ y_i = 1
@@ -20,14 +21,14 @@ import scipy.sparse as sp
 from scipy.linalg import blas, lapack, qr
 
 from nlsid_core import conic
-from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core._types import ArrayLike, BoolArray, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 
 CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
-RANK_TOLERANCE = 1e-10  # of the QR diagonal: degree-4 monomials on a sphere keep 12 digits
+RANK_TOLERANCE = 1e-10  # of the QR diagonal: monomials of degree 4 and 6 on a sphere keep 12 digits
 MAX_ITERATIONS = 60  # 8 to 12 are usual
 STEP_TO_BOUNDARY = 0.95  # of the way to where X or Z would be singular; 0.99 loses the centre
 REGULARISATIONS = (0.0, 1e-15, 1e-14, 1e-13)  # of M, relative to its diagonal; refined away
@@ -44,7 +45,8 @@ class SphereSolution:
 
     m: shown up to rounding by X (k, k); upper: the dual bound, from y (N,). Both in the unit of g.
     gap: (upper - m) relative to the spread of g. centred: an earlier iterate (X, y, m) of the
-    normalised problem, far enough from the boundary to start a similar problem from.
+    normalised problem, far enough from the boundary to start a similar problem from. tau: (L, n+1,
+    n+1) Gram matrices of multipliers chosen before, whose products are in g.
     """
 
     m: float
@@ -54,6 +56,7 @@ class SphereSolution:
     gap: float
     iterations: int
     centred: tuple[FloatArray, FloatArray, float]
+    tau: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +64,17 @@ class SphereProgram:
     """Everything that depends on the number of variables only; build it once and solve often.
 
     n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
-    are kept only if they contain one of them (default: all). basis: (k, n) exponents of v, degree
-    1 first; weight: (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
+    are kept only if they contain one of them (default: all). half: of the degree of g, 2 or 3; 3
+    takes all variables as nonlinear. basis: (k, n) exponents of v, lower degree first; weight:
+    (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
     points: (N, n) where g has to be evaluated.
 
-    Raises DataError if there is no nonlinear variable or n < 2.
+    Raises DataError if there is no nonlinear variable, n < 2, or half is neither 2 nor 3.
     """
 
     n: int
     nonlinear: tuple[int, ...] | None = None
+    half: int = 2
     chosen: tuple[int, ...] = field(init=False)
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
@@ -85,13 +90,15 @@ class SphereProgram:
         chosen = tuple(range(self.n)) if self.nonlinear is None else tuple(self.nonlinear)
         if self.n < 2 or not chosen or not set(chosen) <= set(range(self.n)):
             raise DataError(f"n = {self.n}, nonlinear = {chosen}: expected indices below n, n >= 2")
-        pairs = monomials(self.n, [2])
-        basis = np.vstack([monomials(self.n, [1]), pairs[pairs[:, list(chosen)].any(axis=1)]])
-        points = _unisolvent_points(basis)
-        # Weights with Σ (weight·monomial)² = 1 on the sphere: Σ|z_l|² + ½|z_nl|² + ½|z_nl|²|z|².
-        inside = basis[:, list(chosen)].sum(axis=1)
-        alone = basis.max(axis=1) == 2
-        weight = np.where((inside == 0) | ((inside == 2) & ~alone), 1.0, np.sqrt(0.5))
+        if self.half not in (2, 3) or (self.half == 3 and len(chosen) < self.n):
+            raise DataError(
+                f"half = {self.half} with {len(chosen)} of {self.n} variables nonlinear"
+            )
+        high = monomials(self.n, [self.half])
+        low = monomials(self.n, [self.half - 1])
+        basis = np.vstack([low, high[high[:, list(chosen)].any(axis=1)]])
+        points = _unisolvent_points(basis, self.half)
+        weight = _weights(basis, np.isin(np.arange(self.n), chosen))
         moments = _sphere_moments(basis) * np.outer(weight, weight)
         values, vectors = np.linalg.eigh(moments)
         # v = root⁻¹·weight·monomials is orthonormal on the sphere, and v'(moments)v = 1 there.
@@ -327,13 +334,32 @@ def _step(dA: FloatArray, L: FloatArray) -> float:
     return min(1.0, STEP_TO_BOUNDARY / -lowest) if lowest < 0 else 1.0
 
 
-def _unisolvent_points(basis: IntArray) -> FloatArray:
+def _weights(basis: IntArray, chosen: BoolArray) -> FloatArray:
+    """(k,) with Σ (weight·monomial)² = 1 on the sphere.
+
+    All chosen: ½|z|^2d for both degrees d; else |z_l|² + ½|z_nl|² + ½|z_nl|²|z|².
+    """
+    weight = multinomials(basis) / 2
+    linear = ~chosen[basis.argmax(axis=1)] & (basis.sum(axis=1) == 1)
+    mixed = (basis.sum(axis=1) == 2) & (basis[:, ~chosen].sum(axis=1) == 1)
+    weight[linear] = 1.0
+    weight[mixed] = 0.5
+    return np.sqrt(weight)
+
+
+def multinomials(rows: IntArray) -> FloatArray:
+    """The coefficient of each squared monomial, of degree ≤ 3, in its power of |z|²."""
+    factorials = np.array([1.0, 1.0, 2.0, 6.0])
+    return np.asarray(factorials[rows.sum(axis=1)] / factorials[rows].prod(axis=1))
+
+
+def _unisolvent_points(basis: IntArray, half: int) -> FloatArray:
     """Points on the sphere that determine every function in the span of products of the basis."""
     n = basis.shape[1]
     products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
     degree = products.sum(axis=1)
-    if len(basis) == n + n * (n + 1) // 2:
-        products = products[degree > 2]  # on the sphere degree 4 contains degree 2
+    if len(basis) == len(monomials(n, [half - 1, half])):
+        products = products[degree > 2 * half - 2]  # on the sphere they contain those below
     rng = np.random.default_rng(n)  # one fixed set per n: results repeat
     cloud = rng.normal(size=(int(CANDIDATES * len(products)) + 10, n))
     cloud /= np.linalg.norm(cloud, axis=1)[:, None]
@@ -348,9 +374,9 @@ def _unisolvent_points(basis: IntArray) -> FloatArray:
 def _sphere_moment(exponents: IntArray) -> FloatArray:
     """Mean over the unit sphere of each monomial: Π (a_i - 1)!! / (n (n + 2) …), zero if odd."""
     n = exponents.shape[1]
-    odd_factorial = np.array([1.0, 0.0, 1.0, 0.0, 3.0])
+    odd_factorial = np.array([1.0, 0.0, 1.0, 0.0, 3.0, 0.0, 15.0])
     result = odd_factorial[exponents].prod(axis=-1)
-    for step in range(2):
+    for step in range(3):
         result = result / np.where(exponents.sum(axis=-1) > 2 * step, n + 2 * step, 1)
     return np.asarray(result)
 

@@ -33,10 +33,10 @@ class SphereProof:
 def sphere_proof(program: SphereProgram, solution: SphereSolution, g: Polynomial) -> SphereProof:
     """The proof of `solution.m` minus a rounding allowance, for g in `program.n` variables.
 
-    g has to be the polynomial whose values were given to `solve`, of degree ≤ 4.
+    g has to be the polynomial whose values were given to `solve`, of degree ≤ 4 (half = 2).
     """
     n, names = program.n, g.names
-    if len(names) != n or g.degree > 4:
+    if len(names) != n or g.degree > 4 or program.half != 2:
         raise ShapeError(f"g has {len(names)} variables and degree {g.degree}: expected {n}, <= 4")
     X = program.gram(solution)
     eta = ROUNDING_ROOM * float(np.trace(X)) + 4 * np.finfo(float).eps * abs(solution.m)

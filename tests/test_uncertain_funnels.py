@@ -1,0 +1,110 @@
+"""Disturbances and uncertain parameters: the certificate states their bounds and means them."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core.certificate import check
+from nlsid_core.continuous import VectorField
+from nlsid_core.errors import CertificateRejected
+from nlsid_core.funnels import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.funnels.soundness import simulate_boundary
+from tests.test_funnel_forgeries import write
+
+
+def disturbed(x: Any, u: Any, w: Any) -> Any:
+    """A hanging pendulum that the wind pushes."""
+    return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0]])
+
+
+def unknown(x: Any, u: Any, w: Any) -> Any:
+    """Its stiffness, damping and drive known within bounds."""
+    return np.array([x[1], -w[0] * (x[0] - x[0] ** 3 / 6) - w[1] * x[1] + w[2] * u[0]])
+
+
+def pushed(x: Any, u: Any, w: Any) -> Any:
+    """Three pushes: bounded together, without corners."""
+    return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
+
+
+KINDS: dict[str, tuple[Any, list[list[float]], str]] = {
+    "disturbance": (disturbed, [[-0.05, 0.05]], "w0 in [-0.05, 0.05]"),
+    "parameters": (unknown, [[0.8, 1.2], [0.1, 0.3], [0.9, 1.1]], "w1 in [0.1, 0.3]"),
+    "pushes": (pushed, [[-0.003, 0.003], [-0.002, 0.002], [-0.01, 0.01]], "w2 in [-0.01, 0.01]"),
+}
+
+WIDER = {"disturbance": 30.0, "parameters": 6.0, "pushes": 30.0}  # times the bounds: some leave
+
+
+@pytest.fixture(scope="module", params=list(KINDS))
+def kind(request: pytest.FixtureRequest) -> str:
+    """One kind of uncertainty after the other."""
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def design(kind: str) -> FunnelDesign:
+    """The pendulum held at rest for 2 s, whatever w does."""
+    dynamics, bounds, _ = KINDS[kind]
+    field = VectorField.from_function(dynamics, 2, 1, uncertain=bounds)
+    t = np.linspace(0, 2, 21)
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+    return design_funnel(field, nominal, goal=20 * np.eye(2))
+
+
+def test_the_certificate_states_the_bounds(kind: str, design: FunnelDesign, tmp_path: Path) -> None:
+    proof = design.save(tmp_path)[-1]
+    for verdict in (check(proof, mode="rigorous"), check(proof)):
+        assert any(KINDS[kind][2] in text for text in verdict.assumptions)
+
+
+def test_the_worst_w_at_every_instant_breaks_nothing_and_a_larger_one_does(
+    kind: str, design: FunnelDesign
+) -> None:
+    parts = (design.policy, design.funnel)
+    runs = []
+    for adversary in (False, True):
+        rng = np.random.default_rng(8)
+        runs.append(
+            simulate_boundary(design.field, *parts, starts=2000, rng=rng, adversary=adversary)
+        )
+    assert [run.violations for run in runs] == [0, 0]
+    assert runs[0].max_v <= runs[1].max_v
+    middle = design.field.uncertain.mean(axis=1, keepdims=True)
+    wide = replace(design.field, uncertain=middle + WIDER[kind] * (design.field.uncertain - middle))
+    rng = np.random.default_rng(9)
+    run = simulate_boundary(wide, *parts, starts=500, rng=rng, adversary=True)
+    assert run.violations > 0
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+@pytest.mark.parametrize("mode", ["rigorous", "exact"])
+def test_bounds_changed_after_the_fact_are_refused(
+    design: FunnelDesign, tmp_path: Path, factor: float, mode: Any
+) -> None:
+    """Shrunk, the claim would assume more than it says; widened, it would claim more."""
+    design.save(tmp_path)
+    files = {path.name: json.loads(path.read_text()) for path in tmp_path.iterdir()}
+    field = files["vector_field.json"]
+    middle = (field["low"][0] + field["high"][0]) / 2
+    for key in ("low", "high"):
+        field[key][0] = middle + factor * (field[key][0] - middle)
+    with pytest.raises(CertificateRejected, match="do not represent"):
+        check(write(files, tmp_path, rebind=True), mode=mode)
+
+
+def test_a_corner_left_out_is_refused(kind: str, design: FunnelDesign, tmp_path: Path) -> None:
+    design.save(tmp_path)
+    files = {path.name: json.loads(path.read_text()) for path in tmp_path.iterdir()}
+    proof = files["funnel.proof.json"]["proof"]
+    last = max(piece["vertex"] for piece in proof["pieces"])
+    proof["pieces"] = [piece for piece in proof["pieces"] if piece["vertex"] < last] or (
+        proof["pieces"][:-1]
+    )
+    assert (last == 0) is (kind == "pushes")
+    with pytest.raises(CertificateRejected, match="missing"):
+        check(write(files, tmp_path, rebind=True), mode="rigorous")
