@@ -18,7 +18,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -37,7 +36,7 @@ from nlsid_core.policy import Policy
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.documents import FunnelSubscription
-from nlsid_ros.draining import subscribe
+from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
@@ -98,7 +97,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals: list[Subscription] = []
+        self._signals = Lane(self)
         self._waiting: dict[str, SignalPath] = {}
         self._watch: Watch | None = None
         self._run: Run | None = None
@@ -132,8 +131,6 @@ class FunnelMonitor(ManagedNode):
         monitor = Monitor(model, policy, funnel, nominal=self._nominal)
         paths = {"response": model.y.path, "excitation": model.u.path}
         signals = {role: SignalPath.parse(path) for role, path in paths.items()}
-        for subscription in self._signals:
-            self.destroy_subscription(subscription)
         self._signals.clear()
         self._watch = Watch(monitor, options=self._options, announced=bool(self._controller))
         self._waiting = signals
@@ -186,11 +183,9 @@ class FunnelMonitor(ManagedNode):
                 return
             callback = partial(self._on_signal, role, path)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.append(
-                subscribe(self, message_class(kind), path.topic, callback, profile)
-            )
+            self._signals.subscribe(message_class(kind), path.topic, callback, profile)
 
-    def _on_signal(self, role: str, path: SignalPath, message: Any, _info: object) -> None:
+    def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
@@ -204,11 +199,13 @@ class FunnelMonitor(ManagedNode):
         if role == "excitation":
             self._publish(watch.excitation(stamp_ns, value))
             return
-        self._stale.reset()
+        self._heard_ns = self._patience.now().nanoseconds
+        if self._stale.is_canceled():
+            self._stale.reset()
         judged = watch.response(stamp_ns, value)
         self._publish(judged)
         if not judged:
-            due = self._patience.now().nanoseconds + round(self._command_wait * 1e9)
+            due = self._heard_ns + round(self._command_wait * 1e9)
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
                 self._release.reset()
@@ -224,7 +221,12 @@ class FunnelMonitor(ManagedNode):
             self._release.cancel()
 
     def _on_stale(self) -> None:
-        """The response stopped coming."""
+        """The response stopped coming, or did so a while ago: look again when it would have."""
+        patience_ns = round(self._stale_after * 1e9)
+        ahead_ns = self._heard_ns + patience_ns - self._patience.now().nanoseconds
+        self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
+        if ahead_ns > 0:  # resetting a timer wakes the executor: not for every message
+            return
         self._stale.cancel()
         if self._watch is not None:
             name = self._watch.monitor.model.y.name

@@ -1,5 +1,6 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
+import gc
 import signal
 import socket
 import threading
@@ -139,6 +140,8 @@ def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
             for transition in (node.trigger_configure, node.trigger_activate):
                 if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
                     raise node.failure
+        gc.collect()
+        gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         _spin_until_signalled(node, woken)
     finally:
         if node is not None:
