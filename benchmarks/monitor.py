@@ -41,9 +41,9 @@ from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.monitor import MonitorBank
+from nlsid_core.reading import Reading, Status
 from nlsid_core.trajectory import Dataset, Trajectory
 from nlsid_ros import qos
-from nlsid_ros.funnel_monitor import NUMBERS
 from nlsid_ros.lane import Lane
 from nlsid_ros.messages import stamp_ns_of
 
@@ -176,7 +176,8 @@ def echo() -> None:
     rclpy.init()
     relay = Node("echo")
     answers = relay.create_publisher(JointState, ECHO, qos.STREAM)
-    answer = JointState(name=NUMBERS, position=[0.0] * len(NUMBERS))
+    numbers = [*Reading(0.0, Status.INSIDE).numbers, "time_to_exit", "latency"]
+    answer = JointState(name=numbers, position=[0.0] * len(numbers))
 
     def on_state(message: JointState) -> None:
         answer.header.stamp = message.header.stamp

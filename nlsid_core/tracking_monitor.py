@@ -7,8 +7,6 @@ margin is good. Missing, stale or NaN state reads as unknown, never as inside.
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
@@ -17,42 +15,13 @@ from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.discrete_funnel import DiscreteFunnel
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.models.state_map import StateModel
-from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE, Status
+from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE
+from nlsid_core.reading import Level, Status, TrackingReading
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Trajectory
 
+OVER = "the proof covers"  # how the reason of every reading after the horizon begins
 TREND = 5  # samples over which the margin's trend is taken
-
-
-class Level(Enum):
-    """The best of the three sets that the state is in."""
-
-    GOAL = "goal"
-    TUBE = "tube"
-    INLET = "inlet"
-    NONE = "none"
-
-
-@dataclass(frozen=True)
-class TrackingReading:
-    """One sample's verdict.
-
-    t: s. margin: 1 - |S x̄|/radius, 1 on the nominal, 0 on the tube's boundary, NaN if unknown.
-    disturbance: the assumption's own quantity over its bound; above 1 it is violated. level:
-    `tube`; `inlet` if the state left the tube but can still reach the goal; `goal` at the end.
-    time_to_exit: s until the margin is zero if it goes on falling as it did (no proof); infinite if
-    it does not fall. worst_axis: the state furthest out relative to the tube. reason: why the
-    status is not inside.
-    """
-
-    t: float
-    status: Status
-    margin: float = math.nan
-    disturbance: float = math.nan
-    level: Level = Level.NONE
-    time_to_exit: float = math.nan
-    worst_axis: str = ""
-    reason: str = ""
 
 
 class StateObserver:
@@ -134,6 +103,8 @@ class TrackingMonitor:
     Raises CertificateMismatch if model, policy and funnel do not belong together.
     """
 
+    lags = 0  # samples before the run's start that it needs
+
     def __init__(self, model: StateModel, policy: TrackingPolicy, funnel: DiscreteFunnel) -> None:
         digest = _json.digest(model.document())
         if policy.model != digest or funnel.model != digest:
@@ -154,6 +125,10 @@ class TrackingMonitor:
         self._last_t = -math.inf
         self._ended = self._violated = ""
         self._margins: deque[float] = deque(maxlen=TREND + 1)
+
+    def waiting(self, t: float, _y: ArrayLike, reason: str) -> TrackingReading:
+        """The reading at t (s) of a sample y before the run's start."""
+        return TrackingReading(t, Status.UNKNOWN, reason=reason)
 
     def missing(self, t: float, reason: str) -> TrackingReading:
         """End the run because the state is missing or stale at time t (s): unknown from here on."""
@@ -180,7 +155,7 @@ class TrackingMonitor:
         if not math.isfinite(t) or not np.isfinite(y).all():
             return f"state {y} at t = {t:g} s"
         if self._k > len(self.policy):
-            return f"the proof covers {len(self.policy) * period:g} s; they are over"
+            return f"{OVER} {len(self.policy) * period:g} s; they are over"
         if self._k < len(self.policy) and (u is None or not np.isfinite(u).all()):
             return f"no input at t = {t:g} s (it is {u})"
         if step <= 0:

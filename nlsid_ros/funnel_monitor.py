@@ -23,16 +23,15 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.monitoring.announcement import Run
+from bags.monitoring.designs import Design
 from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
 from nlsid_core import _json
 from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError
-from nlsid_core.funnel import Funnel
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.monitor import Monitor, Nominal, Reading, Status
-from nlsid_core.policy import Policy
+from nlsid_core.reading import AnyReading, Nominal, Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.documents import FunnelSubscription
@@ -51,7 +50,6 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
-NUMBERS = ["margin", "budget_spent", "nominal", "measured", "time_to_exit", "latency"]
 NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
@@ -98,9 +96,10 @@ class FunnelMonitor(ManagedNode):
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
         self._signals = Lane(self)
-        self._waiting: dict[str, SignalPath] = {}
+        self._waiting: dict[str, SignalPath | SignalVector] = {}
         self._watch: Watch | None = None
         self._run: Run | None = None
+        self._said: tuple[AnyReading, Alert]
         self._said = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel"), NOTHING
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
@@ -126,17 +125,18 @@ class FunnelMonitor(ManagedNode):
         )
         self._release.cancel()
 
-    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+    def _on_funnel(self, design: Design) -> None:
         """A funnel came, or another one: watch its signals from scratch."""
-        monitor = Monitor(model, policy, funnel, nominal=self._nominal)
-        paths = {"response": model.y.path, "excitation": model.u.path}
-        signals = {role: SignalPath.parse(path) for role, path in paths.items()}
+        watch = Watch(
+            design, nominal=self._nominal, options=self._options, announced=bool(self._controller)
+        )
+        signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
-        self._watch = Watch(monitor, options=self._options, announced=bool(self._controller))
+        self._watch = watch
         self._waiting = signals
         self._deadlines.clear()
-        self._tell(f"no {model.y.name} yet")
-        self.get_logger().info(f"watching {model.y.path} and {model.u.path}")
+        self._tell(f"no {design.name} yet")
+        self.get_logger().info(f"watching {design.response} and {design.command}")
         self._begin()
 
     def _on_refusal(self, reason: str) -> None:
@@ -185,7 +185,7 @@ class FunnelMonitor(ManagedNode):
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
             self._signals.subscribe(message_class(kind), path.topic, callback, profile)
 
-    def _on_signal(self, role: str, path: SignalPath, message: Any) -> None:
+    def _on_signal(self, role: str, path: SignalPath | SignalVector, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
@@ -225,11 +225,12 @@ class FunnelMonitor(ManagedNode):
         patience_ns = round(self._stale_after * 1e9)
         ahead_ns = self._heard_ns + patience_ns - self._patience.now().nanoseconds
         self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
-        if ahead_ns > 0:  # resetting a timer wakes the executor: not for every message
+        if ahead_ns > 0:  # a reset wakes the executor, so it is not done with every message
+            self._stale.reset()
             return
         self._stale.cancel()
         if self._watch is not None:
-            name = self._watch.monitor.model.y.name
+            name = self._watch.design.name
             self._publish(self._watch.flush())
             for entry in self._watch.missing(f"no {name} for {self._stale_after:g} s"):
                 self._say(entry.reading, entry.alert)
@@ -240,31 +241,22 @@ class FunnelMonitor(ManagedNode):
             self._say(reading, alert)
             self._publish_margin(stamp_ns, reading, alert)
 
-    def _publish_margin(self, stamp_ns: int, reading: Reading, alert: Alert) -> None:
+    def _publish_margin(self, stamp_ns: int, reading: AnyReading, alert: Alert) -> None:
         latency_ns = self.get_clock().now().nanoseconds - stamp_ns
         self._slowest_ns = max(self._slowest_ns, latency_ns)
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        message.name = NUMBERS
-        message.position = array(
-            "d",
-            (
-                reading.margin,
-                reading.budget_spent,
-                reading.nominal,
-                reading.measured,
-                alert.time_to_exit,
-                latency_ns * 1e-9,
-            ),
-        )
+        numbers = reading.numbers
+        message.name = [*numbers, "time_to_exit", "latency"]
+        message.position = array("d", (*numbers.values(), alert.time_to_exit, latency_ns * 1e-9))
         self._margin.publish(message)
 
     def _tell(self, reason: str) -> None:
         """Unknown, and why, at once."""
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), NOTHING, at_once=True)
 
-    def _say(self, reading: Reading, alert: Alert, *, at_once: bool = False) -> None:
+    def _say(self, reading: AnyReading, alert: Alert, *, at_once: bool = False) -> None:
         """Publish diagnostics, and an event, if the state changed; remember what to repeat."""
         before = self._said[1].state
         self._said = reading, alert
@@ -298,9 +290,8 @@ class FunnelMonitor(ManagedNode):
         reading, alert = self._said
         watch = self._watch
         values = {
-            "margin": f"{reading.margin:.6g}",
+            **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
             "worst axis": reading.worst_axis,
-            "budget spent": f"{reading.budget_spent:.6g}",
             "time to exit [s]": f"{alert.time_to_exit:.4g}",
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),

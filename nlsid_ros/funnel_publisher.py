@@ -17,7 +17,8 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.monitoring import documents
-from bags.monitoring.documents import ProvedFunnel, load_proved_funnel
+from bags.monitoring.designs import Design
+from bags.monitoring.documents import Proved, load_proved
 from nlsid_core._types import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
@@ -72,20 +73,20 @@ class FunnelPublisher(ManagedNode):
         with suppress(NlsidError, OSError):  # said by _load
             self._publish(self._load())
 
-    def _load(self) -> ProvedFunnel:
+    def _load(self) -> Proved[Design]:
         try:
-            return load_proved_funnel(self._path)
+            return load_proved(self._path)
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
 
-    def _publish(self, proved: ProvedFunnel) -> None:
+    def _publish(self, proved: Proved[Design]) -> None:
         for name in ("model", "policy", "funnel"):
-            document: Json = getattr(proved, name).document()
+            document: Json = getattr(proved.design, name).document()
             self._latched[name].publish(String(data=json.dumps(document)))
-        self._latched["tube"].publish(tube_markers(proved, self._frame))
-        self._latched["nominal"].publish(nominal_trajectory(proved))
+        self._latched["tube"].publish(tube_markers(proved.design, self._frame))
+        self._latched["nominal"].publish(nominal_trajectory(proved.design))
         self._say(DiagnosticStatus.OK, str(proved.verdict))
         self.get_logger().info(str(proved.verdict))
         for assumption in proved.verdict.assumptions:

@@ -51,10 +51,10 @@ class Lane:
     def _stay(self) -> None:
         """Take messages as they come, until something else has to be done."""
         until = time.monotonic_ns() + round(STAY * 1e9)
-        timers = [timer for timer in self._node.timers if not timer.is_canceled()]
+        timers = list(self._node.timers)
         with ExitStack() as stack:
-            for entity in (*self._callbacks, *timers):
-                stack.enter_context(entity.handle)
+            for handle in (*(s.handle for s in self._callbacks), *(t.handle for t in timers)):
+                stack.enter_context(handle)
             waiting = rclpy_implementation.WaitSet(
                 len(self._callbacks), 0, len(timers), 0, 0, 0, self._node.context.handle
             )

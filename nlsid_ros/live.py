@@ -125,7 +125,7 @@ class Observer(Node):
 def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
     proved = load_proved_funnel(funnel)
-    model = proved.model
+    model = proved.design.model
     paths = [SignalPath.parse(model.y.path), SignalPath.parse(model.u.path)]
     with Bag(bag) as source:
         topics = {path.topic: source.types_on(path.topic)[0] for path in paths}
