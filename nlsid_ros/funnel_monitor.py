@@ -10,7 +10,8 @@ state is unknown (STALE), never inside. `~/restart` begins a new run.
 import sys
 from array import array
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -33,7 +34,7 @@ from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError
 from nlsid_core.reading import AnyReading, Nominal, Reading, Status
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import FunnelSubscription
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
@@ -50,6 +51,7 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
+ALARM = [field.name for field in fields(AlarmOptions)]
 NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
@@ -67,25 +69,15 @@ class FunnelMonitor(ManagedNode):
         self._nominal = Nominal(
             declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
-        number = partial(declare_number, self)
-        self._stale_after = number(
-            "stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0)
-        )
-        self._command_wait = number(
-            "command_wait", 0.02, "s a response waits for its command", between=(0.0, 1.0)
-        )
-        self._options = AlarmOptions(
-            warning_margin=number("warning_margin", 0.2, "warn below", between=(0.0, 1.0)),
-            warning_time=number(
-                "warning_time", 0.0, "s: warn if the exit is predicted sooner", between=(0.0, 60.0)
-            ),
-            hysteresis=number(
-                "hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0)
-            ),
-            clear_after=number(
-                "clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0)
-            ),
-        )
+        number = partial(declare_number, self, tunable=True)
+        number("stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0))
+        number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
+        number("warning_margin", 0.2, "warn below", between=(0.0, 1.0))
+        number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
+        number("hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0))
+        number("clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0))
+        self._watch: Watch | None = None
+        self.tune(self.tunable())
         self._stop_service = declare_text(
             self, "stop_service", "", "std_srvs/Trigger called on leaving the funnel; empty: none"
         )
@@ -93,11 +85,18 @@ class FunnelMonitor(ManagedNode):
             self, "snapshot_service", "", "std_srvs/Trigger called on leaving; empty: none"
         )
 
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Take patience and warnings, also in the middle of a run."""
+        self._options = AlarmOptions(**{name: values[name] for name in ALARM})
+        self._stale_after, self._command_wait = values["stale_after"], values["command_wait"]
+        if self._watch is not None:
+            self._watch.warn(self._options)
+
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
         self._signals = Lane(self)
         self._waiting: dict[str, SignalPath | SignalVector] = {}
-        self._watch: Watch | None = None
+        self._watch = None
         self._run: Run | None = None
         self._said: tuple[AnyReading, Alert]
         self._said = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel"), NOTHING
@@ -121,7 +120,7 @@ class FunnelMonitor(ManagedNode):
         self._stale = self.create_timer(self._stale_after, self._on_stale, clock=self._patience)
         self._stale.cancel()
         self._release = self.create_timer(
-            max(self._command_wait, 1e-4), self._on_release, clock=self._patience
+            self._command_wait, self._on_release, clock=self._patience
         )
         self._release.cancel()
 
@@ -169,10 +168,11 @@ class FunnelMonitor(ManagedNode):
         types = dict(self.get_topic_names_and_types())
         for role, path in list(self._waiting.items()):
             publishers = self.get_publishers_info_by_topic(path.topic)
-            if path.topic not in types or not publishers:
+            kinds = types.get(self.resolve_topic_name(path.topic), [])
+            if not kinds or not publishers:
                 continue
             del self._waiting[role]
-            kind = types[path.topic][0]
+            kind = kinds[0]
             try:
                 path.check(kind, standard_types())
                 if not is_stamped(kind, standard_types()):
@@ -208,7 +208,11 @@ class FunnelMonitor(ManagedNode):
             due = self._heard_ns + round(self._command_wait * 1e9)
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
-                self._release.reset()
+                self._release_in(due - self._heard_ns)
+
+    def _release_in(self, ahead_ns: int) -> None:
+        self._release.timer_period_ns = ahead_ns
+        self._release.reset()
 
     def _on_release(self) -> None:
         """Let go of samples whose command did not come in time."""
@@ -217,8 +221,9 @@ class FunnelMonitor(ManagedNode):
             until = self._deadlines.popleft()[1]
         if until is not None and self._watch is not None:
             self._publish(self._watch.flush(until))
-        if not self._deadlines:
-            self._release.cancel()
+        self._release.cancel()
+        if self._deadlines:
+            self._release_in(self._deadlines[0][0] - now)
 
     def _on_stale(self) -> None:
         """The response stopped coming, or did so a while ago: look again when it would have."""
@@ -301,7 +306,7 @@ class FunnelMonitor(ManagedNode):
         }
         text = alert.state.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
-        return status(stamp, self.get_name(), LEVELS[alert.state], text, values)
+        return status(stamp, name_of(self), LEVELS[alert.state], text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""

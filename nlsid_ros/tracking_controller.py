@@ -9,6 +9,8 @@ digest. Stale or impossible state, `~/stop`, and the end of the plan ramp the in
 
 import sys
 import time
+from collections.abc import Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -30,7 +32,7 @@ from nlsid_core import _json
 from nlsid_core.controller import Limits
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import FunnelSubscription
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
@@ -40,6 +42,7 @@ NAME = "tracking_controller"
 LAST_WORD = 1.0  # s for the last command to be received before the node goes
 REPORT = 1.0  # s between diagnostics while nothing changes
 BIG = 1e9
+LIMITS = [field.name for field in fields(Limits)]
 
 
 class TrackingController(ManagedNode):
@@ -47,7 +50,7 @@ class TrackingController(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        number = partial(declare_number, self)
+        number = partial(declare_number, self, tunable=True)
         self._source = declare_text(
             self, "source", "funnel_publisher", "node that publishes the funnel"
         )
@@ -60,27 +63,30 @@ class TrackingController(ManagedNode):
         self._start_at_once = bool(
             declare(self, "start_at_once", False, "begin a run as soon as there is a funnel")
         )
-        self._stale_after = number(
-            "stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0)
-        )
-        self._settling = number(
-            "settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0)
-        )
-        self._limits = Limits(
-            lowest=number("lowest", 0.0, "least input", between=(-BIG, BIG)),
-            highest=number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG)),
-            stop_at=number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
-            stop_rate=number(
-                "stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG)
-            ),
-        )
-        if self._limits.lowest == self._limits.highest:
+        number("stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0))
+        number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
+        number("lowest", 0.0, "least input", between=(-BIG, BIG))
+        number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG))
+        number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
+        number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
+        self._controller: Any = None  # a Controller or a TrackingController
+        self._stopping = ""
+        self.tune(self.tunable())
+
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Take limits and patience between runs; DataError in the middle of one."""
+        if self._controller is not None or self._stopping:
+            raise DataError("a run is on; stop it first")
+        limits = Limits(**{name: values[name] for name in LIMITS})
+        if limits.lowest == limits.highest:
             raise DataError("no room between lowest and highest; set the limits of the input")
+        self._limits, self._settling = limits, values["settling"]
+        self._stale_after = values["stale_after"]
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
         self._design: Design | None = None
-        self._controller: Any = None  # a Controller or a TrackingController
+        self._controller = None
         self._command: SignalMessage | None = None
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
@@ -146,6 +152,7 @@ class TrackingController(ManagedNode):
             return "a run is on"
         self._controller = self._design.controller(self._limits, self._settling)
         self._first_ns = None
+        self._stale.timer_period_ns = round(self._stale_after * 1e9)
         self._tell("waiting for the response")
         return ""
 
@@ -243,7 +250,7 @@ class TrackingController(ManagedNode):
             "funnel": self._funnel.digest if hasattr(self, "_funnel") else "",
         }
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, self.get_name(), level, self._text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, self._text, values))
 
 
 def main(args: list[str] | None = None) -> None:

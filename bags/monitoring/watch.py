@@ -45,6 +45,10 @@ class Watch:
         self._announced = announced
         self.restart()
 
+    def warn(self, options: AlarmOptions) -> None:
+        """Warn as `options` say from the next sample on."""
+        self._alarm.options = options
+
     def restart(self) -> None:
         """Begin a new run: forget stamps, lags and budget."""
         self.pairing = Pairing()
