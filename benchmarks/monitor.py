@@ -132,7 +132,7 @@ class Ear(Node):
         lane = Lane(self)
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
             lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
+        lane.subscribe(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
 
     def _hear(self, arrivals: dict[int, int], message: JointState) -> None:
         arrivals[stamp_ns_of(message)] = time.time_ns()
