@@ -2,8 +2,6 @@
 
 import math
 import signal
-import subprocess
-import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,22 +13,16 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.monitoring import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
-from bags.samples import f1tenth
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
-from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.f1tenth import design_f1tenth
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
@@ -39,11 +31,7 @@ TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/eve
 @pytest.fixture(scope="module")
 def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
+    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture(autouse=True)
@@ -186,57 +174,3 @@ def test_an_interrupted_controller_ramps_down_before_it_goes(funnel: Path) -> No
     falling = np.diff(commands[commands.index(max(commands)) :])
     assert float(np.min(falling)) >= -2.0 * 0.025 * (1 + 1e-9)
     assert len(falling) >= 4
-
-
-def test_a_lifecycle_manager_can_hold_a_node_stop_it_and_start_it_again(funnel: Path) -> None:
-    heard: list[str] = []
-
-    def hear(message: String) -> None:
-        heard.append(message.data)
-
-    with (
-        node_here("test_manager") as (node, spin_until),
-        process("nlsid_ros.funnel_publisher", funnel=funnel, autostart=False) as publisher,
-    ):
-        node.create_subscription(String, "/funnel_publisher/funnel", hear, qos.DOCUMENT)
-        change = node.create_client(ChangeState, "/funnel_publisher/change_state")
-        spin_until(change.service_is_ready)
-
-        def to(transition: int) -> None:
-            request = ChangeState.Request()
-            request.transition.id = transition
-            answer = change.call_async(request)
-            spin_until(answer.done)
-            assert answer.result().success
-
-        to(Transition.TRANSITION_CONFIGURE)
-        assert node.count_publishers("/funnel_publisher/funnel") == 0
-        to(Transition.TRANSITION_ACTIVATE)
-        spin_until(lambda: len(heard) == 1)
-        to(Transition.TRANSITION_DEACTIVATE)
-        spin_until(lambda: node.count_publishers("/funnel_publisher/funnel") == 0)
-        to(Transition.TRANSITION_ACTIVATE)
-        spin_until(lambda: len(heard) == 2)
-        stop(publisher)
-
-
-def test_nlsid_live_starts_a_whole_loop_and_ends_it(funnel: Path) -> None:
-    options = ["--funnel", str(funnel), "--track", "--plant", "--highest", "0.4"]
-    loop = Loop()
-    running = subprocess.Popen(
-        [sys.executable, "-m", "bags.commands.cli", "live", *options], cwd=ROOT
-    )
-    try:
-        with node_here("test_operator") as (node, spin_until):
-            node.create_subscription(DiagnosticArray, "/diagnostics", loop.hear_status, qos.EVENTS)
-            start = node.create_client(Trigger, "/tracking_controller/start")
-            spin_until(start.service_is_ready)
-            spin_until(lambda: loop.has_said("funnel_monitor", "waiting for the controller"))
-            spin_until(lambda: loop.has_said("tracking_controller", "idle"))
-            start.call_async(Trigger.Request())
-            spin_until(lambda: loop.has_said("tracking_controller", "tracking"))
-            running.send_signal(signal.SIGINT)
-            assert running.wait(timeout=30) == 0
-    finally:
-        running.kill()
-        running.wait()

@@ -1,6 +1,7 @@
 """What goes wrong on a robot, done to the monitor and the recorder over DDS."""
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,22 +13,18 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
-from bags.samples import f1tenth
+from benchmarks.monitor import COMMAND, STATE, timing_funnel
 from nlsid_core import _json
 from nlsid_ros import qos
+from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
@@ -110,11 +107,7 @@ class Robot:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The F1TENTH chain's files."""
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out
+    return design_f1tenth(tmp_path_factory.mktemp("chain")).parent
 
 
 @pytest.fixture(scope="module")
@@ -278,14 +271,132 @@ def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robo
     assert "RELIABILITY" in output
 
 
-def test_a_parameter_cannot_be_changed_under_a_running_monitor(robot: Robot) -> None:
-    robot.ready()
-    client = robot.node.create_client(SetParameters, "/funnel_monitor/set_parameters")
-    robot.spin_until(client.service_is_ready)
-    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=-1.0)
-    request = SetParameters.Request(parameters=[Parameter(name="stale_after", value=value)])
-    answer = client.call_async(request)
-    robot.spin_until(answer.done)
-    [result] = answer.result().results
-    assert not result.successful
-    assert "stale_after" in result.reason
+@pytest.mark.parametrize("role", ["response", "excitation"])
+def test_an_array_of_another_length_is_named_and_ends_the_run(
+    monkeypatch: pytest.MonkeyPatch, role: str
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    said: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        said.extend(status.message for status in message.status)
+
+    design = timing_funnel(1.0)
+    with (
+        node_here("test_joints") as (node, spin_until),
+        process(MONITOR, source="/benchmark", stale_after=5.0) as monitor,
+    ):
+        for document in ("model", "policy", "funnel"):
+            latched = node.create_publisher(String, f"/benchmark/{document}", qos.DOCUMENT)
+            text = _json.canonical(getattr(design, document).document()).decode()
+            latched.publish(String(data=text))
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
+        state, command = (
+            node.create_publisher(JointState, path.partition(":")[0], qos.STREAM)
+            for path in (STATE, COMMAND)
+        )
+        spin_until(lambda: min(p.get_subscription_count() for p in (state, command)) == 1)
+
+        def send(samples: range, *, short: str = "") -> None:
+            for k in samples:
+                for publisher, whose in ((command, "excitation"), (state, "response")):
+                    message = JointState(position=[] if whose == short else [0.0])
+                    message.header.stamp.sec, message.header.stamp.nanosec = 7, k * 10**6
+                    publisher.publish(message)
+
+        send(range(10))
+        spin_until(lambda: "inside" in said)
+        send(range(10, 11), short=role)
+        spin_until(lambda: any("'position' has 0 elements" in text for text in said))
+        count = len(said)
+        send(range(11, 20))
+        spin_until(lambda: len(said) > count + 1)  # a heartbeat or two
+        assert not [text for text in said[count:] if not text.startswith("unknown")]
+        stop(monitor)
+
+
+def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    slow: dict[str, object] = {"hysteresis": 1.0, "clear_after": 60.0, "stale_after": 5.0}
+    with node_here("test_robot") as (node, spin_until), process(MONITOR, **slow) as monitor:
+        robot = Robot(node, spin_until, folder)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        robot.drive([10], speed=1e3)
+        robot.spin_until(lambda: robot.has_said("outside"))
+        robot.said.clear()
+        robot.drive([11, 12, 13, 14])
+        settled = time.monotonic() + 1.5
+        robot.spin_until(lambda: time.monotonic() > settled)
+        assert not robot.has_said("inside")
+        assert not robot.has_said("warning")
+        texts, values = robot.said["funnel_monitor"][-1]
+        assert texts.startswith("outside")
+        assert {"margin", "worst axis", "budget spent", "time to exit [s]"} <= values.keys()
+        stop(monitor)
+
+
+def test_an_alarm_calls_the_services_it_was_given_once(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    called: list[str] = []
+
+    def answer(name: str) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            called.append(name)
+            response.success = True
+            return response
+
+        return serve
+
+    services: dict[str, object] = {"stop_service": "/halt", "snapshot_service": "/keep"}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, **services) as monitor,
+    ):
+        for name in ("/halt", "/keep"):
+            node.create_service(Trigger, name, answer(name))
+        robot = Robot(node, spin_until, folder)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        assert not called
+        robot.drive([10, 11, 12], speed=1e3)
+        robot.spin_until(lambda: len(called) == 2)
+        robot.drive([13, 14, 15], speed=1e3)
+        assert sorted(called) == ["/halt", "/keep"]
+        stop(monitor)
+
+
+def test_an_alarm_with_nobody_to_call_says_so(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, stop_service="/nobody") as monitor,
+    ):
+        robot = Robot(node, spin_until, folder)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.drive([10, 11], speed=1e3)
+        robot.spin_until(lambda: robot.has_said("outside"))
+        assert "/nobody is not there to be called" in stop(monitor)
+
+
+def test_discovery_is_kept_to_this_machine_and_to_one_domain_per_test(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    domains = set()
+    for _ in range(3):
+        use_domain_of_this_run(monkeypatch)
+        assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+        domains.add(os.environ["ROS_DOMAIN_ID"])
+        with node_here("test_elsewhere") as (node, spin_until):
+            spin_until(lambda: True)
+            assert node.get_node_names() == ["test_elsewhere"]
+    assert len(domains) == 3

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.monitoring import documents
 from bags.samples import f1tenth
 from tests.ros.domains import fresh_domain
+from tests.ros.f1tenth import design_f1tenth
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
@@ -23,11 +21,7 @@ pytestmark = pytest.mark.ros
 @pytest.fixture(scope="module")
 def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
+    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture
