@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,97 +11,19 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from benchmarks.monitor import COMMAND, STATE, timing_funnel
 from nlsid_core import _json
 from nlsid_ros import qos
 from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
-
-MONITOR = "nlsid_ros.funnel_monitor"
-PERIOD_NS = 25_000_000
-Spin = Callable[[Callable[[], bool]], None]
-
-
-class Robot:
-    """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
-
-    def __init__(self, node: Node, spin_until: Spin, folder: Path) -> None:
-        self.node, self.spin_until = node, spin_until
-        self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
-        self.latched: dict[str, Publisher] = {}
-        self.texts: dict[str, str] = {}
-        for role in ("model", "policy", "funnel"):
-            self.latched[role] = node.create_publisher(
-                String, f"/funnel_publisher/{role}", qos.DOCUMENT
-            )
-            self.texts[role] = (folder / f"{role}.json").read_text()
-            self.latched[role].publish(String(data=self.texts[role]))
-        self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
-        self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
-        self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            self.said.setdefault(status.name, []).append((status.message, values))
-
-    def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
-        """Whether `node` has said `text`."""
-        return any(text in said for said, _ in self.said.get(node, []))
-
-    def ready(self, monitors: int = 1) -> None:
-        """Wait until the monitors listen."""
-        self.spin_until(lambda: self.odom.get_subscription_count() >= monitors)
-        self.spin_until(lambda: self.command.get_subscription_count() >= monitors)
-
-    def restart(self) -> None:
-        """Begin a new run."""
-        self.ready()
-        client = self.node.create_client(Trigger, "/funnel_monitor/restart")
-        self.spin_until(client.service_is_ready)
-        self.said.clear()
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        self.spin_until(lambda: self.has_said("restarted"))
-        self.node.destroy_client(client)
-
-    def drive(
-        self,
-        samples: list[int],
-        *,
-        speed: float = 0.0,
-        odom: Publisher | None = None,
-        shift_ns: int = 0,
-        slower: float = 1.0,
-        clock: bool = False,
-    ) -> None:
-        """Samples by index, at 40 Hz by their stamps whatever these are."""
-        base = 10**18 + shift_ns
-        for k in samples:
-            command, state = TwistStamped(), Odometry()
-            for message in (command, state):
-                stamp = message.header.stamp
-                stamp.sec, stamp.nanosec = divmod(base + k * PERIOD_NS, 10**9)
-            state.twist.twist.linear.x = speed
-            if clock:
-                self.clock.publish(Clock(clock=state.header.stamp))
-            self.command.publish(command)
-            (odom or self.odom).publish(state)
-            due = time.monotonic() + slower * PERIOD_NS * 1e-9
-            self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +43,6 @@ def robot(folder: Path) -> Iterator[Robot]:
         ):
             yield Robot(node, spin_until, folder)
             stop(monitor)
-
-
-GOOD = list(range(10))
 
 
 @pytest.mark.parametrize(
@@ -313,79 +232,6 @@ def test_an_array_of_another_length_is_named_and_ends_the_run(
         spin_until(lambda: len(said) > count + 1)  # a heartbeat or two
         assert not [text for text in said[count:] if not text.startswith("unknown")]
         stop(monitor)
-
-
-def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
-    slow: dict[str, object] = {"hysteresis": 1.0, "clear_after": 60.0, "stale_after": 5.0}
-    with node_here("test_robot") as (node, spin_until), process(MONITOR, **slow) as monitor:
-        robot = Robot(node, spin_until, folder)
-        robot.ready()
-        robot.drive(GOOD)
-        robot.spin_until(lambda: robot.has_said("inside"))
-        robot.drive([10], speed=1e3)
-        robot.spin_until(lambda: robot.has_said("outside"))
-        robot.said.clear()
-        robot.drive([11, 12, 13, 14])
-        settled = time.monotonic() + 1.5
-        robot.spin_until(lambda: time.monotonic() > settled)
-        assert not robot.has_said("inside")
-        assert not robot.has_said("warning")
-        texts, values = robot.said["funnel_monitor"][-1]
-        assert texts.startswith("outside")
-        assert {"margin", "worst axis", "budget spent", "time to exit [s]"} <= values.keys()
-        stop(monitor)
-
-
-def test_an_alarm_calls_the_services_it_was_given_once(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
-    called: list[str] = []
-
-    def answer(name: str) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
-        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            called.append(name)
-            response.success = True
-            return response
-
-        return serve
-
-    services: dict[str, object] = {"stop_service": "/halt", "snapshot_service": "/keep"}
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(MONITOR, stale_after=5.0, **services) as monitor,
-    ):
-        for name in ("/halt", "/keep"):
-            node.create_service(Trigger, name, answer(name))
-        robot = Robot(node, spin_until, folder)
-        robot.ready()
-        robot.drive(GOOD)
-        robot.spin_until(lambda: robot.has_said("inside"))
-        assert not called
-        robot.drive([10, 11, 12], speed=1e3)
-        robot.spin_until(lambda: len(called) == 2)
-        robot.drive([13, 14, 15], speed=1e3)
-        assert sorted(called) == ["/halt", "/keep"]
-        stop(monitor)
-
-
-def test_an_alarm_with_nobody_to_call_says_so(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(MONITOR, stale_after=5.0, stop_service="/nobody") as monitor,
-    ):
-        robot = Robot(node, spin_until, folder)
-        robot.ready()
-        robot.drive(GOOD)
-        robot.drive([10, 11], speed=1e3)
-        robot.spin_until(lambda: robot.has_said("outside"))
-        assert "/nobody is not there to be called" in stop(monitor)
 
 
 def test_discovery_is_kept_to_this_machine_and_to_one_domain_per_test(

@@ -180,8 +180,6 @@ def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
         operator.hears("model_identifier", "PROVED")
         operator.spin_until(lambda: len(models) == 1)
     model = DifferenceEquation.from_document(_json.parse_document(models[0].data))
-    bag = next(iter(f1tenth()))
-    assert bag.is_dir()
     assert len(model) == 4
 
 
