@@ -5,7 +5,8 @@ python -m benchmarks.monitor [--seconds 60] [--json]
 Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival at
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
-the processor time per sample do not. The monitor runs on a funnel made for timing (its horizon is
+the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
+the priority that a robot gives them. The monitor runs on a funnel made for timing (its horizon is
 as long as the run), not on a proved one.
 """
 
@@ -203,8 +204,12 @@ def live(seconds: float) -> dict[str, float]:
         cpu = cpu_seconds(monitor.pid) - before
     error_ms = (ear.error_ns - sent[-OUT]) / 1e6
     latencies = _latencies(ear.margins, sent, start_ns)
-    with python("benchmarks.monitor", "--echo"):
-        alone = _latencies(ear.echoes, *_run(executor, min(seconds, 20.0)))
+    with python("benchmarks.monitor", "--echo") as relay:
+        _until_there(ear, executor)
+        before = cpu_seconds(relay.pid)
+        sent_alone, start_alone_ns = _run(executor, min(seconds, 20.0))
+        cpu_alone = cpu_seconds(relay.pid) - before
+    alone = _latencies(ear.echoes, sent_alone, start_alone_ns)
     ear.destroy_node()
     rclpy.shutdown()
     result = {"sent": float(len(sent)), "missed": float(len(sent) - len(latencies))}
@@ -217,7 +222,13 @@ def live(seconds: float) -> dict[str, float]:
         result[f"ratio_p{percent}"] = ratio
     result["error_ms"] = error_ms
     result["cpu_us_per_sample"] = 1e6 * cpu / len(sent)
+    result["rclpy_alone_cpu_us_per_sample"] = 1e6 * cpu_alone / len(sent_alone)
     return result
+
+
+def _until_there(ear: Ear, executor: SingleThreadedExecutor) -> None:
+    while not ear.count_publishers(ECHO):
+        executor.spin_once(timeout_sec=0.1)
 
 
 def _run(executor: SingleThreadedExecutor, seconds: float) -> tuple[list[int], int]:

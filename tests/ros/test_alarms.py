@@ -11,7 +11,14 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from std_srvs.srv import Trigger
 
 from tests.ros.f1tenth import design_f1tenth
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import (
+    node_here,
+    process,
+    ros_test,
+    set_parameter,
+    stop,
+    use_domain_of_this_run,
+)
 from tests.ros.robot import GOOD, MONITOR, Robot
 
 pytestmark = ros_test
@@ -44,6 +51,23 @@ def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
         texts, values = robot.said["funnel_monitor"][-1]
         assert texts.startswith("outside")
         assert {"margin", "worst axis", "budget spent", "time to exit [s]"} <= values.keys()
+        stop(monitor)
+
+
+def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0}
+    with node_here("test_robot") as (node, spin_until), process(MONITOR, **wary) as monitor:
+        robot = Robot(node, spin_until, folder)
+        robot.ready()
+        robot.drive(GOOD, speed=0.001)
+        robot.spin_until(lambda: robot.has_said("warning"))
+        assert not robot.has_said("inside")
+        assert set_parameter(node, spin_until, "funnel_monitor", "warning_margin", 0.0) == ""
+        robot.drive([10, 11, 12], speed=0.001)
+        robot.spin_until(lambda: robot.has_said("inside"))
         stop(monitor)
 
 

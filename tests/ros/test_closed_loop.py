@@ -44,12 +44,14 @@ class Loop:
 
     def __init__(self) -> None:
         self.margins: dict[int, tuple[float, ...]] = {}
+        self.latencies: list[float] = []
         self.said: dict[str, list[str]] = {}
 
     def hear_margin(self, message: JointState) -> None:
         """Remember the numbers by stamp."""
         stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         self.margins[stamp_ns] = tuple(message.position)
+        self.latencies.append(message.position[list(message.name).index("latency")])
 
     def hear_status(self, message: DiagnosticArray) -> None:
         """Remember every text by node."""
@@ -94,6 +96,8 @@ def run_loop(funnel: Path, bag: Path, *, push: float) -> Loop:
         listeners = {"/cmd_vel": 3, "/odom": 3}  # recorder, monitor, and the one it is for
         spin_until(lambda: all(node.count_subscribers(t) >= n for t, n in listeners.items()))
         spin_until(lambda: loop.has_said("funnel_monitor", "waiting for the controller"))
+        matched = time.monotonic() + 1.0  # the graph knows a recorder before the plant does
+        spin_until(lambda: time.monotonic() > matched)
         start.call_async(Trigger.Request())
         spin_until(lambda: loop.has_said("funnel_monitor", "inside"))
         pushed_at = time.monotonic() + 1.0
@@ -132,6 +136,7 @@ def test_a_gentle_push_is_tracked_through_and_the_run_ends_inside(
     assert len(live) == 117
     assert live == replayed, "bit for bit"
     assert min(margins[0] for margins in live) > 0.3
+    assert 0.0 < np.median(loop.latencies) < 0.5, "s from stamp to margin, as it says itself"
     assert not (tmp_path / "gentle_snapshot_1").exists()
 
 

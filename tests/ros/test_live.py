@@ -75,14 +75,3 @@ def test_the_publisher_refuses_what_is_not_proved(
     )  # fmt: skip
     assert done.returncode == 1
     assert "not published, not proved" in done.stderr + done.stdout
-
-
-def test_the_monitor_reads_unknown_when_the_state_stops_coming(
-    funnel: Path, environment: dict[str, str]
-) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.ros.listen_stale", str(funnel)],
-        capture_output=True, text=True, env=environment, timeout=100, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "unknown: no speed for 0.1 s" in done.stdout

@@ -4,7 +4,6 @@ import json
 import re
 import signal
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -16,20 +15,28 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from bags.monitoring import documents
 from nlsid_core import _json
 from nlsid_ros import qos
 from nlsid_ros.interfaces import example_nodes
 from tests.ros.f1tenth import design_f1tenth
-from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import (
+    ROOT,
+    node_here,
+    process,
+    ros_test,
+    set_parameter,
+    stop,
+    use_domain_of_this_run,
+)
 
 pytestmark = ros_test
 
@@ -39,7 +46,6 @@ OF_EVERY_NODE = re.compile(
     r"get_available_states|get_available_transitions|get_transition_graph|get_type_description|"
     r"(describe|get|list|set)_\w*parameter\w*)"
 )
-Spin = Callable[[Callable[[], bool]], None]
 
 
 @pytest.fixture(scope="module")
@@ -171,23 +177,6 @@ def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
     assert "Traceback" not in output
 
 
-def set_parameter(node: Node, spin_until: Spin, name: str, key: str, value: float | str) -> str:
-    """Why it was refused, empty if it was not."""
-    client = node.create_client(SetParameters, f"/{name}/set_parameters")
-    spin_until(client.service_is_ready)
-    if isinstance(value, str):
-        wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
-    else:
-        wanted = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-    answer = client.call_async(
-        SetParameters.Request(parameters=[Parameter(name=key, value=wanted)])
-    )
-    spin_until(answer.done)
-    [result] = answer.result().results
-    node.destroy_client(client)
-    return "" if result.successful else str(result.reason)
-
-
 def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel: Path) -> None:
     with (
         node_here("test_operator") as (node, spin_until),
@@ -254,10 +243,18 @@ def test_a_node_goes_through_its_lifecycle_again_and_again(funnel: Path, name: s
     given: dict[str, object] = {"autostart": False}
     given |= {"funnel": funnel} if name == "funnel_publisher" else {}
     given |= {"highest": 0.4} if name == "tracking_controller" else {}
+    takes = {"funnel_monitor": "no speed yet", "tracking_controller": "idle"}.get(name, "PROVED")
+    said: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        said.extend(status.message for status in message.status if status.name == name)
+
     with (
         node_here("test_manager") as (node, spin_until),
-        process(f"nlsid_ros.{name}", **given) as managed,
+        process("nlsid_ros.funnel_publisher", funnel=funnel, __node="source"),
+        process(f"nlsid_ros.{name}", **given, source="source") as managed,
     ):
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
         change = node.create_client(ChangeState, f"/{name}/change_state")
         spin_until(change.service_is_ready)
 
@@ -274,12 +271,34 @@ def test_a_node_goes_through_its_lifecycle_again_and_again(funnel: Path, name: s
             for _ in range(2):
                 to(Transition.TRANSITION_ACTIVATE)
                 spin_until(lambda: node.count_publishers(own) == 1)
+                spin_until(lambda: any(takes in text for text in said))
+                said.clear()
                 to(Transition.TRANSITION_DEACTIVATE)
                 spin_until(lambda: node.count_publishers(own) == 0)
             to(Transition.TRANSITION_CLEANUP)
         to(Transition.TRANSITION_CONFIGURE)
         to(Transition.TRANSITION_ACTIVATE)
         stop(managed)
+
+
+def test_the_funnels_picture_is_in_the_frame_that_was_asked_for(funnel: Path) -> None:
+    tubes: list[MarkerArray] = []
+    plans: list[JointTrajectory] = []
+    with (
+        node_here("test_onlooker") as (node, spin_until),
+        process("nlsid_ros.funnel_publisher", funnel=funnel, frame="odom") as publisher,
+    ):
+        node.create_subscription(MarkerArray, "/funnel_publisher/tube", tubes.append, qos.DOCUMENT)
+        node.create_subscription(
+            JointTrajectory, "/funnel_publisher/nominal", plans.append, qos.DOCUMENT
+        )
+        spin_until(lambda: bool(tubes) and bool(plans))
+        stop(publisher)
+    assert {marker.header.frame_id for marker in tubes[0].markers} == {"odom"}
+    assert all(marker.pose.orientation.w == 1.0 for marker in tubes[0].markers)
+    times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in plans[0].points]
+    assert times[:2] == [0.0, pytest.approx(0.025)]
+    assert max(p.positions[0] for p in plans[0].points) == pytest.approx(0.35, abs=0.1), "m/s"
 
 
 def test_nodes_hear_each_other_under_other_names_and_in_a_namespace(funnel: Path) -> None:
