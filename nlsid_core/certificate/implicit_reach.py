@@ -23,7 +23,8 @@ from nlsid_core.errors import CertificateRejected, Undecided
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.polynomial import Gram, Polynomial, monomials
 
-RATES_SHRUNK = 8  # how much smaller than z the next rates are made where both are bounded together
+RATES_SHRUNK = (1, 4, 16)  # how much smaller than z the next rates are made, bounded together
+HOPELESS = Fraction(2**60)  # a slope that vanishes bounds no difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,12 +169,18 @@ def roots_between(
     contracts around w₂, M near the inverse of ∂h/∂w. Raises CertificateRejected if it may not.
     """
     B, C, N = _normalised(loop)
-    far = 2 * bound  # where w₁ is looked for, and where D ≤ bound/response leaves it
-    weight = _weight(far, radius)
-    slope = _slope(N, weight, _length(radius, far / weight), _length(response, 2 * far / weight))
-    D = _difference(B, C, slope, weight)
-    if D * response > bound:
-        raise CertificateRejected(f"roots may differ by {float(D * response):.3g}; cut the bound")
+    near = 2 * (1 + _norm(B)) * response  # where w₁ is looked for, around w₂
+    D = min(
+        (
+            _difference(B, C, slope, weight)
+            for weight in _weights(bound, radius)
+            for slope in [_slope(N, weight, (radius, bound + near), (response, 2 * near))]
+        ),
+    )
+    if D * response > near:
+        raise CertificateRejected(
+            "roots may differ by more than a disturbance explains; cut the bound or the radius"
+        )
     return D
 
 
@@ -192,11 +199,12 @@ def implicit_response(
     """
     B, C, N = _normalised(loop)
     n = loop.states
-    weight = _weight(reached, radius)
-    size = _length(radius, reached / weight)
-    slope = _slope(N, weight, size, _length(response, D * response / weight))
-    nearer = min(D, _difference(B, C, slope, weight))
-    error = _norm(C - _identity(len(C))) * nearer + slope * (1 + nearer / weight)
+    error = min(
+        _norm(C - _identity(len(C))) * nearer + slope * (1 + nearer / weight)
+        for weight in _weights(reached, radius)
+        for slope in [_slope(N, weight, (radius, reached), (response, D * response))]
+        for nearer in [min(D, _difference(B, C, slope, weight))]
+    )
     by_state, by_rate = loop.rows[1 : n + 1].T, loop.rows[n + 1 :].T
     return (_norm(by_state - by_rate @ B - unit) + _norm(by_rate) * error) * response
 
@@ -243,18 +251,26 @@ def _normalised(loop: ImplicitLoop) -> tuple[Rational, Rational, Rational]:
     return M @ linear[:, :n], M @ linear[:, n:], N
 
 
-def _weight(bound: Fraction, radius: Fraction) -> Fraction:
-    """σ, a power of two, by which w is divided beside z, so that |z| is most of |(z, w/σ)|."""
-    return _two_power(RATES_SHRUNK * bound / radius)
+def _weights(bound: Fraction, radius: Fraction) -> list[Fraction]:
+    """Powers of two σ that w may be divided by beside z; which serves best depends on N."""
+    return [_two_power(bound / radius) * factor for factor in RATES_SHRUNK]
 
 
-def _slope(N: Rational, weight: Fraction, size: Fraction, step: Fraction) -> Fraction:
-    """μ with |N(ζ + ω) - N(ζ)| ≤ μ|ω| for ζ = (z, w/weight), |ζ| ≤ size, |ω| ≤ step."""
+def _slope(
+    N: Rational,
+    weight: Fraction,
+    sizes: tuple[Fraction, Fraction],
+    steps: tuple[Fraction, Fraction],
+) -> Fraction:
+    """μ with |N(ζ + ω) - N(ζ)| ≤ μ(|r| + |Δ|/weight), ω = (r, Δ), for |z|, |w| and |r|, |Δ| up to
+    sizes and steps.
+    """
     variables = 3 * int(N.shape[1])  # z and w
     linear = np.full((N.shape[1], variables), Fraction(0), dtype=object)
     basis = monomials(variables, range(reach.degree_of(N, variables) + 1))
     powers = basis[:, 2 * N.shape[1] :].sum(axis=1).tolist()
     shrunk = N * np.array([weight**power for power in powers], dtype=object)[:, None]
+    size, step = (reach.root_above(z**2 + (w / weight) ** 2) for z, w in (sizes, steps))
     return reach.stretch(reach.curvature(shrunk, linear, variables), Fraction(1), size, step)
 
 
@@ -262,7 +278,7 @@ def _difference(B: Rational, C: Rational, slope: Fraction, weight: Fraction) -> 
     """D of |Δ| ≤ D|r| from |Δ| ≤ |B||r| + |C - 1||Δ| + slope(|r| + |Δ|/weight)."""
     shrink = 1 - _norm(C - _identity(len(C))) - slope / weight
     if shrink <= 0:
-        raise CertificateRejected("the equation's slope in the next rate may vanish in the bound")
+        return HOPELESS
     return (_norm(B) + slope) / shrink
 
 
@@ -272,10 +288,6 @@ def _norm(M: Rational) -> Fraction:
 
 def _identity(d: int) -> Rational:
     return rational(np.eye(d))
-
-
-def _length(a: Fraction, b: Fraction) -> Fraction:
-    return reach.root_above(a**2 + b**2)
 
 
 def _index(n: int, exponent: IntArray) -> int:
