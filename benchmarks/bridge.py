@@ -33,7 +33,7 @@ from nlsid_core.funnels.state_funnel import (
     undisturbed,
 )
 from nlsid_core.identification.states import free_run_error, identify_states
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.monitor import Status
 from nlsid_core.tracking_monitor import TrackingMonitor
 from nlsid_core.trajectory import Dataset
@@ -148,7 +148,7 @@ def measure(robot: Robot, runs: int, seed: int) -> dict[str, float | int | bool 
     return figures | monitored(robot, task, made.design, runs, seed)
 
 
-def designed(robot: Robot, task: Task, model: StateModel, seed: int) -> Made:
+def designed(robot: Robot, task: Task, model: MeasuredState, seed: int) -> Made:
     """The funnel with its exact proof, and how long both took."""
     x, u = plan_motion(model, np.zeros(len(model)), task.goal, steps=task.steps)
     feedback = tvlqr(model, x, u, input_weight=INPUT_WEIGHT)

@@ -10,7 +10,7 @@ import numpy as np
 from nlsid_core._types import FloatArray
 from nlsid_core.controller import Limits
 from nlsid_core.discrete_funnel import DiscreteFunnel
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.monitor import GRID_TOLERANCE
 from nlsid_core.tracking_monitor import StateObserver
 from nlsid_core.tracking_policy import TrackingPolicy
@@ -28,7 +28,7 @@ class TrackingController:
 
     def __init__(
         self,
-        model: StateModel,
+        model: MeasuredState,
         policy: TrackingPolicy,
         funnel: DiscreteFunnel,
         *,

@@ -13,8 +13,8 @@ import numpy as np
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.discrete_funnel import DiscreteFunnel
-from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, SolverError
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE
 from nlsid_core.reading import Level, Status, TrackingReading
 from nlsid_core.tracking_policy import TrackingPolicy
@@ -27,19 +27,23 @@ TREND = 5  # samples over which the margin's trend is taken
 class StateObserver:
     """x̂⁺ = f(x̂, u) + d, d = L(y⁺ - f(x̂, u)), from x̂_0 = y_0."""
 
-    def __init__(self, model: StateModel, L: FloatArray) -> None:
+    def __init__(self, model: MeasuredState, L: FloatArray) -> None:
         self._model, self._L = model, L
         self.x: FloatArray | None = None
+        self.predicted: FloatArray | None = None  # f(x̂, u), before the correction
         self.d: FloatArray = np.zeros(len(model))
 
     def update(self, y: FloatArray, u_before: FloatArray | None) -> FloatArray:
-        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one."""
+        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one.
+
+        Raises SolverError if an implicit model's step finds no root.
+        """
         if self.x is None or u_before is None:
             self.x = np.array(y)
             return self.x
-        predicted = self._model(self.x, u_before)
-        self.d = self._L @ (y - predicted)
-        self.x = predicted + self.d
+        self.predicted = self._model(self.x, u_before)
+        self.d = self._L @ (y - self.predicted)
+        self.x = self.predicted + self.d
         return self.x
 
 
@@ -66,7 +70,7 @@ class DisturbanceMeter:
 
 
 def disturbance_of(
-    model: StateModel,
+    model: MeasuredState,
     policy: TrackingPolicy,
     run: Trajectory,
     *,
@@ -105,7 +109,9 @@ class TrackingMonitor:
 
     lags = 0  # samples before the run's start that it needs
 
-    def __init__(self, model: StateModel, policy: TrackingPolicy, funnel: DiscreteFunnel) -> None:
+    def __init__(
+        self, model: MeasuredState, policy: TrackingPolicy, funnel: DiscreteFunnel
+    ) -> None:
         digest = _json.digest(model.document())
         if policy.model != digest or funnel.model != digest:
             raise CertificateMismatch("policy or funnel was made for another model")
@@ -166,7 +172,11 @@ class TrackingMonitor:
 
     def _judge(self, t: float, y: FloatArray, u: FloatArray | None) -> TrackingReading:
         k, funnel = self._k, self.funnel
-        x = self._observer.update(y, self._u_before)
+        try:
+            x = self._observer.update(y, self._u_before)
+        except SolverError as error:
+            self._ended = f"the model has no next state at t = {t:g} s: {error}"
+            return TrackingReading(t, Status.UNKNOWN, reason=self._ended)
         x_bar, S = x - self.policy.x[k], funnel.S[k]
         size = float(np.linalg.norm(S @ x_bar))
         disturbance = self._meter.update(k, self._observer.d) if k else 0.0
@@ -208,6 +218,10 @@ class TrackingMonitor:
         funnel = self.funnel
         if k == 0 and size > funnel.tube[0]:
             self._violated = f"started outside: {size:.4g} > {funnel.tube[0]:.4g}"
+        elif self._farther_than_roots(k):
+            self._violated = (
+                f"the model's step ended at a root beyond the proved ones at t = {t:g} s"
+            )
         elif disturbance > funnel.assumption.bound:
             self._violated = (
                 f"disturbance {funnel.assumption.form} {disturbance:.4g} above the assumed "
@@ -221,6 +235,15 @@ class TrackingMonitor:
                     f"{self.model.u[worst].name} {u[worst]:.6g} is not the policy's "
                     f"{wanted[worst]:.6g} at t = {t:g} s"
                 )
+
+    def _farther_than_roots(self, k: int) -> bool:
+        """Whether an implicit step's next rates are farther from the nominal than was proved."""
+        predicted, roots = self._observer.predicted, self.funnel.roots
+        if roots is None or predicted is None:
+            return False
+        d = len(predicted) // 2
+        away = (predicted - self.policy.x[k])[d:]
+        return float(np.linalg.norm(self.funnel.S[k][d:, d:] @ away)) > float(roots[k])
 
     def _level(self, k: int, size: float, radius: float) -> Level:
         inlet = float(self.funnel.inlet[k])

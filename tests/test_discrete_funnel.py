@@ -10,7 +10,6 @@ import pytest
 from nlsid_core import _json
 from nlsid_core.certificate import check, proof_document
 from nlsid_core.certificate.composed import compose
-from nlsid_core.certificate.discrete_funnel import StepProof
 from nlsid_core.certificate.reach import rational
 from nlsid_core.errors import (
     CertificateMismatch,
@@ -20,7 +19,7 @@ from nlsid_core.errors import (
     Undecided,
 )
 from nlsid_core.funnels.motion import plan_motion
-from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
+from nlsid_core.funnels.state_funnel import AnyProof, FunnelDesign, design_state_funnel
 from nlsid_core.polynomial import Polynomial, compose_affine, monomials
 from tests.tracked import (
     STEPS,
@@ -168,7 +167,7 @@ def forged(design: FunnelDesign, what: str) -> FunnelDesign:
     raise ValueError(what)
 
 
-def _changed(design: FunnelDesign, key: str, where: object) -> dict[str, list[StepProof]]:
+def _changed(design: FunnelDesign, key: str, where: object) -> dict[str, list[AnyProof]]:
     steps = {chain: list(proofs) for chain, proofs in design.steps.items()}
     matrix = getattr(steps["tube"][5], key).copy()
     matrix[where] *= -1.0

@@ -21,7 +21,8 @@ class StateIdentification(_Section):
     """validation: bags that choose the degrees. refuse_above: % of error in free run.
 
     degrees: classes to try, the highest power of each state and input (default: a few).
-    biased_without_repeats: least squares where no excitation was repeated.
+    biased_without_repeats: least squares where no excitation was repeated. implicit: a trapezoidal
+    step of a mechanism instead of an explicit map.
     """
 
     validation: Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
@@ -30,6 +31,7 @@ class StateIdentification(_Section):
         tuple[Annotated[tuple[int, ...], Field(strict=False)], ...] | None, Field(strict=False)
     ] = None
     biased_without_repeats: bool = False
+    implicit: bool = False
 
 
 class MotionConfig(_Section):

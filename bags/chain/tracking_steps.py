@@ -23,7 +23,7 @@ from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.funnels.motion import Feedback, follow_motion, plan_motion, track, tvlqr
 from nlsid_core.funnels.state_funnel import FunnelDesign, assume, design_state_funnel, frame
 from nlsid_core.identification.states import StateFit, identify_states
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.reading import Nominal, TrackingReading
 from nlsid_core.tracking_monitor import OVER
 from nlsid_core.tracking_policy import TrackingPolicy
@@ -81,6 +81,7 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
         degrees=options.degrees,
         refuse_above=options.refuse_above,
         biased_without_repeats=options.biased_without_repeats,
+        implicit=options.implicit,
     )
     _json.write_document(out / documents.MODEL, fit.model.document())
     return fit
@@ -92,7 +93,8 @@ def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> Tracki
     if motion.samples is not None:
         x, u = follow_motion(model, _read_samples(motion.samples, model))
     else:
-        assert motion.start is not None and motion.goal is not None
+        assert motion.start is not None
+        assert motion.goal is not None
         assert motion.duration is not None  # the configuration has checked that
         steps = round(motion.duration / model.period)
         x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
@@ -167,12 +169,12 @@ def replay_run(
     return [monitor.update(float(t), y, u) for t, y, u in zip(run.t, run.y, run.u, strict=True)]
 
 
-def load_state_model(path: Path) -> StateModel:
+def load_state_model(path: Path) -> MeasuredState:
     """Read a model file; DocumentError says what is wrong with it."""
-    return StateModel.from_document(_json.load_document(path), source=path.name)
+    return read_measured_state(_json.load_document(path), source=path.name)
 
 
-def _read_samples(path: Path, model: StateModel) -> FloatArray:
+def _read_samples(path: Path, model: MeasuredState) -> FloatArray:
     """(N + 1, n) from a CSV file headed by the states' names; DataError says what is wrong."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
@@ -185,7 +187,7 @@ def _read_samples(path: Path, model: StateModel) -> FloatArray:
         raise DataError(f"{path}: {error}") from error
 
 
-def _load_pair(folder: Path) -> tuple[StateModel, TrackingPolicy]:
+def _load_pair(folder: Path) -> tuple[MeasuredState, TrackingPolicy]:
     model = load_state_model(folder / documents.MODEL)
     policy = TrackingPolicy.from_document(
         _json.load_document(folder / documents.POLICY), source=documents.POLICY
@@ -195,7 +197,9 @@ def _load_pair(folder: Path) -> tuple[StateModel, TrackingPolicy]:
     return model, policy
 
 
-def _feedback(model: StateModel, x: np.ndarray, u: np.ndarray, config: TrackingConfig) -> Feedback:
+def _feedback(
+    model: MeasuredState, x: np.ndarray, u: np.ndarray, config: TrackingConfig
+) -> Feedback:
     motion = config.motion
     return tvlqr(model, x, u, state_weight=motion.state_weight, input_weight=motion.input_weight)
 

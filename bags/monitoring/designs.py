@@ -13,7 +13,7 @@ from nlsid_core.discrete_funnel import DiscreteFunnel
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.funnel import Funnel
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.monitor import Monitor, Nominal
 from nlsid_core.policy import Policy
 from nlsid_core.tracking_controller import TrackingController
@@ -57,7 +57,7 @@ class LinearDesign:
 class TrackingDesign:
     """A discrete funnel of a state model: the whole state measured, several inputs."""
 
-    model: StateModel
+    model: MeasuredState
     policy: TrackingPolicy
     funnel: DiscreteFunnel
 
@@ -100,7 +100,7 @@ def read_design(documents: Mapping[str, Json]) -> Design:
     design: Design
     if funnel.get("kind") == discrete_funnel.KIND:
         design = TrackingDesign(
-            StateModel.from_document(model),
+            read_measured_state(model),
             TrackingPolicy.from_document(policy),
             DiscreteFunnel.from_document(funnel),
         )

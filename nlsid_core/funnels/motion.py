@@ -11,7 +11,7 @@ from nlsid_core import _json, conic
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.tracking_policy import TrackingPolicy
 
 ITERATIONS = 30  # of linearising the model around the last motion
@@ -39,7 +39,7 @@ class _Pull:
 
 
 def plan_motion(
-    model: StateModel,
+    model: MeasuredState,
     start: ArrayLike,
     goal: ArrayLike,
     *,
@@ -63,7 +63,7 @@ def plan_motion(
 
 
 def follow_motion(
-    model: StateModel, samples: ArrayLike, *, reserve: float = RESERVE
+    model: MeasuredState, samples: ArrayLike, *, reserve: float = RESERVE
 ) -> tuple[FloatArray, FloatArray]:
     """The model's own motion nearest to given states (N + 1, n), one per period: x and u (N, p).
 
@@ -79,7 +79,7 @@ def follow_motion(
 
 
 def _transcribed(
-    model: StateModel, given: FloatArray, *, reserve: float, fidelity: float | None
+    model: MeasuredState, given: FloatArray, *, reserve: float, fidelity: float | None
 ) -> tuple[FloatArray, FloatArray]:
     """Sequential quadratic programs from the states (N + 1, n) `given`, which fix the ends.
 
@@ -106,7 +106,7 @@ def _transcribed(
 
 
 def tvlqr(
-    model: StateModel,
+    model: MeasuredState,
     x: FloatArray,
     u: FloatArray,
     *,
@@ -129,7 +129,7 @@ def tvlqr(
     return Feedback(np.array(K[::-1]), np.array(P[::-1]))
 
 
-def observer_gain(model: StateModel) -> FloatArray:
+def observer_gain(model: MeasuredState) -> FloatArray:
     """L (n, n) of x̂⁺ = f + L(y⁺ - f), Kalman's for the model's noise and disturbance.
 
     Linearised at the middle of the data box.
@@ -140,7 +140,7 @@ def observer_gain(model: StateModel) -> FloatArray:
     return np.asarray(np.linalg.solve(prior + R, prior).T)
 
 
-def track(model: StateModel, x: FloatArray, u: FloatArray, feedback: Feedback) -> TrackingPolicy:
+def track(model: MeasuredState, x: FloatArray, u: FloatArray, feedback: Feedback) -> TrackingPolicy:
     """The policy that follows a motion with this feedback and the model's observer."""
     return TrackingPolicy(
         x=x,
@@ -152,14 +152,14 @@ def track(model: StateModel, x: FloatArray, u: FloatArray, feedback: Feedback) -
     )
 
 
-def _rolled_out(model: StateModel, x: FloatArray, u: FloatArray) -> FloatArray:
+def _rolled_out(model: MeasuredState, x: FloatArray, u: FloatArray) -> FloatArray:
     """The model's own motion under u, so that no defect is left but rounding."""
     states = model.simulate(x[0], u)
     return states if np.isfinite(states).all() else x
 
 
 def _subproblem(
-    model: StateModel,
+    model: MeasuredState,
     x: FloatArray,
     u: FloatArray,
     ends: Sequence[FloatArray],
