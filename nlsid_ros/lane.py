@@ -29,9 +29,6 @@ class Lane:
         self._node = node
         self._callbacks: dict[Subscription, Received] = {}
 
-    def __len__(self) -> int:
-        return len(self._callbacks)
-
     def subscribe(self, kind: Any, topic: str, callback: Received, profile: QoSProfile) -> None:
         """As `node.create_subscription`."""
 

@@ -35,10 +35,10 @@ def python(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def node(module: str, **parameters: object) -> list[str]:
-    """Arguments for `python` that start a node quietly with parameters."""
-    settings = [
-        part
+    """Arguments for `python` that start a node quietly with parameters; a string is taken as is."""
+    written = {
+        name: value if isinstance(value, str) else json.dumps(value, default=str)
         for name, value in parameters.items()
-        for part in ("-p", f"{name}:={json.dumps(value, default=str)}")
-    ]
+    }
+    settings = [part for name, text in written.items() for part in ("-p", f"{name}:={text}")]
     return [f"nlsid_ros.{module}", "--ros-args", "--log-level", "warn", *settings]

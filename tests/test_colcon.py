@@ -68,7 +68,11 @@ class Workspace:
 
 
 # Colcon runs the tests with the Python it runs on; the system's has colcon but not what we need.
-COLCON_HERE = "import sys; sys.path.insert(0, {!r}); from colcon_core.command import main; main()"
+COLCON_HERE = """import sys
+sys.path.insert(0, {!r})
+from colcon_core.command import main
+sys.exit(main())
+"""
 
 
 @pytest.fixture(scope="module", params=["", "--symlink-install"], ids=["copied", "symlinked"])
@@ -137,7 +141,8 @@ def test_the_sample_bags_are_installed_with_their_licence(workspace: Workspace) 
 def test_the_packages_tests_pass_as_colcon_runs_them(workspace: Workspace) -> None:
     where = "import pathlib, colcon_core as c; print(pathlib.Path(c.__file__).parents[1])"
     colcon = COLCON_HERE.format(workspace.run("/usr/bin/python3", "-c", where).strip())
-    workspace.run(sys.executable, "-c", colcon, "test", "--return-code-on-test-failure")
+    shown = ("--event-handlers", "console_cohesion+", "--return-code-on-test-failure")
+    workspace.run(sys.executable, "-c", colcon, "test", *shown)
     summary = workspace.run("colcon", "test-result").splitlines()[-1]
     tests, errors, failures, _ = (int(number) for number in re.findall(r"\d+", summary))
     assert tests > 1000

@@ -10,7 +10,6 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from std_srvs.srv import Trigger
 
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import (
     node_here,
     process,
@@ -24,19 +23,13 @@ from tests.ros.robot import GOOD, MONITOR, Robot
 pytestmark = ros_test
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's files."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain")).parent
-
-
 def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     slow: dict[str, object] = {"hysteresis": 1.0, "clear_after": 60.0, "stale_after": 5.0}
     with node_here("test_robot") as (node, spin_until), process(MONITOR, **slow) as monitor:
-        robot = Robot(node, spin_until, folder)
+        robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
         robot.drive(GOOD)
         robot.spin_until(lambda: robot.has_said("inside"))
@@ -55,12 +48,12 @@ def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
 
 
 def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0}
     with node_here("test_robot") as (node, spin_until), process(MONITOR, **wary) as monitor:
-        robot = Robot(node, spin_until, folder)
+        robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
         robot.drive(GOOD, speed=0.001)
         robot.spin_until(lambda: robot.has_said("warning"))
@@ -72,7 +65,7 @@ def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
 
 
 def test_an_alarm_calls_the_services_it_was_given_once(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     called: list[str] = []
@@ -92,7 +85,7 @@ def test_an_alarm_calls_the_services_it_was_given_once(
     ):
         for name in ("/halt", "/keep"):
             node.create_service(Trigger, name, answer(name))
-        robot = Robot(node, spin_until, folder)
+        robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
         robot.drive(GOOD)
         robot.spin_until(lambda: robot.has_said("inside"))
@@ -105,14 +98,14 @@ def test_an_alarm_calls_the_services_it_was_given_once(
 
 
 def test_an_alarm_with_nobody_to_call_says_so(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, stale_after=5.0, stop_service="/nobody") as monitor,
     ):
-        robot = Robot(node, spin_until, folder)
+        robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
         robot.drive(GOOD)
         robot.drive([10, 11], speed=1e3)

@@ -21,17 +21,10 @@ from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture(autouse=True)

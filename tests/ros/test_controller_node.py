@@ -21,7 +21,6 @@ from bags.monitoring.announcement import Run
 from nlsid_core import _json
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
@@ -29,12 +28,6 @@ pytestmark = ros_test
 CONTROLLER = "nlsid_ros.tracking_controller"
 PERIOD_NS = 25_000_000
 STOP_RATE = 2.0
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 class Stage:

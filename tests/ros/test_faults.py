@@ -19,7 +19,6 @@ from std_msgs.msg import String
 from benchmarks.monitor import COMMAND, STATE, timing_funnel
 from nlsid_core import _json
 from nlsid_ros import qos
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
@@ -27,13 +26,7 @@ pytestmark = ros_test
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's files."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain")).parent
-
-
-@pytest.fixture(scope="module")
-def robot(folder: Path) -> Iterator[Robot]:
+def robot(funnel: Path) -> Iterator[Robot]:
     """One robot with one monitor, which each test restarts."""
     with pytest.MonkeyPatch.context() as patch:
         use_domain_of_this_run(patch)
@@ -41,7 +34,7 @@ def robot(folder: Path) -> Iterator[Robot]:
             node_here("test_robot") as (node, spin_until),
             process(MONITOR, stale_after=0.5) as monitor,
         ):
-            yield Robot(node, spin_until, folder)
+            yield Robot(node, spin_until, funnel.parent)
             stop(monitor)
 
 

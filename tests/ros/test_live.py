@@ -11,17 +11,10 @@ import pytest
 from bags.monitoring import documents
 from bags.samples import f1tenth
 from tests.ros.domains import fresh_domain
-from tests.ros.f1tenth import design_f1tenth
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture

@@ -27,7 +27,6 @@ from bags.monitoring import documents
 from nlsid_core import _json
 from nlsid_ros import qos
 from nlsid_ros.interfaces import example_nodes
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import (
     ROOT,
     node_here,
@@ -46,12 +45,6 @@ OF_EVERY_NODE = re.compile(
     r"get_available_states|get_available_transitions|get_transition_graph|get_type_description|"
     r"(describe|get|list|set)_\w*parameter\w*)"
 )
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 @pytest.fixture(autouse=True)

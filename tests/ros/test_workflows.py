@@ -23,19 +23,12 @@ from bags.samples import f1tenth
 from nlsid_core import _json
 from nlsid_core.models import DifferenceEquation
 from nlsid_ros import qos
-from tests.ros.f1tenth import design_f1tenth
 from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
 
 pytestmark = ros_test
 
 ENDED = 40.0  # s for all nodes of a workflow to end when asked to
 PATIENT = ["stale_after:=1.0", "command_wait:=0.5"]  # the machine may be busy with other tests
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    return design_f1tenth(tmp_path_factory.mktemp("chain"))
 
 
 class Operator:
