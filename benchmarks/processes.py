@@ -1,11 +1,24 @@
 """What the live benchmarks share: the nodes' processes, and the processor time of one."""
 
 import os
+import subprocess
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from nlsid_ros.processes import isolate, node, python
+from nlsid_ros import processes
+from nlsid_ros.processes import isolate
 
 __all__ = ["cpu_seconds", "isolate", "node", "python"]
+
+
+def python(module: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    """A module in a process of its own, interrupted at the end."""
+    return processes.python(module, arguments)
+
+
+def node(module: str, **parameters: object) -> list[str]:
+    """Arguments for `python` that start a node quietly with parameters."""
+    return [f"nlsid_ros.{module}", *processes.settings(parameters)]
 
 
 def cpu_seconds(pid: int) -> float:

@@ -8,11 +8,12 @@ python -m nlsid_ros.live --funnel DIR/funnel.json --bag BAG --out DIR [--json]
 
 import argparse
 import json
+import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
-from nlsid_ros.processes import isolate, node, python
+from nlsid_ros.processes import isolate, python, settings
 
 FAULT = "scaled by 0.6"
 PATIENCE = 30.0  # s for a process to come up or a message to arrive, on a loaded machine
@@ -130,10 +131,10 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     faulty = out / f"{bag.name}, {FAULT}"
     write_faulty_copy(bag, faulty, model.y.path, FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
-    with _observing(topics) as observer, python(*node("funnel_publisher", funnel=funnel)):
-        with python(*node("funnel_monitor")):
+    with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
+        with _node("funnel_monitor", {}):
             _wait("the monitor to be ready", lambda: observer.has_said("funnel_monitor", " yet"))
-            with python(*node("trajectory_recorder", bag=recording, topics=list(topics))):
+            with _node("trajectory_recorder", {"bag": recording, "topics": list(topics)}):
                 _wait("the recorder", lambda: observer.has_said("trajectory_recorder", ""))
                 _play(bag, list(topics), listeners=3)
                 time.sleep(SETTLE)
@@ -185,7 +186,7 @@ def _contents(bag: Path, topics: list[str]) -> list[tuple[str, int, bytes]]:
 
 
 def _play(bag: Path, topics: list[str], *, listeners: int) -> None:
-    with python(*node("bag_player", bag=bag, topics=topics, wait_for=listeners)) as player:
+    with _node("bag_player", {"bag": bag, "topics": topics, "wait_for": listeners}) as player:
         if player.wait(timeout=PATIENCE + 60.0):
             raise NlsidError(f"bag_player ended with status {player.returncode}")
 
@@ -219,6 +220,12 @@ def _spin(executor: SingleThreadedExecutor) -> None:
         executor.spin()
     except ExternalShutdownException:
         return
+
+
+def _node(
+    name: str, parameters: Mapping[str, object]
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    return python(f"nlsid_ros.{name}", settings(parameters))
 
 
 def _wait(what: str, done: Callable[[], bool]) -> None:

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 PATIENCE = 30.0  # s for a process to end when asked to, on a loaded machine
@@ -19,7 +19,7 @@ def isolate() -> None:
 
 
 @contextmanager
-def python(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def python(module: str, arguments: Sequence[str] = ()) -> Iterator[subprocess.Popen[bytes]]:
     """A module in a process of its own, interrupted at the end and waited for."""
     running = subprocess.Popen([sys.executable, "-m", module, *arguments])
     try:
@@ -34,11 +34,11 @@ def python(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
             running.wait()
 
 
-def node(module: str, **parameters: object) -> list[str]:
-    """Arguments for `python` that start a node quietly with parameters; a string is taken as is."""
+def settings(parameters: Mapping[str, object]) -> list[str]:
+    """Arguments that start a node quietly with parameters; a string is taken as it is."""
     written = {
         name: value if isinstance(value, str) else json.dumps(value, default=str)
         for name, value in parameters.items()
     }
-    settings = [part for name, text in written.items() for part in ("-p", f"{name}:={text}")]
-    return [f"nlsid_ros.{module}", "--ros-args", "--log-level", "warn", *settings]
+    given = [part for name, text in written.items() for part in ("-p", f"{name}:={text}")]
+    return ["--ros-args", "--log-level", "warn", *given]
