@@ -43,7 +43,8 @@ def design() -> TrackingDesign:
 
 def run(controller: TrackingController, seed: int = 0) -> tuple[FloatArray, FloatArray]:
     """States and inputs of the model under the controller, until it ends."""
-    model, rng, x = controller.model, np.random.default_rng(seed), np.zeros(2)
+    model, rng = controller.model, np.random.default_rng(seed)
+    x: FloatArray = np.zeros(2)
     y, u = [], []
     for k in range(STEPS + 50):
         y.append(x + NOISE * rng.standard_normal(2))
@@ -97,9 +98,8 @@ def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_sta
     tmp_path: Path, announced_late: bool
 ) -> None:
     """An announcement may be recorded before its first sample or some samples after it."""
-    made, runs = design(), []
-    for seed in range(2):
-        runs.append(run(made.controller(LIMITS, 1.0), seed))
+    made = design()
+    runs = [run(made.controller(LIMITS, 1.0), seed) for seed in range(2)]
     digest = _json.digest(made.funnel.document())
     topics = standard_types()
     with BagWriter(tmp_path / "bag") as writer:
