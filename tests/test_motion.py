@@ -4,13 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from bags.chain.tracking_config import load_tracking_config
 from bags.chain.tracking_steps import plan_tracking
 from benchmarks.swing import swing, swing_config
 from nlsid_core import _json
 from nlsid_core.errors import DataError, Infeasible, ShapeError
-from nlsid_core.funnels.motion import follow_motion
+from nlsid_core.funnels.motion import (
+    NEARNESS,
+    RESERVE,
+    SMOOTHNESS,
+    follow_motion,
+    plan_motion,
+)
 from tests.tracked import PERIOD, pendulum
 
 
@@ -29,6 +36,37 @@ def test_given_samples_become_a_motion_of_the_model_itself() -> None:
     np.testing.assert_allclose(x, samples, atol=0.02)
     np.testing.assert_allclose(x[[0, -1]], samples[[0, -1]], atol=1e-5)
     assert (np.abs(u) < 9.0).all()  # a tenth of the box is kept in reserve
+
+
+def test_a_planned_motion_is_the_one_that_scipy_finds_more_slowly() -> None:
+    """The same transcription of 15 samples by SLSQP, in units of the box."""
+    model, steps = pendulum(), 15
+    half_x, half_u = model.x_range[:, 1], model.u_range[:, 1]
+    ends = np.array([[0.0, 0.0], [0.1, 0.0]]) / half_x
+
+    def parts(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return z[: 2 * (steps + 1)].reshape(-1, 2), z[2 * (steps + 1) :].reshape(-1, 1)
+
+    def cost(z: np.ndarray) -> float:
+        x, u = parts(z)
+        smooth = SMOOTHNESS * steps * float(np.sum(np.diff(u, axis=0) ** 2))
+        return (NEARNESS * float(np.sum(x**2)) + float(np.sum(u**2)) + smooth) / 2
+
+    def defects(z: np.ndarray) -> np.ndarray:
+        x, u = parts(z)
+        steps_missed = model(x[:-1] * half_x, u * half_u) / half_x - x[1:]
+        return np.concatenate([steps_missed.ravel(), x[0] - ends[0], x[-1] - ends[1]])
+
+    start = np.zeros(3 * steps + 2)
+    found = minimize(
+        cost, start, method="SLSQP", constraints={"type": "eq", "fun": defects},
+        bounds=[(-1.0 + RESERVE, 1.0 - RESERVE)] * len(start), options={"maxiter": 300},
+    )  # fmt: skip
+    assert found.success
+    x, u = plan_motion(model, [0.0, 0.0], [0.1, 0.0], steps=steps)
+    ours = np.concatenate([(x / half_x).ravel(), (u / half_u).ravel()])
+    assert cost(ours) <= found.fun * (1 + 1e-5)
+    np.testing.assert_allclose(ours, found.x, atol=2e-3)
 
 
 def test_samples_that_are_no_motion_within_the_inputs_are_infeasible() -> None:
