@@ -20,12 +20,12 @@ from nlsid_core.tracking_monitor import TrackingMonitor
 from tests.test_trapezoidal import PERIOD, truth
 from tests.tracked import assumption, resigned, step, write
 
-STEPS, BOUND = 20, 0.02
+STEPS, BOUND = 14, 0.02
 SCHEMAS = Path(__file__).resolve().parent.parent / "docs" / "schema"
 
 
 @cache
-def designed(form: str = "response", goal: float = 0.2) -> FunnelDesign:
+def designed(form: str = "response", goal: float = 0.1) -> FunnelDesign:
     """The funnel around a short motion of the trapezoidal pendulum."""
     model = truth()
     x, u = plan_motion(model, [0.0, 0.0], [goal, 0.0], steps=STEPS)
@@ -108,7 +108,7 @@ def forged(design: FunnelDesign, what: str) -> FunnelDesign:
         other = replace(funnel.assumption, form="energy", gain=60.0)
         return resigned(design, funnel=replace(funnel, assumption=other))
     if what == "another nominal":
-        return resigned(design, policy=designed(goal=0.1).policy)
+        return resigned(design, policy=designed(goal=0.05).policy)
     if what == "another model":
         heavier = replace(design.model, coefficients=1.02 * design.model.coefficients)
         return resigned(design, model=heavier)

@@ -29,6 +29,7 @@ LEAST_DISTURBANCE = (
     0.1  # of the measurement noise: no model is so good that its robot may not change
 )
 REPEATED_INPUT = 1e-3  # relative; a driver may quantise, but repeats play the same inputs
+SHORTEST = 50  # samples of a stretch in the box worth simulating
 SLICES = 8  # of each variable's range, to say where a model class fails
 
 
@@ -84,7 +85,7 @@ def identify_states(
             tried.append((tuple(choice), np.inf))
             continue
         model = _model(train, groups, exponents, theta, scale, data, implicit=implicit)
-        error = free_run_error(model, validation)
+        error = free_run_error(model, validation, in_box=True)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
             best = StateFit(model, error, ())
@@ -109,17 +110,31 @@ def classes_to_try(n: int, p: int, *, implicit: bool = False) -> list[tuple[int,
     return choices
 
 
-def free_run_error(model: MeasuredState, dataset: Dataset) -> float:
-    """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread."""
+def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = False) -> float:
+    """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread.
+
+    in_box: only of the stretches in the box of the model's data, each from its measured start;
+    outside it the model is not a claim about anything. Infinite if it diverges or nothing is left.
+    """
     errors = []
     for trial in dataset:
-        states = model.simulate(trial.y[0], trial.u[:-1])
-        spread = trial.y.std(axis=0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            missed = float(np.linalg.norm((trial.y - states) / spread))
-        whole = float(np.linalg.norm((trial.y - trial.y.mean(axis=0)) / spread))
-        errors.append(100.0 * missed / whole if np.isfinite(missed) else np.inf)
-    return max(errors)
+        spread, mean = trial.y.std(axis=0), trial.y.mean(axis=0)
+        missed = whole = 0.0
+        for part in _stretches(model, trial) if in_box else [slice(0, len(trial))]:
+            y, u = trial.y[part], trial.u[part]
+            with np.errstate(over="ignore", invalid="ignore"):
+                missed += float(np.sum(((y - model.simulate(y[0], u[:-1])) / spread) ** 2))
+            whole += float(np.sum(((y - mean) / spread) ** 2))
+        if whole:
+            errors.append(100.0 * np.sqrt(missed / whole) if np.isfinite(missed) else np.inf)
+    return float(max(errors, default=np.inf))
+
+
+def _stretches(model: MeasuredState, trial: Trajectory) -> list[slice]:
+    """Where the trajectory stays in the box of the model's data for SHORTEST samples or more."""
+    outside = (trial.y < model.x_range[:, 0]) | (trial.y > model.x_range[:, 1])
+    ends = [-1, *np.flatnonzero(outside.any(axis=1)).tolist(), len(trial)]
+    return [slice(a + 1, b) for a, b in pairwise(ends) if b - a > SHORTEST]
 
 
 def where_it_fails(model: MeasuredState, dataset: Dataset) -> str:
