@@ -2,9 +2,12 @@
 
 python -m benchmarks.monitor [--seconds 60] [--json]
 
-Beside ours: what was asked of it, and rclpy alone between two processes (p50 0.17, p99 0.43 ms).
-Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival.
-The node runs on a funnel made for timing (its horizon is as long as the run), not on a proved one.
+Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival at
+a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
+with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
+the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
+the priority that a robot gives them. The monitor runs on a funnel made for timing (its horizon is
+as long as the run), not on a proved one.
 """
 
 import os
@@ -17,12 +20,14 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -32,18 +37,22 @@ from bags.signals.grid import read_dataset
 from benchmarks.machine import describe
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_core import _json
+from nlsid_core._types import FloatArray
 from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.monitor import MonitorBank
+from nlsid_core.reading import Reading, Status
 from nlsid_core.trajectory import Dataset, Trajectory
 from nlsid_ros import qos
+from nlsid_ros.lane import Lane
+from nlsid_ros.messages import stamp_ns_of
 
 LAGS, FUNNELS, ROUNDS = 6, 10, 40
 RATE = 1000  # Hz
-SOURCE = "/benchmark"
+SOURCE, MARGIN, ECHO = "/benchmark", "/funnel_monitor/margin", "/benchmark/echo"
 STATE, COMMAND = "/benchmark/state:position[0]", "/benchmark/command:position[0]"
-OUTSIDE = 100.0  # a response no funnel holds
+OUTSIDE, OUT = 100.0, 100  # a response no funnel holds, and how many of them end a run
 ASKED = {
     "update_us_p50": 20.0,
     "update_us_p99": 50.0,
@@ -113,19 +122,21 @@ class Ear(Node):
 
     def __init__(self, design: TubeDesign) -> None:
         super().__init__("ear")
-        self.arrivals: dict[int, int] = {}
+        self.margins: dict[int, int] = {}
+        self.echoes: dict[int, int] = {}
         self.error_ns = 0
         self.ready = False
         for role in ("model", "policy", "funnel"):
             document = getattr(design, role).document()
             publisher = self.create_publisher(String, f"{SOURCE}/{role}", qos.DOCUMENT)
             publisher.publish(String(data=_json.canonical(document).decode()))
-        self.create_subscription(JointState, "/funnel_monitor/margin", self._margin, qos.STREAM)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
+        lane = Lane(self)
+        for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
+            lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)
+        lane.subscribe(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
 
-    def _margin(self, message: JointState) -> None:
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        self.arrivals[stamp_ns] = time.time_ns()
+    def _hear(self, arrivals: dict[int, int], message: JointState) -> None:
+        arrivals[stamp_ns_of(message)] = time.time_ns()
 
     def _status(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -135,12 +146,12 @@ class Ear(Node):
 
 
 def send(seconds: float) -> None:
-    """Publish command and response at 1 kHz, the last 100 responses outside; print the stamps."""
+    """Publish command and response at 1 kHz, the last OUT responses outside; print the stamps."""
     rclpy.init()
     sender = Node("sender")
     state = sender.create_publisher(JointState, STATE.partition(":")[0], qos.STREAM)
     command = sender.create_publisher(JointState, COMMAND.partition(":")[0], qos.STREAM)
-    while min(state.get_subscription_count(), command.get_subscription_count()) < 1:
+    while state.get_subscription_count() < 1:
         time.sleep(0.01)
     time.sleep(0.5)
     count, message = round(seconds * RATE), JointState(position=[0.0])
@@ -153,12 +164,29 @@ def send(seconds: float) -> None:
         sent.append(time.time_ns())
         message.position[0] = 0.0
         command.publish(message)
-        message.position[0] = OUTSIDE if k >= count - 100 else 0.0
+        message.position[0] = OUTSIDE if k >= count - OUT else 0.0
         state.publish(message)
     time.sleep(1.0)
     print(json.dumps({"start_ns": start_ns, "sent_ns": sent}))
     sender.destroy_node()
     rclpy.shutdown()
+
+
+def echo() -> None:
+    """Answer every sample with a message as long as a margin: what rclpy alone costs."""
+    rclpy.init()
+    relay = Node("echo")
+    answers = relay.create_publisher(JointState, ECHO, qos.STREAM)
+    numbers = [*Reading(0.0, Status.INSIDE).numbers, "time_to_exit", "latency"]
+    answer = JointState(name=numbers, position=[0.0] * len(numbers))
+
+    def on_state(message: JointState) -> None:
+        answer.header.stamp = message.header.stamp
+        answers.publish(answer)
+
+    relay.create_subscription(JointState, STATE.partition(":")[0], on_state, qos.STREAM)
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(relay)
 
 
 def live(seconds: float) -> dict[str, float]:
@@ -171,39 +199,59 @@ def live(seconds: float) -> dict[str, float]:
     with python(*node("funnel_monitor", source=SOURCE)) as monitor:
         while not ear.ready:
             executor.spin_once(timeout_sec=0.1)
-        sender = subprocess.Popen(
-            [sys.executable, "-m", "benchmarks.monitor", "--send", str(seconds)],
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        heard: list[str] = []
-        assert sender.stdout is not None
-        reader = threading.Thread(target=lambda: heard.extend(sender.stdout or ()))
-        reader.start()
-        while reader.is_alive():
-            executor.spin_once(timeout_sec=0.1)
-        cpu = cpu_seconds(monitor.pid)
-        sender.wait()
-    sent = json.loads(heard[-1])
-    stamps = [sent["start_ns"] + k * 10**9 // RATE for k in range(len(sent["sent_ns"]))]
-    ways = [
-        ear.arrivals[stamp] - at
-        for stamp, at in zip(stamps, sent["sent_ns"], strict=True)
-        if stamp in ear.arrivals
-    ]
-    latencies = np.array(ways) / 1e6
-    result = {
-        "sent": len(stamps),
-        "missed": len(stamps) - len(latencies),
-        "latency_ms_p50": float(np.percentile(latencies, 50)),
-        "latency_ms_p99": float(np.percentile(latencies, 99)),
-        "latency_ms_max": float(np.max(latencies)),
-        "error_ms": (ear.error_ns - sent["sent_ns"][-100]) / 1e6,
-    }
-    result["cpu_percent_of_a_core"] = 100.0 * cpu / seconds
+        before = cpu_seconds(monitor.pid)
+        sent, start_ns = _run(executor, seconds)
+        cpu = cpu_seconds(monitor.pid) - before
+    error_ms = (ear.error_ns - sent[-OUT]) / 1e6
+    latencies = _latencies(ear.margins, sent, start_ns)
+    with python("benchmarks.monitor", "--echo") as relay:
+        _until_there(ear, executor)
+        before = cpu_seconds(relay.pid)
+        sent_alone, start_alone_ns = _run(executor, min(seconds, 20.0))
+        cpu_alone = cpu_seconds(relay.pid) - before
+    alone = _latencies(ear.echoes, sent_alone, start_alone_ns)
     ear.destroy_node()
     rclpy.shutdown()
+    result = {"sent": float(len(sent)), "missed": float(len(sent) - len(latencies))}
+    for percent in (50, 99):
+        result[f"latency_ms_p{percent}"] = float(np.percentile(latencies, percent))
+    result["latency_ms_max"] = float(np.max(latencies))
+    for percent in (50, 99):
+        result[f"rclpy_alone_ms_p{percent}"] = float(np.percentile(alone, percent))
+        ratio = result[f"latency_ms_p{percent}"] / result[f"rclpy_alone_ms_p{percent}"]
+        result[f"ratio_p{percent}"] = ratio
+    result["error_ms"] = error_ms
+    result["cpu_us_per_sample"] = 1e6 * cpu / len(sent)
+    result["rclpy_alone_cpu_us_per_sample"] = 1e6 * cpu_alone / len(sent_alone)
     return result
+
+
+def _until_there(ear: Ear, executor: SingleThreadedExecutor) -> None:
+    while not ear.count_publishers(ECHO):
+        executor.spin_once(timeout_sec=0.1)
+
+
+def _run(executor: SingleThreadedExecutor, seconds: float) -> tuple[list[int], int]:
+    """When each sample was sent, and the stamp of the first (ns), from a process that sends."""
+    command = [sys.executable, "-m", "benchmarks.monitor", "--send", str(seconds)]
+    sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    heard: list[str] = []
+    reader = threading.Thread(target=lambda: heard.extend(sender.stdout or ()))
+    reader.start()
+    while reader.is_alive():
+        executor.spin_once(timeout_sec=0.1)
+    sender.wait()
+    said = json.loads(heard[-1])
+    return said["sent_ns"], said["start_ns"]
+
+
+def _latencies(arrivals: dict[int, int], sent: list[int], start_ns: int) -> FloatArray:
+    """ms from sending to arrival of every sample that arrived."""
+    stamps = (start_ns + k * 10**9 // RATE for k in range(len(sent)))
+    ways = [
+        arrivals[stamp] - at for stamp, at in zip(stamps, sent, strict=True) if stamp in arrivals
+    ]
+    return np.array(ways) / 1e6
 
 
 def main() -> None:
@@ -212,9 +260,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
+    parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.send:
         send(options.send)
+        return
+    if options.echo:
+        echo()
         return
     result = updates() | live(options.seconds)
     print(f"{describe()}\n{'':24} {'reached':>10} {'asked':>10}")

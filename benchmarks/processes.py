@@ -1,43 +1,24 @@
-"""What the live benchmarks share: a domain of their own, node processes, CPU time of a process."""
+"""What the live benchmarks share: the nodes' processes, and the processor time of one."""
 
 import os
-import signal
 import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-PATIENCE = 20.0  # s for a node to end
+from nlsid_ros import processes
+from nlsid_ros.processes import isolate
+
+__all__ = ["cpu_seconds", "isolate", "node", "python"]
 
 
-def isolate() -> None:
-    """Fast DDS, on this machine only, on a domain of this process."""
-    os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
-
-
-@contextmanager
-def python(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+def python(module: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """A module in a process of its own, interrupted at the end."""
-    running = subprocess.Popen([sys.executable, "-m", module, *arguments])
-    try:
-        yield running
-    finally:
-        if running.poll() is None:
-            running.send_signal(signal.SIGINT)
-        try:
-            running.wait(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            running.kill()
-            running.wait()
+    return processes.python(module, arguments)
 
 
 def node(module: str, **parameters: object) -> list[str]:
     """Arguments for `python` that start a node quietly with parameters."""
-    settings = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
-    return [f"nlsid_ros.{module}", "--ros-args", "--log-level", "warn", *settings]
+    return [f"nlsid_ros.{module}", *processes.settings(parameters)]
 
 
 def cpu_seconds(pid: int) -> float:

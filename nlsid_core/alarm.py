@@ -11,7 +11,7 @@ from enum import Enum
 from typing import NamedTuple
 
 from nlsid_core.errors import DataError
-from nlsid_core.reading import Reading, Status
+from nlsid_core.reading import AnyReading, Status
 
 WINDOW = 8  # samples over which the margin's slope is taken
 
@@ -78,7 +78,7 @@ class Alarm:
         self._better_since = math.inf
         self._recent: deque[tuple[float, float]] = deque(maxlen=WINDOW)
 
-    def update(self, reading: Reading) -> Alert:
+    def update(self, reading: AnyReading) -> Alert:
         """The alert for this reading."""
         if reading.status is Status.UNKNOWN:
             self.restart()
@@ -94,7 +94,7 @@ class Alarm:
                 self._state, self._better_since = now, math.inf
         return Alert(self._state, ahead)
 
-    def _now(self, reading: Reading, ahead: float) -> State:
+    def _now(self, reading: AnyReading, ahead: float) -> State:
         """The state of this sample: its status, the warning, and what hysteresis holds back."""
         options, margin = self.options, reading.margin
         if reading.status is Status.OUTSIDE:

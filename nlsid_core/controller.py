@@ -6,6 +6,7 @@ Input k+1 depends on the samples up to k only, so it is known a period before it
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from nlsid_core.funnel import Funnel
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.monitor_bank import GRID_TOLERANCE
 from nlsid_core.policy import Policy
+
+Input = TypeVar("Input", float, FloatArray)
 
 
 @dataclass(frozen=True)
@@ -37,14 +40,20 @@ class Limits:
                 f"stop_rate {self.stop_rate} positive"
             )
 
-    def clip(self, u: float) -> float:
-        """The nearest input that is allowed."""
-        return min(max(u, self.lowest), self.highest)
+    def clip(self, u: Input) -> Input:
+        """The nearest input that is allowed; of several, each."""
+        allowed: Input = np.clip(u, self.lowest, self.highest)
+        return allowed
 
-    def towards_stop(self, u: float, dt: float) -> float:
+    def towards_stop(self, u: Input, dt: float) -> Input:
         """The input dt s later on the way to `stop_at`."""
         step = self.stop_rate * dt
-        return self.clip(u + min(max(self.stop_at - u, -step), step))
+        nearer: Input = u + np.clip(self.stop_at - u, -step, step)
+        return self.clip(nearer)
+
+    def at_rest(self, u: Input) -> bool:
+        """Whether every input is where a robot at rest has it."""
+        return bool(np.all(u == self.stop_at))
 
 
 class Controller:
@@ -52,7 +61,8 @@ class Controller:
 
     Before sample 0 the plan's first input is held until the last n samples give an x̂ in the
     funnel's inlet, at most for `settling` s. `k` is the index of the next sample, negative before.
-    `ended` says why it is over, empty while it runs.
+    `ended` says why it is over, empty while it runs. `lead`: s from a sample to the stamp of its
+    input, which is not quite a period, so that a sample off the grid still finds it in force.
     """
 
     def __init__(
@@ -67,6 +77,7 @@ class Controller:
         self.model, self.policy, self.funnel, self.limits = model, policy, funnel, limits
         self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset
         self.ended = ""
+        self.lead = (1.0 - GRID_TOLERANCE) * model.period
         self.k = -1
         self.u = limits.clip(float(policy.u[0]))  # the input in force at the next sample
         self._settling = settling

@@ -45,7 +45,9 @@ class DiscreteFunnel:
     S: (N + 1, n, n), upper triangular, S'S the shape. A: (N, n, n), of the disturbance's response.
     tube: (N + 1,) radii of what starts with |S_0 x̄_0| ≤ tube_0 do; inlet: (N + 1,) radii from
     which the goal inlet_N is reached. Unless the form is `peak` the radius is tube + bound. Radii
-    are in the norm of S, without unit. `model` and `policy` are digests.
+    are in the norm of S, without unit. roots, of an implicit model only: (N + 1,), at sample k + 1
+    the next rates v are claimed to be within |S_vv (v - v_{k+1})| ≤ roots_{k+1}, S_vv the block of
+    the rates; farther ones are spurious. `model` and `policy` are digests.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -57,9 +59,10 @@ class DiscreteFunnel:
     assumption: DisturbanceAssumption
     model: str
     policy: str
+    roots: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        for key in ("S", "A", "tube", "inlet"):
+        for key in ("S", "A", "tube", "inlet") + (() if self.roots is None else ("roots",)):
             values = np.array(getattr(self, key), dtype=np.float64)
             if not np.isfinite(values).all():
                 raise DataError(f"funnel: {key} holds NaN or infinity")
@@ -77,6 +80,8 @@ class DiscreteFunnel:
             raise ShapeError(f"funnel: S, A, tube and inlet do not fit: {shapes}")
         if (np.tril(self.S, -1) != 0).any() or (np.diagonal(self.S, axis1=1, axis2=2) == 0).any():
             raise DataError("funnel: S should be upper triangular with a nonzero diagonal")
+        if self.roots is not None and (self.roots.shape != (length,) or not (self.roots > 0).all()):
+            raise DataError(f"funnel: roots should be {length} positive radii")
         if not ((self.tube > 0).all() and (self.inlet > 0).all() and self.tube[0] <= self.inlet[0]):
             raise DataError("funnel: radii should be positive, and the tube start in the inlet")
         if self.assumption.form not in FORMS or self.assumption.bound < 0:
@@ -105,6 +110,7 @@ class DiscreteFunnel:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         a = self.assumption
+        roots = {} if self.roots is None else {"roots": self.roots.tolist()}
         return {
             "format": FORMAT,
             "version": VERSION,
@@ -125,6 +131,7 @@ class DiscreteFunnel:
             "inlet": self.inlet.tolist(),
             "S": self.S.tolist(),
             "A": self.A.tolist(),
+            **roots,
         }
 
     @classmethod
@@ -138,7 +145,8 @@ class DiscreteFunnel:
         runs = _json.member(nested, "measured_on", list, source=where)
         arrays = {
             key: _json.array(document, key, (None,) * axes, source=source)
-            for key, axes in (("S", 3), ("A", 3), ("tube", 1), ("inlet", 1))
+            for key, axes in (("S", 3), ("A", 3), ("tube", 1), ("inlet", 1), ("roots", 1))
+            if key != "roots" or key in document
         }
         return cls(
             assumption=DisturbanceAssumption(

@@ -39,6 +39,15 @@ class Monitor:
         self._bank = MonitorBank(model, [(policy, funnel)], nominal=nominal)
         self.model, self.policy, self.funnel, self.nominal = model, policy, funnel, nominal
 
+    @property
+    def lags(self) -> int:
+        """Samples before an announced start that give the observer its state."""
+        return len(self.model)
+
+    def waiting(self, t: float, y: float, reason: str) -> Reading:
+        """The reading at t (s) of a sample y before the run's start."""
+        return Reading(t, Status.UNKNOWN, measured=y, reason=reason)
+
     def restart(self) -> None:
         """Begin a new run: forget lags, budget and why the last run ended."""
         self._bank.restart()

@@ -1,12 +1,16 @@
-"""Simulated robots to try the chain on: an identified model, and a pendulum."""
+"""Simulated robots to try the chain on: an identified model, a pendulum and a satellite."""
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
+from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
 from nlsid_core.models import DifferenceEquation
+
+STEP = 1e-3  # s, the longest step of integration
 
 
 class Plant(Protocol):
@@ -14,11 +18,11 @@ class Plant(Protocol):
 
     period: float
 
-    def measure(self, u: float) -> float:
-        """The output under the input in force."""
+    def measure(self, u: FloatArray, /) -> FloatArray:
+        """What its sensors say under the inputs (p,) in force."""
 
-    def step(self, u: float, push: float) -> None:
-        """Go on by one period under input u, disturbed by `push` in the input's unit."""
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """Go on by one period under inputs (p,), disturbed by `push` (p,) in the inputs' unit."""
 
 
 class ModelPlant:
@@ -27,26 +31,22 @@ class ModelPlant:
     def __init__(self, model: DifferenceEquation) -> None:
         self.period = model.period
         self._model = model
-        self._A, self._B, self._offset = model.A, model.B[:, 0], model.offset
+        self._A, self._B, self._offset = model.A, model.B, model.offset
         self._x = np.linalg.solve(np.eye(len(model)) - self._A, self._offset)
 
-    def measure(self, u: float) -> float:
-        """The output under the input in force."""
-        return float(self._x[0] + self._model.D * u + self._model.c)
+    def measure(self, u: FloatArray, /) -> FloatArray:
+        """The output (1,) under the input in force."""
+        return np.asarray(self._x[0] + self._model.D * u + self._model.c)
 
-    def step(self, u: float, push: float) -> None:
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
         """One sample of the difference equation."""
-        self._x = self._A @ self._x + self._B * (u + push) + self._offset
+        self._x = self._A @ self._x + self._B @ (u + push) + self._offset
 
 
 class Pendulum:
-    """q̈ = -(g/l) sin q - d q̇ + u/(m l²): the angle q (rad) under a torque u (N m), from rest.
-
-    Integrated by the classical Runge-Kutta method with steps of at most 1 ms.
-    """
+    """q̈ = -(g/l) sin q - d q̇ + u/(m l²): measured [q (rad), q̇ (rad/s)], torque u (N m)."""
 
     GRAVITY = 9.81  # m/s²
-    STEP = 1e-3  # s
 
     def __init__(
         self, period: float, *, length: float = 0.5, mass: float = 1.0, damping: float = 0.5
@@ -56,27 +56,65 @@ class Pendulum:
         self.period = period
         self._stiffness, self._damping = self.GRAVITY / length, damping
         self._gain = 1.0 / (mass * length**2)
-        self._q, self._v = 0.0, 0.0
+        self._x: FloatArray = np.zeros(2)
 
-    def measure(self, u: float) -> float:  # noqa: ARG002 - the torque acts on the acceleration
-        """The angle."""
-        return self._q
+    def measure(self, _u: FloatArray, /) -> FloatArray:
+        """The angle and its rate."""
+        return self._x
 
-    def step(self, u: float, push: float) -> None:
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
         """One period."""
-        count = math.ceil(self.period / self.STEP)
-        h = self.period / count
-        for _ in range(count):
-            q, v = self._q, self._v
-            a1 = self._acceleration(q, v, u + push)
-            v2 = v + h / 2 * a1
-            a2 = self._acceleration(q + h / 2 * v, v2, u + push)
-            v3 = v + h / 2 * a2
-            a3 = self._acceleration(q + h / 2 * v2, v3, u + push)
-            v4 = v + h * a3
-            a4 = self._acceleration(q + h * v3, v4, u + push)
-            self._q = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4)
-            self._v = v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        torque = self._gain * float((u + push)[0])
 
-    def _acceleration(self, q: float, v: float, torque: float) -> float:
-        return -self._stiffness * math.sin(q) - self._damping * v + self._gain * torque
+        def rate(x: FloatArray) -> FloatArray:
+            q, v = x
+            return np.array([v, torque - self._stiffness * math.sin(q) - self._damping * v])
+
+        self._x = integrated(rate, self._x, self.period)
+
+
+class Satellite:
+    """A rigid body: measured [σ; ω], modified Rodrigues parameters and body rates (rad/s).
+
+    σ̇ = ¼((1 - |σ|²)I + 2σσ' + 2[σ×])ω, Hω̇ = u - ω × Hω, H = diag(5, 3, 2) kg m², u in N m.
+    Source: thesis Chapter 7.
+    """
+
+    INERTIA = np.array([5.0, 3.0, 2.0])
+
+    def __init__(self, period: float) -> None:
+        if period <= 0.0:
+            raise DataError(f"satellite: period {period} s should be positive")
+        self.period = period
+        self._x: FloatArray = np.zeros(6)
+
+    def measure(self, _u: FloatArray, /) -> FloatArray:
+        """The attitude and the body rates (6,)."""
+        return self._x
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """One period."""
+        H, torque = self.INERTIA, u + push
+
+        def rate(x: FloatArray) -> FloatArray:
+            sigma, omega = x[:3], x[3:]
+            turning = (1.0 - sigma @ sigma) * omega + 2.0 * sigma * (sigma @ omega)
+            turning = turning + 2.0 * np.cross(sigma, omega)
+            return np.concatenate([turning / 4.0, (torque - np.cross(omega, H * omega)) / H])
+
+        self._x = integrated(rate, self._x, self.period)
+
+
+def integrated(
+    rate: Callable[[FloatArray], FloatArray], x: FloatArray, period: float
+) -> FloatArray:
+    """x (n,) after `period` s of ẋ = rate(x): classical Runge-Kutta, steps of at most 1 ms."""
+    count = math.ceil(period / STEP)
+    h = period / count
+    for _ in range(count):
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x

@@ -1,8 +1,9 @@
 """What a monitor says of one sample."""
 
 import math
+from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 
 class Status(Enum):
@@ -39,3 +40,52 @@ class Reading(NamedTuple):
     nominal: float = math.nan
     measured: float = math.nan
     reason: str = ""
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What is published of it, by name."""
+        return {
+            "margin": self.margin,
+            "budget_spent": self.budget_spent,
+            "nominal": self.nominal,
+            "measured": self.measured,
+        }
+
+
+class Level(Enum):
+    """The best of the three sets of a discrete funnel that the state is in."""
+
+    GOAL = "goal"
+    TUBE = "tube"
+    INLET = "inlet"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class TrackingReading:
+    """One sample's verdict on a discrete funnel.
+
+    t: s. margin: 1 - |S x̄|/radius, 1 on the nominal, 0 on the tube's boundary, NaN if unknown.
+    disturbance: the assumption's own quantity over its bound; above 1 it is violated. level:
+    `tube`; `inlet` if the state left the tube but can still reach the goal; `goal` at the end.
+    time_to_exit: s until the margin is zero if it goes on falling as it did (no proof); infinite if
+    it does not fall. worst_axis: the state furthest out relative to the tube. reason: why the
+    status is not inside.
+    """
+
+    t: float
+    status: Status
+    margin: float = math.nan
+    disturbance: float = math.nan
+    level: Level = Level.NONE
+    time_to_exit: float = math.nan
+    worst_axis: str = ""
+    reason: str = ""
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What is published of it, by name."""
+        return {"margin": self.margin, "disturbance": self.disturbance}
+
+
+AnyReading: TypeAlias = Reading | TrackingReading

@@ -7,70 +7,43 @@ margin is good. Missing, stale or NaN state reads as unknown, never as inside.
 
 import math
 from collections import deque
-from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.discrete_funnel import DiscreteFunnel
-from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE, Status
+from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, SolverError
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.monitor import COMMAND_TOLERANCE, GRID_TOLERANCE
+from nlsid_core.reading import Level, Status, TrackingReading
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Trajectory
 
+OVER = "the proof covers"  # how the reason of every reading after the horizon begins
 TREND = 5  # samples over which the margin's trend is taken
-
-
-class Level(Enum):
-    """The best of the three sets that the state is in."""
-
-    GOAL = "goal"
-    TUBE = "tube"
-    INLET = "inlet"
-    NONE = "none"
-
-
-@dataclass(frozen=True)
-class TrackingReading:
-    """One sample's verdict.
-
-    t: s. margin: 1 - |S x̄|/radius, 1 on the nominal, 0 on the tube's boundary, NaN if unknown.
-    disturbance: the assumption's own quantity over its bound; above 1 it is violated. level:
-    `tube`; `inlet` if the state left the tube but can still reach the goal; `goal` at the end.
-    time_to_exit: s until the margin is zero if it goes on falling as it did (no proof); infinite if
-    it does not fall. worst_axis: the state furthest out relative to the tube. reason: why the
-    status is not inside.
-    """
-
-    t: float
-    status: Status
-    margin: float = math.nan
-    disturbance: float = math.nan
-    level: Level = Level.NONE
-    time_to_exit: float = math.nan
-    worst_axis: str = ""
-    reason: str = ""
 
 
 class StateObserver:
     """x̂⁺ = f(x̂, u) + d, d = L(y⁺ - f(x̂, u)), from x̂_0 = y_0."""
 
-    def __init__(self, model: StateModel, L: FloatArray) -> None:
+    def __init__(self, model: MeasuredState, L: FloatArray) -> None:
         self._model, self._L = model, L
         self.x: FloatArray | None = None
+        self.predicted: FloatArray | None = None  # f(x̂, u), before the correction
         self.d: FloatArray = np.zeros(len(model))
 
     def update(self, y: FloatArray, u_before: FloatArray | None) -> FloatArray:
-        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one."""
+        """The estimate (n,) at this sample, from y (n,) and the input (p,) since the last one.
+
+        Raises SolverError if an implicit model's step finds no root.
+        """
         if self.x is None or u_before is None:
             self.x = np.array(y)
             return self.x
-        predicted = self._model(self.x, u_before)
-        self.d = self._L @ (y - predicted)
-        self.x = predicted + self.d
+        self.predicted = self._model(self.x, u_before)
+        self.d = self._L @ (y - self.predicted)
+        self.x = self.predicted + self.d
         return self.x
 
 
@@ -97,7 +70,7 @@ class DisturbanceMeter:
 
 
 def disturbance_of(
-    model: StateModel,
+    model: MeasuredState,
     policy: TrackingPolicy,
     run: Trajectory,
     *,
@@ -134,7 +107,11 @@ class TrackingMonitor:
     Raises CertificateMismatch if model, policy and funnel do not belong together.
     """
 
-    def __init__(self, model: StateModel, policy: TrackingPolicy, funnel: DiscreteFunnel) -> None:
+    lags = 0  # samples before the run's start that it needs
+
+    def __init__(
+        self, model: MeasuredState, policy: TrackingPolicy, funnel: DiscreteFunnel
+    ) -> None:
         digest = _json.digest(model.document())
         if policy.model != digest or funnel.model != digest:
             raise CertificateMismatch("policy or funnel was made for another model")
@@ -154,6 +131,10 @@ class TrackingMonitor:
         self._last_t = -math.inf
         self._ended = self._violated = ""
         self._margins: deque[float] = deque(maxlen=TREND + 1)
+
+    def waiting(self, t: float, _y: ArrayLike, reason: str) -> TrackingReading:
+        """The reading at t (s) of a sample y before the run's start."""
+        return TrackingReading(t, Status.UNKNOWN, reason=reason)
 
     def missing(self, t: float, reason: str) -> TrackingReading:
         """End the run because the state is missing or stale at time t (s): unknown from here on."""
@@ -180,7 +161,7 @@ class TrackingMonitor:
         if not math.isfinite(t) or not np.isfinite(y).all():
             return f"state {y} at t = {t:g} s"
         if self._k > len(self.policy):
-            return f"the proof covers {len(self.policy) * period:g} s; they are over"
+            return f"{OVER} {len(self.policy) * period:g} s; they are over"
         if self._k < len(self.policy) and (u is None or not np.isfinite(u).all()):
             return f"no input at t = {t:g} s (it is {u})"
         if step <= 0:
@@ -191,7 +172,11 @@ class TrackingMonitor:
 
     def _judge(self, t: float, y: FloatArray, u: FloatArray | None) -> TrackingReading:
         k, funnel = self._k, self.funnel
-        x = self._observer.update(y, self._u_before)
+        try:
+            x = self._observer.update(y, self._u_before)
+        except SolverError as error:
+            self._ended = f"the model has no next state at t = {t:g} s: {error}"
+            return TrackingReading(t, Status.UNKNOWN, reason=self._ended)
         x_bar, S = x - self.policy.x[k], funnel.S[k]
         size = float(np.linalg.norm(S @ x_bar))
         disturbance = self._meter.update(k, self._observer.d) if k else 0.0
@@ -233,6 +218,10 @@ class TrackingMonitor:
         funnel = self.funnel
         if k == 0 and size > funnel.tube[0]:
             self._violated = f"started outside: {size:.4g} > {funnel.tube[0]:.4g}"
+        elif self._farther_than_roots(k):
+            self._violated = (
+                f"the model's step ended at a root beyond the proved ones at t = {t:g} s"
+            )
         elif disturbance > funnel.assumption.bound:
             self._violated = (
                 f"disturbance {funnel.assumption.form} {disturbance:.4g} above the assumed "
@@ -246,6 +235,15 @@ class TrackingMonitor:
                     f"{self.model.u[worst].name} {u[worst]:.6g} is not the policy's "
                     f"{wanted[worst]:.6g} at t = {t:g} s"
                 )
+
+    def _farther_than_roots(self, k: int) -> bool:
+        """Whether an implicit step's next rates are farther from the nominal than was proved."""
+        predicted, roots = self._observer.predicted, self.funnel.roots
+        if roots is None or predicted is None:
+            return False
+        d = len(predicted) // 2
+        away = (predicted - self.policy.x[k])[d:]
+        return float(np.linalg.norm(self.funnel.S[k][d:, d:] @ away)) > float(roots[k])
 
     def _level(self, k: int, size: float, radius: float) -> Level:
         inlet = float(self.funnel.inlet[k])

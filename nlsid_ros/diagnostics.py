@@ -4,6 +4,12 @@ from collections.abc import Mapping
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+
+
+def name_of(node: Node) -> str:
+    """A node's name in diagnostics: with its namespace, so that two robots' are told apart."""
+    return node.get_fully_qualified_name().removeprefix("/")
 
 
 def status(

@@ -6,20 +6,18 @@ from functools import partial
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from bags.monitoring.designs import Design, read_design
 from nlsid_core import _json
 from nlsid_core._types import Json
-from nlsid_core.errors import CertificateMismatch, NlsidError
-from nlsid_core.funnel import Funnel
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.policy import Policy
+from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 
 ROLES = ("model", "policy", "funnel")
-Taken = Callable[[DifferenceEquation, Policy, Funnel], None]
+Taken = Callable[[Design], None]
 
 
 class FunnelSubscription:
-    """Calls `taken` with model, policy and funnel of `source` once all are there and belong
+    """Calls `taken` with the design of `source` once its documents are all there and belong
     together, again whenever they are replaced; `refused` with the reason when they do not.
     """
 
@@ -39,14 +37,8 @@ class FunnelSubscription:
             self._documents[role] = _json.parse_document(message.data, source=role)
             if len(self._documents) < len(ROLES):
                 return
-            model = DifferenceEquation.from_document(self._documents["model"])
-            policy = Policy.from_document(self._documents["policy"])
-            funnel = Funnel.from_document(self._documents["funnel"])
-            if _json.digest(self._documents["policy"]) != funnel.policy:
-                raise CertificateMismatch("the funnel was made for another policy")
-            if _json.digest(self._documents["model"]) != funnel.model:
-                raise CertificateMismatch("the funnel was made for another model")
+            design = read_design(self._documents)
             self.digest = _json.digest(self._documents["funnel"])
-            self._taken(model, policy, funnel)
+            self._taken(design)
         except NlsidError as error:
             self._refused(f"funnel not used: {error}")

@@ -10,7 +10,8 @@ state is unknown (STALE), never inside. `~/restart` begins a new run.
 import sys
 from array import array
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -18,26 +19,24 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.monitoring.announcement import Run
+from bags.monitoring.designs import Design
 from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
 from nlsid_core import _json
 from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
 from nlsid_core.errors import BagError, NlsidError
-from nlsid_core.funnel import Funnel
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.monitor import Monitor, Nominal, Reading, Status
-from nlsid_core.policy import Policy
+from nlsid_core.reading import AnyReading, Nominal, Reading, Status
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import FunnelSubscription
-from nlsid_ros.draining import subscribe
+from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
@@ -52,7 +51,7 @@ LEVELS = {
     State.OUTSIDE: DiagnosticStatus.ERROR,
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
-NUMBERS = ["margin", "budget_spent", "nominal", "measured", "time_to_exit", "latency"]
+ALARM = [field.name for field in fields(AlarmOptions)]
 NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
@@ -70,25 +69,15 @@ class FunnelMonitor(ManagedNode):
         self._nominal = Nominal(
             declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
-        number = partial(declare_number, self)
-        self._stale_after = number(
-            "stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0)
-        )
-        self._command_wait = number(
-            "command_wait", 0.02, "s a response waits for its command", between=(0.0, 1.0)
-        )
-        self._options = AlarmOptions(
-            warning_margin=number("warning_margin", 0.2, "warn below", between=(0.0, 1.0)),
-            warning_time=number(
-                "warning_time", 0.0, "s: warn if the exit is predicted sooner", between=(0.0, 60.0)
-            ),
-            hysteresis=number(
-                "hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0)
-            ),
-            clear_after=number(
-                "clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0)
-            ),
-        )
+        number = partial(declare_number, self, tunable=True)
+        number("stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0))
+        number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
+        number("warning_margin", 0.2, "warn below", between=(0.0, 1.0))
+        number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
+        number("hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0))
+        number("clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0))
+        self._watch: Watch | None = None
+        self.tune(self.tunable())
         self._stop_service = declare_text(
             self, "stop_service", "", "std_srvs/Trigger called on leaving the funnel; empty: none"
         )
@@ -96,12 +85,20 @@ class FunnelMonitor(ManagedNode):
             self, "snapshot_service", "", "std_srvs/Trigger called on leaving; empty: none"
         )
 
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Take patience and warnings, also in the middle of a run."""
+        self._options = AlarmOptions(**{name: values[name] for name in ALARM})
+        self._stale_after, self._command_wait = values["stale_after"], values["command_wait"]
+        if self._watch is not None:
+            self._watch.warn(self._options)
+
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals: list[Subscription] = []
-        self._waiting: dict[str, SignalPath] = {}
-        self._watch: Watch | None = None
+        self._signals = Lane(self)
+        self._waiting: dict[str, SignalPath | SignalVector] = {}
+        self._watch = None
         self._run: Run | None = None
+        self._said: tuple[AnyReading, Alert]
         self._said = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel"), NOTHING
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
@@ -123,23 +120,22 @@ class FunnelMonitor(ManagedNode):
         self._stale = self.create_timer(self._stale_after, self._on_stale, clock=self._patience)
         self._stale.cancel()
         self._release = self.create_timer(
-            max(self._command_wait, 1e-4), self._on_release, clock=self._patience
+            self._command_wait, self._on_release, clock=self._patience
         )
         self._release.cancel()
 
-    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+    def _on_funnel(self, design: Design) -> None:
         """A funnel came, or another one: watch its signals from scratch."""
-        monitor = Monitor(model, policy, funnel, nominal=self._nominal)
-        paths = {"response": model.y.path, "excitation": model.u.path}
-        signals = {role: SignalPath.parse(path) for role, path in paths.items()}
-        for subscription in self._signals:
-            self.destroy_subscription(subscription)
+        watch = Watch(
+            design, nominal=self._nominal, options=self._options, announced=bool(self._controller)
+        )
+        signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
-        self._watch = Watch(monitor, options=self._options, announced=bool(self._controller))
+        self._watch = watch
         self._waiting = signals
         self._deadlines.clear()
-        self._tell(f"no {model.y.name} yet")
-        self.get_logger().info(f"watching {model.y.path} and {model.u.path}")
+        self._tell(f"no {design.name} yet")
+        self.get_logger().info(f"watching {design.response} and {design.command}")
         self._begin()
 
     def _on_refusal(self, reason: str) -> None:
@@ -172,10 +168,11 @@ class FunnelMonitor(ManagedNode):
         types = dict(self.get_topic_names_and_types())
         for role, path in list(self._waiting.items()):
             publishers = self.get_publishers_info_by_topic(path.topic)
-            if path.topic not in types or not publishers:
+            kinds = types.get(self.resolve_topic_name(path.topic), [])
+            if not kinds or not publishers:
                 continue
             del self._waiting[role]
-            kind = types[path.topic][0]
+            kind = kinds[0]
             try:
                 path.check(kind, standard_types())
                 if not is_stamped(kind, standard_types()):
@@ -186,11 +183,9 @@ class FunnelMonitor(ManagedNode):
                 return
             callback = partial(self._on_signal, role, path)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.append(
-                subscribe(self, message_class(kind), path.topic, callback, profile)
-            )
+            self._signals.subscribe(message_class(kind), path.topic, callback, profile)
 
-    def _on_signal(self, role: str, path: SignalPath, message: Any, _info: object) -> None:
+    def _on_signal(self, role: str, path: SignalPath | SignalVector, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
@@ -204,14 +199,20 @@ class FunnelMonitor(ManagedNode):
         if role == "excitation":
             self._publish(watch.excitation(stamp_ns, value))
             return
-        self._stale.reset()
+        self._heard_ns = self._patience.now().nanoseconds
+        if self._stale.is_canceled():
+            self._stale.reset()
         judged = watch.response(stamp_ns, value)
         self._publish(judged)
         if not judged:
-            due = self._patience.now().nanoseconds + round(self._command_wait * 1e9)
+            due = self._heard_ns + round(self._command_wait * 1e9)
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
-                self._release.reset()
+                self._release_in(due - self._heard_ns)
+
+    def _release_in(self, ahead_ns: int) -> None:
+        self._release.timer_period_ns = ahead_ns
+        self._release.reset()
 
     def _on_release(self) -> None:
         """Let go of samples whose command did not come in time."""
@@ -220,14 +221,21 @@ class FunnelMonitor(ManagedNode):
             until = self._deadlines.popleft()[1]
         if until is not None and self._watch is not None:
             self._publish(self._watch.flush(until))
-        if not self._deadlines:
-            self._release.cancel()
+        self._release.cancel()
+        if self._deadlines:
+            self._release_in(self._deadlines[0][0] - now)
 
     def _on_stale(self) -> None:
-        """The response stopped coming."""
+        """The response stopped coming, or did so a while ago: look again when it would have."""
+        patience_ns = round(self._stale_after * 1e9)
+        ahead_ns = self._heard_ns + patience_ns - self._patience.now().nanoseconds
+        self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
+        if ahead_ns > 0:  # a reset wakes the executor, so it is not done with every message
+            self._stale.reset()
+            return
         self._stale.cancel()
         if self._watch is not None:
-            name = self._watch.monitor.model.y.name
+            name = self._watch.design.name
             self._publish(self._watch.flush())
             for entry in self._watch.missing(f"no {name} for {self._stale_after:g} s"):
                 self._say(entry.reading, entry.alert)
@@ -238,31 +246,22 @@ class FunnelMonitor(ManagedNode):
             self._say(reading, alert)
             self._publish_margin(stamp_ns, reading, alert)
 
-    def _publish_margin(self, stamp_ns: int, reading: Reading, alert: Alert) -> None:
+    def _publish_margin(self, stamp_ns: int, reading: AnyReading, alert: Alert) -> None:
         latency_ns = self.get_clock().now().nanoseconds - stamp_ns
         self._slowest_ns = max(self._slowest_ns, latency_ns)
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        message.name = NUMBERS
-        message.position = array(
-            "d",
-            (
-                reading.margin,
-                reading.budget_spent,
-                reading.nominal,
-                reading.measured,
-                alert.time_to_exit,
-                latency_ns * 1e-9,
-            ),
-        )
+        numbers = reading.numbers
+        message.name = [*numbers, "time_to_exit", "latency"]
+        message.position = array("d", (*numbers.values(), alert.time_to_exit, latency_ns * 1e-9))
         self._margin.publish(message)
 
     def _tell(self, reason: str) -> None:
         """Unknown, and why, at once."""
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), NOTHING, at_once=True)
 
-    def _say(self, reading: Reading, alert: Alert, *, at_once: bool = False) -> None:
+    def _say(self, reading: AnyReading, alert: Alert, *, at_once: bool = False) -> None:
         """Publish diagnostics, and an event, if the state changed; remember what to repeat."""
         before = self._said[1].state
         self._said = reading, alert
@@ -296,9 +295,8 @@ class FunnelMonitor(ManagedNode):
         reading, alert = self._said
         watch = self._watch
         values = {
-            "margin": f"{reading.margin:.6g}",
+            **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
             "worst axis": reading.worst_axis,
-            "budget spent": f"{reading.budget_spent:.6g}",
             "time to exit [s]": f"{alert.time_to_exit:.4g}",
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
@@ -308,7 +306,7 @@ class FunnelMonitor(ManagedNode):
         }
         text = alert.state.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
-        return status(stamp, self.get_name(), LEVELS[alert.state], text, values)
+        return status(stamp, name_of(self), LEVELS[alert.state], text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""

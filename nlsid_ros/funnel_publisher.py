@@ -8,20 +8,24 @@ not proved: one error on /diagnostics, and exit status 1 if it is the first.
 
 import json
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.monitoring import documents
-from bags.monitoring.documents import ProvedFunnel, load_proved_funnel
+from bags.monitoring.designs import Design
+from bags.monitoring.documents import Proved, load_proved
 from nlsid_core._types import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.pictures import nominal_trajectory, tube_markers
 from nlsid_ros.running import ManagedNode, declare, declare_text, run
 
@@ -34,9 +38,18 @@ class FunnelPublisher(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self._path = Path(declare_text(self, "funnel", "", "funnel.json, with its proof beside it"))
+        what = "funnel.json, with its proof beside it"
+        self._path = Path(declare_text(self, "funnel", "", what, tunable=True))
         self._frame = declare_text(self, "frame", "map", "frame the tube is drawn in")
         self._watch = bool(declare(self, "watch", True, "publish again when the files change"))
+        self._latched: dict[str, Publisher] = {}
+
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Publish another funnel, if it is proved."""
+        path = Path(values["funnel"])
+        if self._latched:
+            self._publish(self._load(path))
+        self._path, self._seen = path, self._files(path)
 
     def start(self) -> None:
         """Check, publish latched, and say what was proved."""
@@ -51,41 +64,45 @@ class FunnelPublisher(ManagedNode):
                 ("nominal", JointTrajectory),
             )
         }
-        self._seen = self._files()
-        self._publish(self._load())
+        self._seen = self._files(self._path)
+        self._publish(self._load(self._path))
         if self._watch:
             self.create_timer(LOOK, self._look)
 
-    def _files(self) -> list[tuple[int, int]]:
+    def stop(self) -> None:
+        """Publish no more."""
+        self._latched = {}
+
+    def _files(self, path: Path) -> list[tuple[int, int]]:
         """When each file last changed, and its size."""
-        names = (documents.MODEL, documents.POLICY, documents.FUNNEL_PROOF, self._path.name)
-        found = (self._path.with_name(name) for name in names)
-        states = (path.stat() for path in found if path.exists())
+        names = (documents.MODEL, documents.POLICY, documents.FUNNEL_PROOF, path.name)
+        found = (path.with_name(name) for name in names)
+        states = (each.stat() for each in found if each.exists())
         return [(state.st_mtime_ns, state.st_size) for state in states]
 
     def _look(self) -> None:
         """Publish again if the files changed and are proved; else keep what was, and say so."""
-        files = self._files()
+        files = self._files(self._path)
         if files == self._seen:
             return
         self._seen = files
         with suppress(NlsidError, OSError):  # said by _load
-            self._publish(self._load())
+            self._publish(self._load(self._path))
 
-    def _load(self) -> ProvedFunnel:
+    def _load(self, path: Path) -> Proved[Design]:
         try:
-            return load_proved_funnel(self._path)
+            return load_proved(path)
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
 
-    def _publish(self, proved: ProvedFunnel) -> None:
+    def _publish(self, proved: Proved[Design]) -> None:
         for name in ("model", "policy", "funnel"):
-            document: Json = getattr(proved, name).document()
+            document: Json = getattr(proved.design, name).document()
             self._latched[name].publish(String(data=json.dumps(document)))
-        self._latched["tube"].publish(tube_markers(proved, self._frame))
-        self._latched["nominal"].publish(nominal_trajectory(proved))
+        self._latched["tube"].publish(tube_markers(proved.design, self._frame))
+        self._latched["nominal"].publish(nominal_trajectory(proved.design))
         self._say(DiagnosticStatus.OK, str(proved.verdict))
         self.get_logger().info(str(proved.verdict))
         for assumption in proved.verdict.assumptions:
@@ -93,7 +110,7 @@ class FunnelPublisher(ManagedNode):
 
     def _say(self, level: bytes, message: str) -> None:
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, NAME, level, message, {}))
+        self._diagnostics.publish(status(now, name_of(self), level, message, {}))
 
 
 def main(args: list[str] | None = None) -> None:

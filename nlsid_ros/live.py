@@ -8,14 +8,12 @@ python -m nlsid_ros.live --funnel DIR/funnel.json --bag BAG --out DIR [--json]
 
 import argparse
 import json
-import os
-import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -37,6 +35,8 @@ from nlsid_core.errors import NlsidError
 from nlsid_core.monitor import Nominal, Status
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
+from nlsid_ros.messages import stamp_ns_of
+from nlsid_ros.processes import isolate, python, settings
 
 FAULT = "scaled by 0.6"
 PATIENCE = 30.0  # s for a process to come up or a message to arrive, on a loaded machine
@@ -111,8 +111,7 @@ class Observer(Node):
         return heard
 
     def _margin(self, message: JointState) -> None:
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        self.margins[stamp_ns] = message.position[0]
+        self.margins[stamp_ns_of(message)] = message.position[0]
 
     def _status(self, message: DiagnosticArray) -> None:
         self.statuses += [(time.monotonic(), entry) for entry in message.status]
@@ -125,17 +124,17 @@ class Observer(Node):
 def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
     proved = load_proved_funnel(funnel)
-    model = proved.model
+    model = proved.design.model
     paths = [SignalPath.parse(model.y.path), SignalPath.parse(model.u.path)]
     with Bag(bag) as source:
         topics = {path.topic: source.types_on(path.topic)[0] for path in paths}
     faulty = out / f"{bag.name}, {FAULT}"
     write_faulty_copy(bag, faulty, model.y.path, FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
-    with _observing(topics) as observer, _process("funnel_publisher", funnel=str(funnel)):
-        with _process("funnel_monitor"):
+    with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
+        with _node("funnel_monitor", {}):
             _wait("the monitor to be ready", lambda: observer.has_said("funnel_monitor", " yet"))
-            with _process("trajectory_recorder", bag=str(recording), topics=list(topics)):
+            with _node("trajectory_recorder", {"bag": recording, "topics": list(topics)}):
                 _wait("the recorder", lambda: observer.has_said("trajectory_recorder", ""))
                 _play(bag, list(topics), listeners=3)
                 time.sleep(SETTLE)
@@ -187,7 +186,7 @@ def _contents(bag: Path, topics: list[str]) -> list[tuple[str, int, bytes]]:
 
 
 def _play(bag: Path, topics: list[str], *, listeners: int) -> None:
-    with _process("bag_player", bag=str(bag), topics=topics, wait_for=listeners) as player:
+    with _node("bag_player", {"bag": bag, "topics": topics, "wait_for": listeners}) as player:
         if player.wait(timeout=PATIENCE + 60.0):
             raise NlsidError(f"bag_player ended with status {player.returncode}")
 
@@ -223,25 +222,10 @@ def _spin(executor: SingleThreadedExecutor) -> None:
         return
 
 
-@contextmanager
-def _process(
-    module: str, **parameters: str | float | list[str]
-) -> Iterator[subprocess.Popen[bytes]]:
-    """A node as a process of its own, interrupted at the end and waited for."""
-    arguments = ["--ros-args", "--log-level", "warn"]
-    for name, value in parameters.items():
-        arguments += ["-p", f"{name}:={json.dumps(value)}"]
-    command = [sys.executable, "-m", f"nlsid_ros.{module}", *arguments]
-    process = subprocess.Popen(command)
-    try:
-        yield process
-    finally:
-        if process.poll() is None:
-            process.send_signal(signal.SIGINT)
-        try:
-            process.wait(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            process.kill()
+def _node(
+    name: str, parameters: Mapping[str, object]
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    return python(f"nlsid_ros.{name}", settings(parameters))
 
 
 def _wait(what: str, done: Callable[[], bool]) -> None:
@@ -260,9 +244,7 @@ def main(args: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the recordings")
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     options = parser.parse_args(args)
-    os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    isolate()
     try:
         result = run_live(options.funnel, options.bag, options.out)
     except (NlsidError, OSError) as error:

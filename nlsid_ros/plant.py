@@ -1,7 +1,9 @@
-"""Node `plant`: a simulated robot to try the chain on without one.
+"""Node `plant`: a simulated robot to try the chain on without one, in real time.
 
-Publishes the response on an exact grid of stamps and applies each command from its stamp on.
-`~/push` disturbs the input by `push` for `push_duration`. Noise is reproducible by `seed`.
+Publishes the response, or the joint states, on an exact grid of stamps. A period is simulated when
+it is over, under the command in force at its start, so that a controller that answers within a
+period acts as if at once; a later command acts from the next sample on. `~/push` disturbs one input
+by `push` for `push_duration`. Noise is reproducible by `seed`.
 """
 
 import sys
@@ -15,16 +17,21 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_srvs.srv import Trigger
 
+from bags.chain import plants
+from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
 from bags.monitoring.documents import load_model
 from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
+from nlsid_core._types import FloatArray
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.plants import ModelPlant, Pendulum, Plant
+from nlsid_core.plants import ModelPlant, Pendulum, Plant, Satellite
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "plant"
-SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
+KINDS = ("model", "pendulum", "satellite", *MUJOCO)
 
 
 class PlantNode(ManagedNode):
@@ -33,67 +40,98 @@ class PlantNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(NAME)
         number = partial(declare_number, self)
-        self._kind = declare_text(self, "kind", "model", "what is simulated: model or pendulum")
+        self._kind = declare_text(self, "kind", "model", f"what is simulated: {', '.join(KINDS)}")
         self._model = declare_text(self, "model", "", "model.json, for kind model")
-        self._period = number("period", 0.01, "s, of the pendulum's samples", between=(1e-3, 1.0))
-        self._paths = [
-            declare_text(self, "response", SPEED, "signal published (pendulum)"),
-            declare_text(self, "excitation", COMMAND, "signal obeyed (pendulum)"),
-        ]
+        self._period = number(
+            "period", 0.01, "s between samples (pendulum, satellite)", between=(1e-3, 1.0)
+        )
         self._types = [
-            declare_text(self, "response_type", "nav_msgs/msg/Odometry", "its message type"),
-            declare_text(
-                self, "command_type", "geometry_msgs/msg/TwistStamped", "its message type"
-            ),
+            declare_text(self, "response_type", "nav_msgs/msg/Odometry", "for kind model"),
+            declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "for kind model"),
         ]
-        self._noise = number("noise", 0.0, "standard deviation, response", between=(0.0, 1e6))
+        self._noise = number(
+            "noise",
+            0.0,
+            "standard deviation of the response or positions; MuJoCo's sensors have their own",
+            between=(0.0, 1e6),
+        )
+        self._rate_noise = number(
+            "rate_noise", 0.0, "standard deviation of the rates", between=(0.0, 1e6)
+        )
+        self._mass_scale = number(
+            "mass_scale", 1.0, "of every mass and inertia (MuJoCo)", between=(0.1, 10.0)
+        )
         self._delay = number("delay", 0.0, "s from stamp to publication", between=(0.0, 10.0))
         self._push = number("push", 0.3, "size of a push, input's unit", between=(-1e6, 1e6))
         self._push_duration = number("push_duration", 0.3, "s of a push", between=(0.0, 60.0))
+        pushed: Any = declare(self, "push_input", 0, "index of the input pushed", between=(0, 100))
         seed: Any = declare(self, "seed", 1, "of the noise", between=(0, 2**31))
-        self._rng = np.random.default_rng(seed)
+        self._pushed, self._rng = pushed, np.random.default_rng(seed)
 
     def prepare(self) -> None:
         """Make the plant and its messages."""
+        self._plant = self._make()
+        response: SignalPath | SignalVector
+        command: SignalPath | SignalVector
+        if self._kind == "model":
+            model = load_model(Path(self._model))
+            response, command = SignalPath.parse(model.y.path), SignalPath.parse(model.u.path)
+            inputs, spread = 1, [self._noise]
+        else:
+            inputs = len(self._plant.measure(np.zeros(1))) // 2
+            joints = range(inputs)
+            fields = [f"{STATES}:{f}[{i}]" for f in ("position", "velocity") for i in joints]
+            response = SignalVector.parse(fields)
+            command = SignalVector.parse(f"{COMMANDS}:effort[{i}]" for i in joints)
+            self._types = [JOINTS, JOINTS]
+            spread = [0.0] * (2 * inputs)
+            if self._kind not in MUJOCO:
+                spread = [self._noise] * inputs + [self._rate_noise] * inputs
+        if self._pushed >= inputs:
+            raise DataError(f"push_input is {self._pushed}; {self._kind} has {inputs} inputs")
+        self._inputs, self._spread = inputs, np.array(spread)
+        self._response = SignalMessage(response, self._types[0])
+        self._command = SignalMessage(command, self._types[1])
+
+    def _make(self) -> Plant:
         if self._kind == "model":
             if not self._model:
                 raise DataError("no model to simulate; set the parameter model")
-            model = load_model(Path(self._model))
-            self._paths = [model.y.path, model.u.path]
-            self._plant: Plant = ModelPlant(model)
-        elif self._kind == "pendulum":
-            self._plant = Pendulum(self._period)
-        else:
-            raise DataError(f"kind is '{self._kind}'; it should be model or pendulum")
-        response, command = (SignalPath.parse(path) for path in self._paths)
-        self._response = SignalMessage(response, self._types[0])
-        self._command = SignalMessage(command, self._types[1])
+            return ModelPlant(load_model(Path(self._model)))
+        if self._kind == "pendulum":
+            return Pendulum(self._period)
+        if self._kind == "satellite":
+            return Satellite(self._period)
+        if self._kind in MUJOCO:
+            return plants.Plant(MUJOCO[self._kind], self._rng, mass_scale=self._mass_scale)
+        raise DataError(f"kind is '{self._kind}'; it should be one of {', '.join(KINDS)}")
 
     def start(self) -> None:
         """Begin at the next sample."""
         self._publisher = self.create_publisher(
             self._response.kind, self._response.path.topic, qos.STREAM
         )
-        self._commands: list[tuple[int, float]] = [(0, 0.0)]  # by stamp, the one in force first
+        self._commands: list[tuple[int, FloatArray]] = [(0, np.zeros(self._inputs))]
         self.create_subscription(
             self._command.kind, self._command.path.topic, self._on_command, qos.STREAM
         )
         self.create_service(Trigger, "~/push", self._on_push)
         self._period_ns = round(self._plant.period * 1e9)
+        self._last_ns: int | None = None
         self._next_ns = self.get_clock().now().nanoseconds
         self._pushed_until_ns = 0
         self._sent: list[tuple[int, Any]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(min(self._plant.period, 0.005), self._on_tick, clock=steady)
+        self.create_timer(min(self._plant.period, 0.005) / 2, self._on_tick, clock=steady)
 
     def _on_command(self, message: Any) -> None:
         try:
-            value = self._command.path.value(message)
+            values = np.atleast_1d(self._command.path.value(message))
         except BagError as error:
             self.get_logger().error(str(error))
             return
-        if np.isfinite(value):
-            insort(self._commands, (stamp_ns_of(message), value))
+        if np.isfinite(values).all():
+            insort(self._commands, (stamp_ns_of(message), values), key=lambda entry: entry[0])
 
     def _on_tick(self) -> None:
         """Every sample that is due, and every message whose delay is over."""
@@ -105,13 +143,23 @@ class PlantNode(ManagedNode):
             self._publisher.publish(self._sent.pop(0)[1])
 
     def _sample(self, stamp_ns: int) -> None:
-        while len(self._commands) > 1 and self._commands[1][0] <= stamp_ns:
-            del self._commands[0]
-        u = self._commands[0][1]
-        y = self._plant.measure(u) + self._noise * float(self._rng.standard_normal())
-        self._plant.step(u, self._push if stamp_ns < self._pushed_until_ns else 0.0)
+        """Simulate the period that ends at this stamp, and measure."""
+        if self._last_ns is not None:
+            push = np.zeros(self._inputs)
+            if self._last_ns < self._pushed_until_ns:
+                push[self._pushed] = self._push
+            self._plant.step(self._in_force(self._last_ns), push)
+        noise = self._spread * self._rng.standard_normal(len(self._spread))
+        y = self._plant.measure(self._in_force(stamp_ns)) + noise
+        self._last_ns = stamp_ns
         due_ns = stamp_ns + round(self._delay * 1e9)
         self._sent.append((due_ns, self._response.make(stamp_ns, y)))
+
+    def _in_force(self, stamp_ns: int) -> FloatArray:
+        """The latest command stamped up to `stamp_ns`; those before it are forgotten."""
+        while len(self._commands) > 1 and self._commands[1][0] <= stamp_ns:
+            del self._commands[0]
+        return self._commands[0][1]
 
     def _on_push(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         self._pushed_until_ns = self._next_ns + round(self._push_duration * 1e9)

@@ -1,18 +1,25 @@
 """What every node shares: its lifecycle, its parameters, and a `main` that starts and stops it."""
 
+import gc
 import signal
 import socket
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rclpy
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import try_shutdown
 
@@ -29,6 +36,7 @@ class Declared(NamedTuple):
     default: Value
     description: str
     between: tuple[float, float] | None
+    tunable: bool
 
 
 class ManagedNode(LifecycleNode):
@@ -41,6 +49,7 @@ class ManagedNode(LifecycleNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.declared: list[Declared] = []
+        self.add_on_set_parameters_callback(self._on_parameters)
         self.autostart = bool(
             declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
         )
@@ -56,6 +65,16 @@ class ManagedNode(LifecycleNode):
 
     def stop(self) -> None:
         """Finish: send the last command, close files."""
+
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Use these values of the tunable parameters from now on.
+
+        Raises NlsidError or OSError to refuse them; all stays as it was then.
+        """
+
+    def tunable(self) -> dict[str, Any]:
+        """The tunable parameters' values."""
+        return {d.name: self.get_parameter(d.name).value for d in self.declared if d.tunable}
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: unconfigured to inactive."""
@@ -91,6 +110,17 @@ class ManagedNode(LifecycleNode):
             self._running = False
             self.stop()
         super().destroy_node()
+
+    def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
+        values = self.tunable()
+        asked = {parameter.name: parameter.value for parameter in changed}
+        if not asked.keys() & values.keys():
+            return SetParametersResult(successful=True)
+        try:
+            self.tune({name: asked.get(name, value) for name, value in values.items()})
+        except (NlsidError, OSError) as refusal:
+            return SetParametersResult(successful=False, reason=str(refusal))
+        return SetParametersResult(successful=True)
 
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
         try:
@@ -139,6 +169,8 @@ def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
             for transition in (node.trigger_configure, node.trigger_activate):
                 if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
                     raise node.failure
+        gc.collect()
+        gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         _spin_until_signalled(node, woken)
     finally:
         if node is not None:
@@ -177,15 +209,16 @@ def declare(
     description: str,
     *,
     between: tuple[float, float] | None = None,
+    tunable: bool = False,
 ) -> Value:
-    """Declare a read-only parameter with its description and range, and return its value.
+    """Declare a parameter with its description and range, and return its value.
+
+    It can be changed while the node runs only if `tunable`: `ManagedNode.tune` is told then.
 
     The default's type is the parameter's: ROS keeps 2 and 2.0 apart. Raises DataError if the value
     given has another type or is out of range.
     """
-    if isinstance(node, ManagedNode):
-        node.declared.append(Declared(name, default, description, between))
-    descriptor = ParameterDescriptor(name=name, description=description, read_only=True)
+    descriptor = ParameterDescriptor(name=name, description=description, read_only=not tunable)
     if between is not None:
         lo, hi = between
         if isinstance(default, int):
@@ -196,18 +229,28 @@ def declare(
         value: Value = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
+    if isinstance(node, ManagedNode):
+        node.declared.append(Declared(name, default, description, between, tunable))
     return value
 
 
 def declare_number(
-    node: Node, name: str, default: float, description: str, *, between: tuple[float, float]
+    node: Node,
+    name: str,
+    default: float,
+    description: str,
+    *,
+    between: tuple[float, float],
+    tunable: bool = False,
 ) -> float:
     """`declare` for a float parameter."""
-    value = declare(node, name, float(default), description, between=between)
+    value = declare(node, name, float(default), description, between=between, tunable=tunable)
     assert isinstance(value, float)
     return value
 
 
-def declare_text(node: Node, name: str, default: str, description: str) -> str:
+def declare_text(
+    node: Node, name: str, default: str, description: str, *, tunable: bool = False
+) -> str:
     """`declare` for a string parameter."""
-    return str(declare(node, name, default, description))
+    return str(declare(node, name, default, description, tunable=tunable))

@@ -11,8 +11,8 @@ from rclpy.node import Node
 from bags.recordings.definitions import Definition
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
-from nlsid_ros.draining import Polled, Received, Source
 from nlsid_ros.message_classes import message_class
+from nlsid_ros.polling import Polled, Received, Source
 from nlsid_ros.type_descriptions import TypeDescriptions
 
 UNASKED = {"/rosout", "/parameter_events"}  # every node has them; a pattern does not mean them

@@ -1,17 +1,20 @@
-"""Node `tracking_controller`: runs the certified policy u = u_k - K(x̂ - x_k) on the live state.
+"""Node `tracking_controller`: runs the certified policy on the live state.
 
-Sample k's input is known one period ahead; it is published when it comes into force, stamped a
-quarter of a period before its sample is due, so that a sample off the grid by that much is still
-paired with it. `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and
-the funnel's digest. Stale or impossible state, `~/stop`, and the end of the plan ramp the input to
-`stop_at`.
+Of a difference equation sample k's input is known one period ahead; it is published when it comes
+into force, stamped a quarter of a period before its sample is due, so that a sample off the grid by
+that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
+`~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
+digest. Stale or impossible state, `~/stop`, and the end of the plan ramp the input to `stop_at`.
 """
 
 import sys
 import time
+from collections.abc import Mapping
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -20,18 +23,16 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.monitoring.announcement import Run
+from bags.monitoring.designs import Design
 from bags.recordings.message_types import standard_types
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
 from nlsid_core import _json
-from nlsid_core.controller import Controller, Limits
+from nlsid_core.controller import Limits
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.funnel import Funnel
-from nlsid_core.models import DifferenceEquation
-from nlsid_core.monitor import GRID_TOLERANCE
-from nlsid_core.policy import Policy
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import FunnelSubscription
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
@@ -41,6 +42,7 @@ NAME = "tracking_controller"
 LAST_WORD = 1.0  # s for the last command to be received before the node goes
 REPORT = 1.0  # s between diagnostics while nothing changes
 BIG = 1e9
+LIMITS = [field.name for field in fields(Limits)]
 
 
 class TrackingController(ManagedNode):
@@ -48,7 +50,7 @@ class TrackingController(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        number = partial(declare_number, self)
+        number = partial(declare_number, self, tunable=True)
         self._source = declare_text(
             self, "source", "funnel_publisher", "node that publishes the funnel"
         )
@@ -61,29 +63,32 @@ class TrackingController(ManagedNode):
         self._start_at_once = bool(
             declare(self, "start_at_once", False, "begin a run as soon as there is a funnel")
         )
-        self._stale_after = number(
-            "stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0)
-        )
-        self._settling = number(
-            "settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0)
-        )
-        self._limits = Limits(
-            lowest=number("lowest", 0.0, "least input", between=(-BIG, BIG)),
-            highest=number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG)),
-            stop_at=number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
-            stop_rate=number(
-                "stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG)
-            ),
-        )
-        if self._limits.lowest == self._limits.highest:
+        number("stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0))
+        number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
+        number("lowest", 0.0, "least input", between=(-BIG, BIG))
+        number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG))
+        number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
+        number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
+        self._controller: Any = None  # a Controller or a TrackingController
+        self._stopping = ""
+        self.tune(self.tunable())
+
+    def tune(self, values: Mapping[str, Any]) -> None:
+        """Take limits and patience between runs; DataError in the middle of one."""
+        if self._controller is not None or self._stopping:
+            raise DataError("a run is on; stop it first")
+        limits = Limits(**{name: values[name] for name in LIMITS})
+        if limits.lowest == limits.highest:
             raise DataError("no room between lowest and highest; set the limits of the input")
+        self._limits, self._settling = limits, values["settling"]
+        self._stale_after = values["stale_after"]
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
-        self._parts: tuple[DifferenceEquation, Policy, Funnel] | None = None
-        self._controller: Controller | None = None
+        self._design: Design | None = None
+        self._controller = None
         self._command: SignalMessage | None = None
-        self._input = self._limits.stop_at
+        self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
         self._due_ns = 0
         self._stopping = ""
@@ -106,22 +111,22 @@ class TrackingController(ManagedNode):
         """Ramp down before going, in real time."""
         if self._controller is None and not self._stopping:
             return
-        assert self._parts is not None
-        period = self._parts[0].period
+        assert self._design is not None
+        period = self._design.model.period
         self._halt("the node stops")
-        while self._input != self._limits.stop_at:
+        while not self._limits.at_rest(self._input):
             self._step_down()
             time.sleep(period)
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
-    def _on_funnel(self, model: DifferenceEquation, policy: Policy, funnel: Funnel) -> None:
+    def _on_funnel(self, design: Design) -> None:
         """Take a funnel, but never in the middle of a run: stop that first."""
         if self._controller is not None or self._stopping:
             self._halt("the funnel was replaced")
-        response = SignalPath.parse(model.y.path)
+        response, command = design.response, design.command
         response.check(self._response_type, standard_types())
-        if self._parts is None:
-            self._command = SignalMessage(SignalPath.parse(model.u.path), self._command_type)
+        if self._design is None:
+            self._command = SignalMessage(command, self._command_type)
             self._commands = self.create_publisher(
                 self._command.kind, self._command.path.topic, qos.STREAM
             )
@@ -131,29 +136,27 @@ class TrackingController(ManagedNode):
                 partial(self._on_response, response),
                 qos.SENSOR,
             )
-        elif (model.y.path, model.u.path) != (self._parts[0].y.path, self._parts[0].u.path):
+        elif (response, command) != (self._design.response, self._design.command):
             self._tell("the new funnel is about other signals; deactivate and activate again")
             return
-        self._parts = model, policy, funnel
+        self._design = design
         self._tell("idle")
         if self._start_at_once:
             self._begin()
 
     def _begin(self) -> str:
         """Begin a run; why not, empty if it began."""
-        if self._parts is None:
+        if self._design is None:
             return "there is no funnel yet"
         if self._controller is not None or self._stopping:
             return "a run is on"
-        model, policy, funnel = self._parts
-        self._controller = Controller(
-            model, policy, funnel, limits=self._limits, settling=self._settling
-        )
+        self._controller = self._design.controller(self._limits, self._settling)
         self._first_ns = None
+        self._stale.timer_period_ns = round(self._stale_after * 1e9)
         self._tell("waiting for the response")
         return ""
 
-    def _on_response(self, path: SignalPath, message: Any) -> None:
+    def _on_response(self, path: SignalPath | SignalVector, message: Any) -> None:
         """Decode, ask the core for the next input, and set it down for when it is due."""
         controller = self._controller
         if controller is None:
@@ -162,7 +165,7 @@ class TrackingController(ManagedNode):
         if self._first_ns is None:  # its input is not ours; the next sample's is
             self._first_ns = stamp_ns
         else:
-            starting = controller.k == 0
+            waiting = controller.k < 1
             try:
                 value = path.value(message)
             except BagError as error:
@@ -172,13 +175,12 @@ class TrackingController(ManagedNode):
             if controller.ended:
                 self._halt(controller.ended)
                 return
-            if starting:
+            if waiting and controller.k >= 1:
                 announced = Run(stamp_ns, self._funnel.digest).document()
                 self._announce.publish(String(data=_json.canonical(announced).decode()))
                 self._tell("tracking")
         self._stale.reset()
-        lead = round((1.0 - GRID_TOLERANCE) * controller.model.period * 1e9)
-        self._schedule(stamp_ns + lead)
+        self._schedule(stamp_ns + round(controller.lead * 1e9))
 
     def _schedule(self, due_ns: int) -> None:
         """Publish at `due_ns`, at once if that has passed."""
@@ -197,16 +199,16 @@ class TrackingController(ManagedNode):
             self._send(self._due_ns)
         elif self._stopping:
             self._step_down()
-            if self._input == self._limits.stop_at:
+            if self._limits.at_rest(self._input):
                 self._tell(f"idle; stopped: {self._stopping}")
                 self._stopping = ""
             else:
-                assert self._parts is not None
-                self._schedule(self._due_ns + round(self._parts[0].period * 1e9))
+                assert self._design is not None
+                self._schedule(self._due_ns + round(self._design.model.period * 1e9))
 
     def _step_down(self) -> None:
-        assert self._parts is not None
-        self._input = self._limits.towards_stop(self._input, self._parts[0].period)
+        assert self._design is not None
+        self._input = self._limits.towards_stop(self._input, self._design.model.period)
         self._send(self.get_clock().now().nanoseconds)
 
     def _send(self, stamp_ns: int) -> None:
@@ -243,12 +245,12 @@ class TrackingController(ManagedNode):
         if self._stopping or "stopped" in self._text:
             level = DiagnosticStatus.WARN
         values = {
-            "input": f"{self._input:.6g}",
+            "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",
             "funnel": self._funnel.digest if hasattr(self, "_funnel") else "",
         }
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, self.get_name(), level, self._text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, self._text, values))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -31,8 +31,8 @@ from nlsid_core import _json
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
-from nlsid_ros.draining import Polled, Received
 from nlsid_ros.message_classes import message_class
+from nlsid_ros.polling import Polled, Received
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 from nlsid_ros.subscribing import Listener, Subscriptions, Wanted
 from nlsid_ros.type_descriptions import TypeDescriptions

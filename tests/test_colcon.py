@@ -1,6 +1,7 @@
 """The tree as a ROS 2 package: both of colcon's builds, and what `ros2 run` would find there."""
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -66,6 +67,14 @@ class Workspace:
         return self.run("bash", "-c", f". install/setup.bash && {shlex.join(command)}")
 
 
+# Colcon runs the tests with the Python it runs on; the system's has colcon but not what we need.
+COLCON_HERE = """import sys
+sys.path.insert(0, {!r})
+from colcon_core.command import main
+sys.exit(main())
+"""
+
+
 @pytest.fixture(scope="module", params=["", "--symlink-install"], ids=["copied", "symlinked"])
 def workspace(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
@@ -125,6 +134,19 @@ def test_the_sample_bags_are_installed_with_their_licence(workspace: Workspace) 
     shipped = files_below(ROOT / "bags" / "samples")
     assert "f1tenth/LICENSE" in shipped
     assert files_below(installed) == shipped
+
+
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("workspace", [""], indirect=True, ids=["copied"])
+def test_the_packages_tests_pass_as_colcon_runs_them(workspace: Workspace) -> None:
+    where = "import pathlib, colcon_core as c; print(pathlib.Path(c.__file__).parents[1])"
+    colcon = COLCON_HERE.format(workspace.run("/usr/bin/python3", "-c", where).strip())
+    shown = ("--event-handlers", "console_cohesion+", "--return-code-on-test-failure")
+    workspace.run(sys.executable, "-c", colcon, "test", *shown)
+    summary = workspace.run("colcon", "test-result").splitlines()[-1]
+    tests, errors, failures, _ = (int(number) for number in re.findall(r"\d+", summary))
+    assert tests > 1000
+    assert (errors, failures) == (0, 0)
 
 
 def files_below(folder: Path) -> set[str]:

@@ -9,7 +9,7 @@ from nlsid_core.controller import Controller, Limits
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.monitor import Monitor, Nominal, Reading, Status
-from nlsid_core.plants import ModelPlant, Pendulum
+from nlsid_core.plants import ModelPlant, Pendulum, Satellite
 from nlsid_core.trajectory import Dataset
 from tests.conftest import PERIOD
 
@@ -37,8 +37,8 @@ def closed_loop(
     k = 0
     while not controller.ended:
         u, index = controller.u, controller.k
-        y = plant.measure(u) + noise * rng.standard_normal()
-        plant.step(u, push if 20 <= index < 24 else 0.0)
+        y = float(plant.measure(np.array([u]))[0]) + noise * rng.standard_normal()
+        plant.step(np.array([u]), np.array([push if 20 <= index < 24 else 0.0]))
         if index == 0:
             for j in range(n):
                 monitor.update((k - n + j) * PERIOD, *history[j - n])
@@ -106,13 +106,40 @@ def test_limits_that_make_no_sense_are_refused(lowest: float, highest: float, ra
 
 def test_a_small_swing_of_the_pendulum_has_its_textbook_period() -> None:
     pendulum = Pendulum(0.01, length=0.5, damping=0.0)
-    pendulum.step(0.0, 0.05)
+    pendulum.step(np.zeros(1), np.array([0.05]))
     angles = []
     for _ in range(1000):
-        angles.append(pendulum.measure(0.0))
-        pendulum.step(0.0, 0.0)
+        angles.append(pendulum.measure(np.zeros(1))[0])
+        pendulum.step(np.zeros(1), np.zeros(1))
     signs = np.sign(angles)
     crossings = np.flatnonzero((signs[:-1] < 0) & (signs[1:] >= 0))
     assert np.diff(crossings).mean() * 0.01 == pytest.approx(
         2 * math.pi * math.sqrt(0.5 / 9.81), rel=2e-3
     )
+
+
+def test_a_free_satellite_keeps_its_angular_momentum_and_energy() -> None:
+    satellite = Satellite(0.01)
+    satellite.step(np.array([20.0, 30.0, -10.0]), np.zeros(3))
+
+    def momentum_and_energy() -> list[float]:
+        sigma, omega = np.split(satellite.measure(np.zeros(3)), 2)
+        H, cross = Satellite.INERTIA, np.cross(np.eye(3), sigma)
+        rotation = (
+            np.eye(3)
+            + (8 * cross @ cross - 4 * (1 - sigma @ sigma) * cross) / (1 + sigma @ sigma) ** 2
+        )  # from inertial to body axes; M. Shuster, A Survey of Attitude Representations
+        return [*(rotation.T @ (H * omega)), omega @ (H * omega)]
+
+    before = momentum_and_energy()
+    for _ in range(500):
+        satellite.step(np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(momentum_and_energy(), before, rtol=1e-9)
+
+
+def test_a_push_adds_to_the_satellites_torque() -> None:
+    pushed, driven = Satellite(0.01), Satellite(0.01)
+    pushed.step(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    driven.step(np.array([1.0, 0.0, 0.0]), np.zeros(3))
+    np.testing.assert_array_equal(pushed.measure(np.zeros(3)), driven.measure(np.zeros(3)))
+    assert pushed.measure(np.zeros(3))[3] > 0

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("nlsid_core", "bags", "nlsid_ros")
-WRITTEN_BY_HAND = (*PACKAGES, "tests", "examples", "benchmarks", "launch")
+WRITTEN_BY_HAND = (*PACKAGES, "tests", "examples", "benchmarks")
 MAX_LINES = 400
 
 # Each package may import itself and those before it.
@@ -198,23 +198,8 @@ def test_no_file_is_too_long_to_hold_one_idea(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= MAX_LINES
 
 
-@pytest.mark.parametrize("path", sources("launch"), ids=ids)
-def test_launch_files_compile_and_start_executables_that_exist(path: Path) -> None:
-    tree = ast.parse(path.read_text())
-    compile(tree, path, "exec")
-    started = {
-        keyword.value.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-        for keyword in node.keywords
-        if keyword.arg == "executable" and isinstance(keyword.value, ast.Constant)
-    }
-    assert started
-    assert started <= project()["scripts"].keys()
-
-
 def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
-    imported = set().union(*map(imported_packages, sources("nlsid_ros", "launch")))
+    imported = set().union(*map(imported_packages, sources("nlsid_ros")))
     manifest = ElementTree.parse(ROOT / "package.xml").getroot()
     named = {element.text for element in manifest.iter("exec_depend")}
     assert {name for name in imported if ROS.fullmatch(name)} <= named

@@ -10,7 +10,8 @@ from nlsid_core._types import FloatArray
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.funnels.state_funnel import assume
 from nlsid_core.monitor import Status
-from nlsid_core.tracking_monitor import Level, StateObserver, TrackingMonitor, TrackingReading
+from nlsid_core.reading import Level, TrackingReading
+from nlsid_core.tracking_monitor import StateObserver, TrackingMonitor
 from nlsid_core.trajectory import Dataset, Trajectory
 from tests.tracked import PERIOD, STEPS, designed, tracked
 

@@ -1,11 +1,16 @@
 """Implicit models of mechanisms: physical coefficients come back, spurious roots do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from nlsid_core import _json
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.implicit import ImplicitStep
-from nlsid_core.identification.trapezoidal import identify_trapezoidal
+from nlsid_core.identification.states import identify_states
+from nlsid_core.models import Signal
+from nlsid_core.models.measured_state import read_measured_state
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.polynomial import compose_affine, variables
 from nlsid_core.trajectory import Dataset, Trajectory
@@ -17,7 +22,18 @@ PHYSICS = np.array([[-9.8], [9.8 / 6], [-0.5], [1.0]])
 
 def truth() -> TrapezoidalModel:
     """A pendulum with a cubic in the place of the sine."""
-    return TrapezoidalModel(EXPONENTS, PHYSICS, PERIOD, np.array([[-9.0, 9.0]]))
+    return TrapezoidalModel(
+        exponents=EXPONENTS,
+        coefficients=PHYSICS,
+        period=PERIOD,
+        x=(Signal("angle", "rad"), Signal("rate", "rad/s")),
+        u=(Signal("torque", "N m"),),
+        x_range=np.array([[-2.0, 2.0], [-9.0, 9.0]]),
+        u_range=np.array([[-10.0, 10.0]]),
+        noise=np.array([1e-3, 1e-2]),
+        disturbance=np.array([1e-4, 1e-3]),
+        bags=(("fit", f"sha256:{1:064x}"),),
+    )
 
 
 def recorded(repeats: int = 4) -> Dataset:
@@ -40,20 +56,27 @@ def recorded(repeats: int = 4) -> Dataset:
     return Dataset(tuple(runs))
 
 
+def identified(data: Dataset) -> TrapezoidalModel:
+    """Fitted to data, the first trajectory validating."""
+    fit = identify_states(data, Dataset(data.trajectories[:1]), degrees=[(3, 1, 1)], implicit=True)
+    assert isinstance(fit.model, TrapezoidalModel)
+    return fit.model
+
+
 def coefficient(model: TrapezoidalModel, exponent: list[int]) -> float:
     row = np.flatnonzero((model.exponents == exponent).all(axis=1))[0]
     return float(model.coefficients[row, 0])
 
 
 def test_the_accelerations_coefficients_are_the_physical_ones() -> None:
-    model = identify_trapezoidal(recorded(), degrees=[3, 1, 1])
+    model = identified(recorded())
     for exponent, value in zip(EXPONENTS.tolist(), PHYSICS[:, 0], strict=True):
         assert coefficient(model, exponent) == pytest.approx(value, rel=0.05, abs=0.02)
 
 
 def test_free_run_of_the_identified_model_follows_the_truth() -> None:
     data = recorded()
-    model = identify_trapezoidal(data, degrees=[3, 1, 1])
+    model = identified(data)
     u = data.trajectories[0].u
     true, free = truth().simulate([0.0, 0.0], u), model.simulate([0.0, 0.0], u)
     assert np.linalg.norm(free - true) < 0.01 * np.linalg.norm(true)
@@ -61,20 +84,45 @@ def test_free_run_of_the_identified_model_follows_the_truth() -> None:
 
 def test_a_step_satisfies_the_equations_it_states() -> None:
     model, x, u = truth(), np.array([0.7, -1.0]), np.array([0.4])
-    following = model.step(x, u)
+    following = model(x, u)
     residual = model.equations()[0](np.concatenate([x, u, following[1:]]))
     assert abs(float(residual)) < 1e-12
     assert following[0] == pytest.approx(x[0] + PERIOD / 2 * (x[1] + following[1]))
 
 
-def test_a_root_outside_the_data_is_refused() -> None:
-    with pytest.raises(SolverError, match=r"outside the box|no next rate"):
-        truth().step([0.0, 8.9], [500.0])
+def test_a_step_that_has_no_root_is_an_error() -> None:
+    cubic = replace(truth(), exponents=np.array([[0, 2, 0]]), coefficients=np.array([[1e3]]))
+    with pytest.raises(SolverError, match="no next rate"):  # w - 10 w² = 11 at v = 1
+        cubic([0.0, 1.0], [0.0])
+
+
+def test_steps_of_many_states_are_those_of_each() -> None:
+    model, rng = truth(), np.random.default_rng(3)
+    x, u = rng.uniform(-1, 1, (5, 2)), rng.uniform(-3, 3, (5, 1))
+    each = [model(a, b) for a, b in zip(x, u, strict=True)]
+    np.testing.assert_allclose(model(x, u), each, rtol=0, atol=1e-15)
+
+
+def test_the_linearised_step_is_the_slope_of_steps() -> None:
+    model, x, u, step = truth(), np.array([0.6, -1.2]), np.array([0.8]), 1e-6
+    slopes = [
+        (model(x + step * e[:2], u + step * e[2:]) - model(x - step * e[:2], u - step * e[2:]))
+        / (2 * step)
+        for e in np.eye(3)
+    ]
+    np.testing.assert_allclose(np.hstack(model.linearised(x, u)), np.array(slopes).T, atol=1e-8)
+
+
+def test_a_trapezoidal_model_reads_back_from_its_document_bit_for_bit() -> None:
+    text = _json.canonical(truth().document())
+    again = read_measured_state(_json.parse_document(text))
+    assert isinstance(again, TrapezoidalModel)
+    assert _json.canonical(again.document()) == text
 
 
 def test_without_repeats_nothing_is_identified() -> None:
     with pytest.raises(DataError, match="repeated"):
-        identify_trapezoidal(recorded(1), degrees=[3, 1, 1])
+        identified(recorded(1))
 
 
 def test_the_proved_reach_of_an_implicit_step_bounds_the_models_own_steps() -> None:
@@ -96,6 +144,6 @@ def test_the_proved_reach_of_an_implicit_step_bounds_the_models_own_steps() -> N
     for _ in range(500):
         z = rng.standard_normal(2)
         z /= np.linalg.norm(z)
-        following = model.step(size * z, np.array([-2.0 * z[0] - z[1]]))
+        following = model(size * z, np.array([-2.0 * z[0] - z[1]]))
         farthest = max(farthest, float(np.linalg.norm(following / size)))
     assert 0.98 * reach < farthest <= reach

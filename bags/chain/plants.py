@@ -86,6 +86,8 @@ class Plant:
     Raises DataError if MuJoCo is not installed.
     """
 
+    period = PERIOD
+
     def __init__(self, robot: Robot, rng: np.random.Generator, *, mass_scale: float = 1.0) -> None:
         try:
             import mujoco
@@ -110,13 +112,13 @@ class Plant:
         self._data.qpos[:], self._data.qvel[:] = values[:n], values[n:]
         self._data.qacc_warmstart[:] = 0.0  # so that a run depends on its start and seed only
 
-    def measure(self) -> FloatArray:
-        """(2n,) the state as the encoders see it."""
+    def measure(self, _torque: ArrayLike = 0.0, /) -> FloatArray:
+        """(2n,) the state as the encoders see it, whatever the torque."""
         n = self.robot.joints
         sizes = np.repeat([ANGLE_NOISE, RATE_NOISE], n)
         return self.state + sizes * self._rng.standard_normal(2 * n)
 
-    def step(self, torque: ArrayLike, push: ArrayLike = 0.0) -> None:
+    def step(self, torque: ArrayLike, push: ArrayLike = 0.0, /) -> None:
         """Hold `torque` (n,), cut to the drives' limits, for one sample; `push` in N·m is added."""
         limit = np.array(self.robot.torque)
         self._data.ctrl[:] = np.clip(torque, -limit, limit)

@@ -1,7 +1,8 @@
 """Where the files that ship outside the packages are, however nlsid was installed.
 
-`config/` holds one YAML file a robot. A checkout has it beside this package; pip and colcon put it
-in `share/nlsid/config` below the prefix that also holds this package, where ROS looks for it.
+`config/` holds one YAML file a robot, `launch/` one launch file a workflow. A checkout has them
+beside this package; pip and colcon put them in `share/nlsid` below the prefix that also holds this
+package, where ROS looks for them.
 """
 
 from pathlib import Path
@@ -14,11 +15,16 @@ def config_file(name: str) -> Path:
 
     Raises DataError, with the places searched, when no such file was installed.
     """
+    return shipped_file("config", name)
+
+
+def shipped_file(folder: str, name: str) -> Path:
+    """The shipped file called `name` in `folder`; raises as `config_file`."""
     here = Path(__file__).resolve().parents[1]
-    folders = [here.parent / "config"]
-    folders += [prefix / "share" / "nlsid" / "config" for prefix in here.parents]
-    for folder in folders:
-        if (folder / name).is_file():
-            return folder / name
-    searched = ", ".join(str(folder) for folder in folders)
-    raise DataError(f"no configuration '{name}' was installed; searched {searched}")
+    places = [here.parent / folder]
+    places += [prefix / "share" / "nlsid" / folder for prefix in here.parents]
+    for place in places:
+        if (place / name).is_file():
+            return place / name
+    searched = ", ".join(str(place) for place in places)
+    raise DataError(f"no {folder} file '{name}' was installed; searched {searched}")

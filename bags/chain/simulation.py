@@ -7,7 +7,7 @@ import numpy as np
 
 from bags.chain.plants import PERIOD, Plant, Robot
 from nlsid_core._types import FloatArray
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.tracking_monitor import StateObserver
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset, Trajectory
@@ -61,7 +61,7 @@ def record_repeats(
 
 def run_policy(
     robot: Robot,
-    model: StateModel,
+    model: MeasuredState,
     policy: TrackingPolicy,
     *,
     seed: int,

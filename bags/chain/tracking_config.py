@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from bags.chain.config import GridConfig, NonNegative, Positive, SignalConfig, _Section, read_yaml
 
@@ -21,7 +21,8 @@ class StateIdentification(_Section):
     """validation: bags that choose the degrees. refuse_above: % of error in free run.
 
     degrees: classes to try, the highest power of each state and input (default: a few).
-    biased_without_repeats: least squares where no excitation was repeated.
+    biased_without_repeats: least squares where no excitation was repeated. implicit: a trapezoidal
+    step of a mechanism instead of an explicit map.
     """
 
     validation: Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
@@ -30,16 +31,31 @@ class StateIdentification(_Section):
         tuple[Annotated[tuple[int, ...], Field(strict=False)], ...] | None, Field(strict=False)
     ] = None
     biased_without_repeats: bool = False
+    implicit: bool = False
 
 
 class MotionConfig(_Section):
-    """From `start` to `goal` (states) in `duration` s; weights relative to the box of the data."""
+    """From `start` to `goal` (states) in `duration` s, or near given `samples`.
 
-    start: Numbers
-    goal: Numbers
-    duration: Positive
+    samples: a CSV file, headed by the states' names in their order, one row a period; a relative
+    path is seen from the configuration. Weights are relative to the box of the data.
+    """
+
+    start: Numbers | None = None
+    goal: Numbers | None = None
+    duration: Positive | None = None
+    samples: Path | None = Field(default=None, strict=False)
     state_weight: Positive = 1.0
     input_weight: Positive = 0.3
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> "MotionConfig":
+        ends = (self.start, self.goal, self.duration)
+        if self.samples is not None and any(part is not None for part in ends):
+            raise ValueError("give samples, or start, goal and duration, not both")
+        if self.samples is None and any(part is None for part in ends):
+            raise ValueError("give start, goal and duration, or samples")
+        return self
 
 
 class DisturbanceConfig(_Section):
@@ -80,4 +96,9 @@ class TrackingConfig(_Section):
 
 def load_tracking_config(path: Path | str) -> TrackingConfig:
     """Read and check a configuration; DataError lists every wrong key with where it stands."""
-    return read_yaml(path, TrackingConfig)
+    config = read_yaml(path, TrackingConfig)
+    given = config.motion.samples
+    if given is None:
+        return config
+    motion = config.motion.model_copy(update={"samples": Path(path).parent / given})
+    return config.model_copy(update={"motion": motion})

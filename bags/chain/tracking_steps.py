@@ -1,7 +1,8 @@
 """The steps of `nlsid track`: each takes files, returns what it made, writes it whole or not."""
 
+import csv
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,36 +12,24 @@ from bags.chain.plants import ROBOTS, Robot
 from bags.chain.simulation import record_repeats, run_policy
 from bags.chain.tracking_config import SimulationConfig, TrackingConfig
 from bags.monitoring import documents
+from bags.monitoring.designs import TrackingDesign
+from bags.monitoring.documents import Proved
+from bags.monitoring.replay import announced_runs, replay_messages
+from bags.monitoring.watch import WAITING
 from bags.signals.grid import read_dataset
 from nlsid_core import _json
-from nlsid_core.certificate import Verdict, check
-from nlsid_core.discrete_funnel import DiscreteFunnel
+from nlsid_core._types import FloatArray
 from nlsid_core.errors import CertificateMismatch, DataError
-from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
+from nlsid_core.funnels.motion import Feedback, follow_motion, plan_motion, track, tvlqr
 from nlsid_core.funnels.state_funnel import FunnelDesign, assume, design_state_funnel, frame
 from nlsid_core.identification.states import StateFit, identify_states
-from nlsid_core.models.state_map import StateModel
-from nlsid_core.tracking_monitor import TrackingMonitor, TrackingReading
+from nlsid_core.models.measured_state import MeasuredState, read_measured_state
+from nlsid_core.reading import Nominal, TrackingReading
+from nlsid_core.tracking_monitor import OVER
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset
 
 Progress = Callable[[str, float], None]
-
-
-@dataclass(frozen=True, eq=False)
-class ProvedTracking:
-    """A funnel whose proof was checked when it was loaded, with its model and policy."""
-
-    model: StateModel
-    policy: TrackingPolicy
-    funnel: DiscreteFunnel
-    verdict: Verdict
-
-    def replay(self, config: TrackingConfig, bag: Path) -> list[TrackingReading]:
-        """Every sample of one bag held against the funnel; the bag starts with sample 0."""
-        run = read_states([bag], config).trajectories[0]
-        monitor = TrackingMonitor(self.model, self.policy, self.funnel)
-        return [monitor.update(float(t), y, u) for t, y, u in zip(run.t, run.y, run.u, strict=True)]
 
 
 def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
@@ -92,6 +81,7 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
         degrees=options.degrees,
         refuse_above=options.refuse_above,
         biased_without_repeats=options.biased_without_repeats,
+        implicit=options.implicit,
     )
     _json.write_document(out / documents.MODEL, fit.model.document())
     return fit
@@ -100,8 +90,14 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
 def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> TrackingPolicy:
     """model.json in, policy.json in `out`: a motion within the data and its feedback."""
     model, motion = load_state_model(model_path), config.motion
-    steps = round(motion.duration / model.period)
-    x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
+    if motion.samples is not None:
+        x, u = follow_motion(model, _read_samples(motion.samples, model))
+    else:
+        assert motion.start is not None
+        assert motion.goal is not None
+        assert motion.duration is not None  # the configuration has checked that
+        steps = round(motion.duration / model.period)
+        x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
     policy = track(model, x, u, _feedback(model, x, u, config))
     _json.write_document(out / documents.POLICY, policy.document())
     return policy
@@ -155,26 +151,43 @@ def design_tracking_funnel(
     return made
 
 
-def load_proved_tracking(funnel_path: Path) -> ProvedTracking:
-    """A funnel with the model, policy and proof beside it, its proof checked.
+def replay_run(
+    proved: Proved[TrackingDesign], config: TrackingConfig, bag: Path
+) -> list[TrackingReading]:
+    """Every sample of one bag held against the funnel.
 
-    Raises CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
+    Runs begin where a controller announced them in the bag, and are read message by message, as
+    they are live; without an announcement the bag starts with sample 0.
     """
-    verdict = check(funnel_path.with_name(documents.FUNNEL_PROOF), mode="rigorous")
-    model, policy = _load_pair(funnel_path.parent)
-    funnel = DiscreteFunnel.from_document(_json.load_document(funnel_path), source=funnel_path.name)
-    for role, noun in (("model", model), ("policy", policy), ("funnel", funnel)):
-        if verdict.digests.get(role) != _json.digest(noun.document()):
-            raise CertificateMismatch(f"{documents.FUNNEL_PROOF} is not about this {role}")
-    return ProvedTracking(model, policy, funnel, verdict)
+    design = proved.design
+    if announced_runs(design, bag):
+        stamped = replay_messages(design, bag, nominal=Nominal.PROFILE)
+        said = [e.reading for e in stamped if isinstance(e.reading, TrackingReading)]
+        return [r for r in said if not r.reason.startswith((WAITING, OVER))]
+    run = read_states([bag], config).trajectories[0]
+    monitor = design.monitor(Nominal.PROFILE)
+    return [monitor.update(float(t), y, u) for t, y, u in zip(run.t, run.y, run.u, strict=True)]
 
 
-def load_state_model(path: Path) -> StateModel:
+def load_state_model(path: Path) -> MeasuredState:
     """Read a model file; DocumentError says what is wrong with it."""
-    return StateModel.from_document(_json.load_document(path), source=path.name)
+    return read_measured_state(_json.load_document(path), source=path.name)
 
 
-def _load_pair(folder: Path) -> tuple[StateModel, TrackingPolicy]:
+def _read_samples(path: Path, model: MeasuredState) -> FloatArray:
+    """(N + 1, n) from a CSV file headed by the states' names; DataError says what is wrong."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    names = [signal.name for signal in model.x]
+    if not rows or [name.strip() for name in rows[0]] != names:
+        raise DataError(f"{path}: the first row should be {','.join(names)}; it is {rows[:1]}")
+    try:
+        return np.array([[float(value) for value in row] for row in rows[1:] if row])
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _load_pair(folder: Path) -> tuple[MeasuredState, TrackingPolicy]:
     model = load_state_model(folder / documents.MODEL)
     policy = TrackingPolicy.from_document(
         _json.load_document(folder / documents.POLICY), source=documents.POLICY
@@ -184,7 +197,9 @@ def _load_pair(folder: Path) -> tuple[StateModel, TrackingPolicy]:
     return model, policy
 
 
-def _feedback(model: StateModel, x: np.ndarray, u: np.ndarray, config: TrackingConfig) -> Feedback:
+def _feedback(
+    model: MeasuredState, x: np.ndarray, u: np.ndarray, config: TrackingConfig
+) -> Feedback:
     motion = config.motion
     return tvlqr(model, x, u, state_weight=motion.state_weight, input_weight=motion.input_weight)
 

@@ -11,10 +11,12 @@ from rich.markup import escape
 
 from bags.chain.config import load_config
 from bags.chain.problems import FunnelProblem
+from bags.chain.shipped import shipped_file
 from bags.chain.steps import compare_bags, design_funnel_files, identify_bags
-from bags.commands import show, stack
+from bags.commands import show
 from bags.commands.bag_cli import bag_app
 from bags.commands.demo import run_demo
+from bags.commands.launching import LaunchFile, run_together
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from bags.monitoring import documents
@@ -201,23 +203,17 @@ def monitor(
 
 @app.command()
 def live(
-    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
-    track: Annotated[
-        bool, typer.Option("--track", help="Run the policy too; give --highest. Default: watch.")
-    ] = False,
-    plant: Annotated[
-        bool, typer.Option("--plant", help="With --track: simulate the robot by the model.")
-    ] = False,
-    lowest: Annotated[float, typer.Option(help="Least input the robot may get.")] = 0.0,
-    highest: Annotated[float, typer.Option(help="Greatest input the robot may get.")] = 0.0,
+    workflow: Annotated[str, typer.Argument(help="monitor, closed_loop or identify.")],
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
+    ] = None,
 ) -> None:
-    """Start the live nodes on a funnel and end them together: no ROS launch needed, rclpy is."""
+    """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
-    nodes = stack.monitoring(funnel)
-    if track:
-        nodes = stack.tracking(funnel, lowest=lowest, highest=highest, plant=plant)
-    raise typer.Exit(stack.run_stack(nodes))
+    launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
+    raise typer.Exit(run_together(launch.commands(arguments or [])))
 
 
 @app.command()

@@ -17,7 +17,7 @@ from nlsid_core.certificate import check
 from nlsid_core.funnels.state_funnel import FunnelDesign
 from nlsid_core.identification.states import StateFit
 from nlsid_core.monitor import Status
-from nlsid_core.tracking_monitor import TrackingReading
+from nlsid_core.reading import TrackingReading
 
 app = typer.Typer(
     help="A measured state: model from repeats, motion, proved discrete funnel, monitor.",
@@ -111,13 +111,13 @@ def _funnel(bags: list[Path], design: Path, config: TrackingConfig) -> FunnelDes
 
 
 def _monitor(bags: list[Path], funnel: Path, config: TrackingConfig) -> bool:
-    proved = tracking_steps.load_proved_tracking(funnel)
+    proved = documents.load_proved_tracking(funnel)
     table = Table(title="runs against the funnel", title_justify="left")
     for column in ("run", "verdict", "least margin", "disturbance / bound", "end", "why"):
         table.add_column(column)
     inside = True
     for bag in bags:
-        readings = proved.replay(config, bag)
+        readings = tracking_steps.replay_run(proved, config, bag)
         judged = [r for r in readings if r.status is not Status.UNKNOWN]
         bad = next((r for r in readings if r.status is not Status.INSIDE), None)
         inside = inside and bad is None

@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
+from bags.monitoring.designs import Design, LinearDesign, TrackingDesign, read_design
 from nlsid_core import _json
 from nlsid_core.certificate import Verdict, check
-from nlsid_core.errors import CertificateMismatch
-from nlsid_core.funnel import Funnel
+from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.monitor import Monitor, Nominal
-from nlsid_core.policy import Policy
 
 MODEL = "model.json"
 MODEL_PROOF = "model.proof.json"
@@ -22,18 +21,15 @@ MARGIN_PLOT = "monitor.png"
 FUNNEL_PLOT = "funnel.png"
 
 
+D = TypeVar("D", bound=Design)
+
+
 @dataclass(frozen=True, eq=False)
-class ProvedFunnel:
-    """A funnel whose proof was checked when it was loaded, with its model and policy."""
+class Proved(Generic[D]):
+    """A design whose proof was checked when it was loaded."""
 
-    model: DifferenceEquation
-    policy: Policy
-    funnel: Funnel
+    design: D
     verdict: Verdict
-
-    def monitor(self, nominal: Nominal = Nominal.COMMAND) -> Monitor:
-        """A monitor for one run."""
-        return Monitor(self.model, self.policy, self.funnel, nominal=nominal)
 
 
 def load_model(path: Path | str) -> DifferenceEquation:
@@ -42,26 +38,32 @@ def load_model(path: Path | str) -> DifferenceEquation:
     return DifferenceEquation.from_document(_json.load_document(path), source=str(path))
 
 
-def load_proved_funnel(path: Path | str) -> ProvedFunnel:
+def load_proved(path: Path | str) -> Proved[Design]:
     """Read a funnel with the model, policy and proof beside it, and check the proof.
 
     Raises CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
     """
     path = Path(path)
     verdict = check(path.with_name(FUNNEL_PROOF))
-    funnel_document = _json.load_document(path)
-    model_document = _json.load_document(path.with_name(MODEL))
-    policy_document = _json.load_document(path.with_name(POLICY))
-    for role, document in (
-        ("funnel", funnel_document),
-        ("model", model_document),
-        ("policy", policy_document),
-    ):
+    names = {"model": MODEL, "policy": POLICY, "funnel": path.name}
+    found = {role: _json.load_document(path.with_name(name)) for role, name in names.items()}
+    for role, document in found.items():
         if verdict.digests.get(role) != _json.digest(document):
             raise CertificateMismatch(f"{FUNNEL_PROOF} beside {path} is not about this {role}")
-    return ProvedFunnel(
-        model=DifferenceEquation.from_document(model_document, source=MODEL),
-        policy=Policy.from_document(policy_document, source=POLICY),
-        funnel=Funnel.from_document(funnel_document, source=str(path)),
-        verdict=verdict,
-    )
+    return Proved(read_design(found), verdict)
+
+
+def load_proved_funnel(path: Path | str) -> Proved[LinearDesign]:
+    """`load_proved` for a tube of a difference equation; DocumentError if it is another."""
+    proved = load_proved(path)
+    if not isinstance(proved.design, LinearDesign):
+        raise DocumentError(f"{path}: a discrete funnel; use `nlsid track` for it")
+    return Proved(proved.design, proved.verdict)
+
+
+def load_proved_tracking(path: Path | str) -> Proved[TrackingDesign]:
+    """`load_proved` for a discrete funnel; DocumentError if it is another."""
+    proved = load_proved(path)
+    if not isinstance(proved.design, TrackingDesign):
+        raise DocumentError(f"{path}: no discrete funnel; use `nlsid monitor` for it")
+    return Proved(proved.design, proved.verdict)

@@ -3,18 +3,18 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from bags.monitoring.announcement import Run
-from bags.monitoring.documents import ProvedFunnel
+from bags.monitoring.designs import Design, LinearDesign, TrackingDesign
+from bags.monitoring.documents import Proved
 from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, header_stamp_ns, is_stamped
-from bags.signals.signal import SignalPath
 from nlsid_core import _json
 from nlsid_core.errors import BagError
 from nlsid_core.monitor import Nominal, Reading, Status
 
-RESPONSE, EXCITATION = "response", "excitation"
 STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
@@ -66,58 +66,82 @@ class Replay:
         return "" if self.judged or not self.readings else self.readings[-1].reason
 
 
-def replay_bag(proved: ProvedFunnel, bag: Path | str, *, nominal: Nominal) -> Replay:
-    """Every response in `bag` held against the funnel, message by message as it was recorded.
+def replay_bag(proved: Proved[LinearDesign], bag: Path | str, *, nominal: Nominal) -> Replay:
+    """Every response in `bag` held against a tube of a difference equation.
 
-    Raises BagError if the bag cannot be read or does not hold the funnel's signals on stamped
-    messages. What is wrong with the signals themselves (NaN, gaps, time going back) shows as
-    unknown, as it does live.
+    Raises BagError as `replay_messages`.
     """
-    bag, model = Path(bag), proved.model
-    run = announced_run(proved, bag) if nominal is Nominal.PROFILE else None
-    watch = Watch(proved.monitor(nominal), announced=run is not None)
-    stamped: list[Stamped] = [] if run is None else watch.begin(run.start_ns)
-    for role, stamp_ns, value in _events(bag, model.y.path, model.u.path):
-        feed = watch.response if role == RESPONSE else watch.excitation
-        stamped += feed(stamp_ns, value)
-    stamped += watch.flush()
-    if not stamped:
-        raise BagError(f"{bag}: no message on {model.y.path}")
+    design = proved.design
+    stamped = replay_messages(design, bag, nominal=nominal)
     return Replay(
-        name=bag.name,
-        readings=tuple(entry.reading for entry in stamped),
+        name=Path(bag).name,
+        readings=tuple(e.reading for e in stamped if isinstance(e.reading, Reading)),
         stamps_ns=tuple(entry.stamp_ns for entry in stamped),
-        axis=model.y.name,
-        unit=model.y.unit,
-        half_width=proved.funnel.half_width,
+        axis=design.name,
+        unit=design.model.y.unit,
+        half_width=design.funnel.half_width,
     )
 
 
-def announced_run(proved: ProvedFunnel, bag: Path | str) -> Run | None:
-    """The last run of this funnel that a controller announced in `bag`, None if there is none."""
-    digest = _json.digest(proved.funnel.document())
-    found = None
+def replay_messages(design: Design, bag: Path | str, *, nominal: Nominal) -> list[Stamped]:
+    """What the live monitor says of the messages in `bag`, one by one as they were recorded.
+
+    Runs that a controller announced in it begin where it said, if the tube is around its plan;
+    without an announcement the first response is sample 0. Raises BagError if the bag cannot be
+    read or does not hold the funnel's signals on stamped messages. What is wrong with the signals
+    themselves (NaN, gaps, time going back) shows as unknown, as it does live.
+    """
+    bag = Path(bag)
+    planned = nominal is Nominal.PROFILE or isinstance(design, TrackingDesign)
+    announced = planned and bool(announced_runs(design, bag))
+    watch = Watch(design, nominal=nominal, announced=announced)
+    stamped = [entry for said in _fed(watch, bag, announced=announced) for entry in said]
+    stamped += watch.flush()
+    if not stamped:
+        raise BagError(f"{bag}: no message on {design.response}")
+    return stamped
+
+
+def announced_runs(design: Design, bag: Path | str) -> list[Run]:
+    """The runs of this funnel that a controller announced in `bag`, in the order it did."""
     with Bag(bag) as source:
-        topics = [t for t, kind in source.topics.items() if t.endswith(RUN_TOPIC)]
-        topics = [topic for topic in topics if source.types_on(topic)[0] == STRING]
+        messages = source.messages(_run_topics(source))
+        found = [_run(message, source) for message in messages]
+    digest = _json.digest(design.funnel.document())
+    return [run for run in found if run.funnel == digest]
+
+
+def _fed(watch: Watch, bag: Path, *, announced: bool) -> Iterator[list[Stamped]]:
+    """What `watch` says to every message, in log order."""
+    design = watch.design
+    digest = _json.digest(design.funnel.document())
+    with Bag(bag) as source:
+        for path in (design.response, design.command):
+            kind = source.types_on(path.topic)
+            path.check(*kind)
+            if not is_stamped(*kind):
+                raise BagError(f"{bag}: {path.topic} ({kind[0]}) has no header stamp")
+        run_topics = _run_topics(source) if announced else []
+        topics = [*run_topics, design.response.topic, design.command.topic]
         for message in source.messages(topics):
-            text = decode(message.data, *source.types_on(message.topic))
-            run = Run.from_document(_json.parse_document(text.data, source=message.topic))  # type: ignore[attr-defined]
-            found = run if run.funnel == digest else found
-    return found
+            if message.topic in run_topics:
+                run = _run(message, source)
+                if run.funnel == digest:
+                    yield watch.begin(run.start_ns)
+                continue
+            stamp_ns = header_stamp_ns(message.data)
+            decoded = decode(message.data, *source.types_on(message.topic))
+            if message.topic == design.response.topic:
+                yield watch.response(stamp_ns, design.response.value(decoded))
+            if message.topic == design.command.topic:
+                yield watch.excitation(stamp_ns, design.command.value(decoded))
 
 
-def _events(bag: Path, response: str, excitation: str) -> Iterator[tuple[str, int, float]]:
-    """(role, header stamp in ns, value) of every message of the two signals, in log order."""
-    paths = {RESPONSE: SignalPath.parse(response), EXCITATION: SignalPath.parse(excitation)}
-    with Bag(bag) as source:
-        kinds = {role: source.types_on(path.topic) for role, path in paths.items()}
-        for role, path in paths.items():
-            path.check(*kinds[role])
-            if not is_stamped(*kinds[role]):
-                raise BagError(f"{bag}: {path.topic} ({kinds[role][0]}) has no header stamp")
-        for message in source.messages([path.topic for path in paths.values()]):
-            for role, path in paths.items():
-                if path.topic == message.topic:
-                    value = path.value(decode(message.data, *kinds[role]))
-                    yield role, header_stamp_ns(message.data), value
+def _run_topics(source: Bag) -> list[str]:
+    topics = [topic for topic in source.topics if topic.endswith(RUN_TOPIC)]
+    return [topic for topic in topics if source.types_on(topic)[0] == STRING]
+
+
+def _run(message: Any, source: Bag) -> Run:
+    text = decode(message.data, *source.types_on(message.topic))
+    return Run.from_document(_json.parse_document(text.data, source=message.topic))  # type: ignore[attr-defined]

@@ -2,14 +2,16 @@
 
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from bags.monitoring.designs import Design
 from bags.signals.grid import seconds
 from bags.signals.pairing import Pairing, Sample
 from nlsid_core.alarm import Alarm, AlarmOptions, Alert
-from nlsid_core.monitor import Monitor, Reading, Status
+from nlsid_core.monitor import Nominal
+from nlsid_core.reading import AnyReading
 
-HELD = 4096  # samples kept while a run's start is not announced yet: 4 s at 1 kHz
+HELD = 4096  # samples kept for a run whose start is announced late: 4 s at 1 kHz
 WAITING = "waiting for the controller to announce its start"
 
 
@@ -17,7 +19,7 @@ class Stamped(NamedTuple):
     """A reading and its alert, and the stamp (ns) of the response they judge."""
 
     stamp_ns: int
-    reading: Reading
+    reading: AnyReading
     alert: Alert
 
 
@@ -25,17 +27,27 @@ class Watch:
     """Pairs responses with commands on message stamps and asks the monitor about each sample.
 
     A run begins with the first response, or, if `announced`, at the stamp given to `begin`; the
-    samples before it then give the observer its state. Time in the readings is s since the run's
-    first response or announced start.
+    samples before it then give the observer its state, and runs may follow each other. Time in the
+    readings is s since the run's first response or announced start.
     """
 
     def __init__(
-        self, monitor: Monitor, *, options: AlarmOptions | None = None, announced: bool = False
+        self,
+        design: Design,
+        *,
+        nominal: Nominal = Nominal.COMMAND,
+        options: AlarmOptions | None = None,
+        announced: bool = False,
     ) -> None:
-        self.monitor = monitor
+        self.design = design
+        self.monitor: Any = design.monitor(nominal)  # takes what the design's response gives
         self._alarm = Alarm(options)
         self._announced = announced
         self.restart()
+
+    def warn(self, options: AlarmOptions) -> None:
+        """Warn as `options` say from the next sample on."""
+        self._alarm.options = options
 
     def restart(self) -> None:
         """Begin a new run: forget stamps, lags and budget."""
@@ -44,21 +56,24 @@ class Watch:
         self._alarm.restart()
         self.origin_ns: int | None = None
         self._newest_ns = 0
-        self._held: deque[Sample] | None = deque(maxlen=HELD) if self._announced else None
+        self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
         self._start_ns: int | None = None
+        self._running = not self._announced
 
     def begin(self, start_ns: int) -> list[Stamped]:
         """The run's sample 0 is the response stamped `start_ns`, past or to come; readings from it.
 
         A second `begin` is a new run.
         """
-        held = list(self._held or ())
-        self._held = deque(maxlen=HELD)
+        recent = list(self._recent)
+        self._recent.clear()
+        self._recent.extend(sample for sample in recent if sample.stamp_ns < start_ns)
         self._start_ns = self.origin_ns = start_ns
+        self._running = False
         self._alarm.restart()
-        return [entry for entry in self._judge(held) if entry.stamp_ns >= start_ns]
+        return self._judge([sample for sample in recent if sample.stamp_ns >= start_ns])
 
-    def response(self, stamp_ns: int, y: float) -> list[Stamped]:
+    def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
         """Feed a response; the readings that can be given now, in order."""
         if self.origin_ns is None:
             self.origin_ns = stamp_ns
@@ -67,10 +82,10 @@ class Watch:
         readings = self._judge(self.pairing.response(stamp_ns, y))
         if self.pairing.late_responses > before:
             back = seconds(self._newest_ns, stamp_ns)
-            readings += self.missing(f"time went back by {back:g} s on {self.monitor.model.y.path}")
+            readings += self.missing(f"time went back by {back:g} s on {self.design.response}")
         return readings
 
-    def excitation(self, stamp_ns: int, u: float) -> list[Stamped]:
+    def excitation(self, stamp_ns: int, u: Any) -> list[Stamped]:
         """Feed a command; the readings that can be given now, in order."""
         return self._judge(self.pairing.excitation(stamp_ns, u))
 
@@ -92,13 +107,13 @@ class Watch:
         judged = []
         for sample in samples:
             t = seconds(sample.stamp_ns, self.origin_ns)
-            if self._held is not None and self._starts(sample):
+            if not self._running and self._starts(sample):
                 self._give_lags()
-            if self._held is not None:
-                self._held.append(sample)
-                reading = Reading(t, Status.UNKNOWN, measured=sample.y, reason=WAITING)
-            else:
+            self._recent.append(sample)
+            if self._running:
                 reading = self.monitor.update(t, sample.y, sample.u)
+            else:
+                reading = self.monitor.waiting(t, sample.y, WAITING)
             judged.append(Stamped(sample.stamp_ns, reading, self._alarm.update(reading)))
         return judged
 
@@ -106,10 +121,10 @@ class Watch:
         return self._start_ns is not None and sample.stamp_ns >= self._start_ns
 
     def _give_lags(self) -> None:
-        """The samples before the start give the observer its state."""
-        n = len(self.monitor.model)
-        lags = list(self._held or ())[-n:]
-        self._held = None
+        """The samples before the start give the observer its state, if it needs any."""
+        n = self.monitor.lags
+        lags = list(self._recent)[-n:] if n else []
+        self._running = True
         self.monitor.restart()
         if len(lags) < n:
             reason = f"only {len(lags)} samples before the run's start; it takes {n}"

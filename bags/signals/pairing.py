@@ -7,17 +7,20 @@ so nothing older is still to come), or once the caller stops waiting.
 
 import math
 from bisect import bisect_right, insort
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 HISTORY: Final = 2**16  # excitations kept while no response comes: a minute at 1 kHz
 
 
 class Sample(NamedTuple):
-    """A response and the excitation that was in force at its stamp (NaN: none yet)."""
+    """A response and the excitation that was in force at its stamp (NaN: none yet).
+
+    Both are what was fed: numbers, or arrays of them.
+    """
 
     stamp_ns: int
-    y: float
-    u: float
+    y: Any
+    u: Any
 
 
 class Pairing:
@@ -35,10 +38,10 @@ class Pairing:
         self.duplicate_responses = 0
         self._released_ns = -math.inf
         self._newest_ns = -math.inf
-        self._waiting: list[tuple[int, float]] = []
-        self._excitations: list[tuple[int, float]] = []
+        self._waiting: list[tuple[int, Any]] = []
+        self._excitations: list[tuple[int, Any]] = []
 
-    def response(self, stamp_ns: int, y: float) -> list[Sample]:
+    def response(self, stamp_ns: int, y: Any) -> list[Sample]:
         """Feed a response; the samples that are certain now, in order of stamps."""
         at = bisect_right(self._waiting, stamp_ns, key=_stamp)
         if stamp_ns == self._released_ns or (at and self._waiting[at - 1][0] == stamp_ns):
@@ -49,7 +52,7 @@ class Pairing:
             self._waiting.insert(at, (stamp_ns, y))
         return self._release(self._newest_ns)
 
-    def excitation(self, stamp_ns: int, u: float) -> list[Sample]:
+    def excitation(self, stamp_ns: int, u: Any) -> list[Sample]:
         """Feed an excitation; the samples that are certain now, in order of stamps.
 
         Of two with one stamp the later one fed counts.
@@ -76,7 +79,7 @@ class Pairing:
             del self._waiting[:ready]
         return samples
 
-    def _held(self, stamp_ns: int) -> float:
+    def _held(self, stamp_ns: int) -> Any:
         """The excitation in force; older ones are forgotten, as released stamps only increase."""
         after = bisect_right(self._excitations, stamp_ns, key=_stamp)
         if not after:
@@ -85,5 +88,5 @@ class Pairing:
         return self._excitations[0][1]
 
 
-def _stamp(entry: tuple[int, float]) -> int:
+def _stamp(entry: tuple[int, Any]) -> int:
     return entry[0]

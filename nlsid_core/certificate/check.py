@@ -12,6 +12,7 @@ from nlsid_core.certificate import (
     block_cascade,
     discrete_funnel,
     implicit,
+    implicit_funnel,
     monotone_equation,
     nonnegative,
     stability,
@@ -52,6 +53,10 @@ def _funnel_composition(
     return funnel_composition.decide(claim, proof, about, mode)
 
 
+def _implicit_funnel(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
+    return implicit_funnel.decide(claim, proof, about, "exact")
+
+
 CLAIMS: Mapping[str, Decide] = MappingProxyType(
     {
         "incremental_stability": _exact_only(stability.decide),
@@ -64,6 +69,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,
         "implicit_stability": implicit.decide,
+        "implicit_funnel": _exact_only(_implicit_funnel),
         "trajectory_funnel": _trajectory_funnel,
         "funnel_composition": _funnel_composition,
     }

@@ -26,6 +26,7 @@ from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.tracking_policy import TrackingPolicy
 
@@ -40,6 +41,14 @@ class StepProof:
     Q: FloatArray
     sigma: FloatArray
 
+    def document(self) -> Json:
+        """The JSON form: matrices as lower triangles, row by row."""
+        return {
+            "reach": self.reach,
+            "Q": self.Q[np.tril_indices(len(self.Q))].tolist(),
+            "sigma": self.sigma[np.tril_indices(len(self.sigma))].tolist(),
+        }
+
 
 def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> Decision:
     """Decide the funnel of the bound files."""
@@ -48,7 +57,17 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     model = StateModel.from_document(about["model"], source="model")
     policy = TrackingPolicy.from_document(about["policy"], source="policy")
     funnel = DiscreteFunnel.from_document(about["funnel"], source="funnel")
-    _refuse_strangers(about, policy, funnel)
+    refuse_strangers(about, policy, funnel)
+    refuse_misfits(model, policy, funnel)
+    if funnel.roots is not None:
+        raise CertificateRejected("an explicit model has no roots to bound")
+    T, steps = _read_steps(proof, model, funnel)
+    margin = prove_chains(model, policy, funnel, T, steps, mode=mode)
+    return statement(model, funnel, margin)
+
+
+def refuse_misfits(model: MeasuredState, policy: TrackingPolicy, funnel: DiscreteFunnel) -> None:
+    """Refuse parts of different sizes, and an assumption that is none."""
     if policy.x.shape[1] != len(model) or policy.u.shape[1] != len(model.u):
         raise CertificateRejected("the policy has another number of states or inputs")
     if funnel.S.shape[1] != len(model) or len(funnel) != len(policy):
@@ -56,9 +75,12 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json], mode: Mode) -> D
     if policy.period != model.period:
         raise CertificateRejected("the policy has another sample time than the model")
     refuse_assumption(model, funnel.assumption)
-    T, steps = _read_steps(proof, model, funnel)
-    margin = prove_chains(model, policy, funnel, T, steps, mode=mode)
-    return _statement(model, funnel, margin)
+
+
+def refuse_T(T: FloatArray) -> None:
+    """Refuse a T that is not triangular and invertible."""
+    if (np.tril(T, -1) != 0).any() or (np.diagonal(T, axis1=1, axis2=2) == 0).any():
+        raise CertificateRejected("T should be upper triangular with a nonzero diagonal")
 
 
 def prove_chains(
@@ -71,13 +93,12 @@ def prove_chains(
     mode: Mode = "exact",
 ) -> float:
     """Prove both chains on plain numbers; the least margin of a Gram matrix. Raises on refusal."""
-    if (np.tril(T, -1) != 0).any() or (np.diagonal(T, axis1=1, axis2=2) == 0).any():
-        raise CertificateRejected("T should be upper triangular with a nonzero diagonal")
+    refuse_T(T)
     reach.refuse_size(model)
     margins = []
     form = funnel.assumption.form
     for k in range(len(funnel) + 1):
-        _refuse_box(model, policy, funnel, k)
+        refuse_box(model, policy, funnel, k)
     for k in range(len(funnel)):
         g = reach.closed_loop(
             model,
@@ -137,7 +158,7 @@ def disturbed(
     return Fraction(0)
 
 
-def refuse_assumption(model: StateModel, a: DisturbanceAssumption) -> None:
+def refuse_assumption(model: MeasuredState, a: DisturbanceAssumption) -> None:
     """Refuse a bound smaller than what was measured, or measured on the data of the fit."""
     if not a.measured_on:
         raise CertificateRejected("the assumption was measured on no commissioning run")
@@ -159,7 +180,9 @@ def refuse_assumption(model: StateModel, a: DisturbanceAssumption) -> None:
         )
 
 
-def _refuse_box(model: StateModel, policy: TrackingPolicy, funnel: DiscreteFunnel, k: int) -> None:
+def refuse_box(
+    model: MeasuredState, policy: TrackingPolicy, funnel: DiscreteFunnel, k: int
+) -> None:
     """Both chains within the box of the data at sample k, the policy's inputs included."""
     S = reach.rational(funnel.S[k])
     largest = max(Fraction(float(r[k])) for r in (funnel.tube, funnel.inlet))
@@ -184,9 +207,10 @@ def _refuse_box(model: StateModel, policy: TrackingPolicy, funnel: DiscreteFunne
             )
 
 
-def _refuse_strangers(
+def refuse_strangers(
     about: Mapping[str, Json], policy: TrackingPolicy, funnel: DiscreteFunnel
 ) -> None:
+    """CertificateMismatch unless policy and funnel name the documents they are decided with."""
     digests = {role: _json.digest(content) for role, content in about.items()}
     for owner, role, stated in (
         ("policy", "model", policy.model),
@@ -233,7 +257,8 @@ def _symmetric(entry: Json, key: str, source: str) -> FloatArray:
     return np.asarray(matrix + np.tril(matrix, -1).T)
 
 
-def _statement(model: StateModel, funnel: DiscreteFunnel, margin: float) -> Decision:
+def statement(model: MeasuredState, funnel: DiscreteFunnel, margin: float) -> Decision:
+    """What was proved, in words, and what it assumes."""
     a, N = funnel.assumption, len(funnel)
     widths = ", ".join(
         f"{signal.name} {width:.3g} {signal.unit}".rstrip()

@@ -91,9 +91,9 @@ def rounded(g: Rational, radius: float) -> tuple[FloatArray, Fraction]:
     return floats, gap
 
 
-def degree_of(g: Rational) -> int:
-    """The degree up to which `g` has rows."""
-    n, degree = g.shape[1], 1
+def degree_of(g: Rational, variables: int | None = None) -> int:
+    """The degree up to which `g` has rows, in as many variables as it has columns, or so many."""
+    n, degree = g.shape[1] if variables is None else variables, 1
     while comb(n + degree, n) < len(g):
         degree += 1
     return degree
@@ -137,16 +137,18 @@ def prove_reach(
     return decide_identity(target, Gram(basis, Q, names), strict=False, mode=mode)
 
 
-def curvature(g: Rational, A_unit: Rational) -> dict[tuple[int, int], Fraction]:
+def curvature(
+    g: Rational, A_unit: Rational, variables: int | None = None
+) -> dict[tuple[int, int], Fraction]:
     """c_jl with |g(z + w) - g(z) - A_unit w| ≤ Σ_jl c_jl |z|^j |w|^l, every l ≥ 1.
 
     The part of degrees j and l is M m(z, w), m the monomials z^α w^β times the roots of the
     multinomials of α and β, so that |m|² = |z|^2j |w|^2l. c_jl² is at least the largest
     eigenvalue of MM', which is rational.
     """
-    n = g.shape[1]
+    n = g.shape[1] if variables is None else variables
     squares: dict[tuple[int, int], Rational] = {}
-    exponents = monomials(n, range(degree_of(g) + 1)).tolist()
+    exponents = monomials(n, range(degree_of(g, n) + 1)).tolist()
     for exponent, row in zip(exponents, g, strict=True):
         if sum(exponent) == 1:
             row = row - A_unit[:, exponent.index(1)]  # linear: compared with A
@@ -172,7 +174,10 @@ def response_error(
 
 
 def stretch(
-    c: Mapping[tuple[int, int], Fraction], inflation: Fraction, radius: float, bound: float
+    c: Mapping[tuple[int, int], Fraction],
+    inflation: Fraction,
+    radius: float | Fraction,
+    bound: float | Fraction,
 ) -> Fraction:
     """μ with |g(z + w) - g(z)| ≤ μ|w| for |z| ≤ radius and |w| ≤ bound, c of A = 0."""
     s, r = inflation * Fraction(radius), inflation * Fraction(bound)
@@ -189,7 +194,7 @@ def inflation(ST: Rational) -> Fraction:
     return 1 / (1 - distance)
 
 
-def inflate(kappa: Fraction, radius: float) -> float:
+def inflate(kappa: Fraction, radius: float | Fraction) -> float:
     """A float at least κ·radius."""
     value = float(kappa * Fraction(radius))
     return (
@@ -210,6 +215,12 @@ def root_above(value: Fraction) -> Fraction:
     """A rational at least √value, closer than 2^(2 - ROOT_BITS)."""
     whole = -((-value.numerator << 2 * ROOT_BITS) // value.denominator)
     return Fraction(isqrt(whole) + 1, 1 << ROOT_BITS)
+
+
+def norm_above(M: Rational) -> Fraction:
+    """A rational at least the largest singular value of M."""
+    square = M @ M.T
+    return root_above(_largest_eigenvalue(square)) if square.any() else Fraction(0)
 
 
 def _ball(names: tuple[str, ...]) -> Polynomial:

@@ -9,15 +9,18 @@ holds for next states within R, which a monitor has to check.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 
+from nlsid_core.certificate.implicit_reach import ImplicitStepProof
 from nlsid_core.certificate.nonnegative import prove_lower_bound
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.polynomial import Polynomial, constant, variables
-from nlsid_core.sos import Identity, Program, SumOfSquares, solve
+from nlsid_core.sos import Program, SumOfSquares, solve
+from nlsid_core.sos.search import positive_semidefinite
 
-ROOM = 1e-3  # relative; β is raised by so much, so that the proof's matrices are definite
+ROOM = 1e-5  # relative; β is raised by so much, so that the proof's matrices are definite
 ATTEMPTS = 4  # each raising β ten times as much
 
 
@@ -62,29 +65,38 @@ class ImplicitStep:
         return total
 
     def reach(self) -> float:
-        """b with h(z, w) = 0, |z| ≤ 1 and |w| ≤ R ⇒ |x̄⁺| ≤ b, proved exactly.
+        """b with h(z, w) = 0, |z| ≤ 1 and |w| ≤ R ⇒ |x̄⁺| ≤ b, proved exactly; raises as `proof`."""
+        return self.proof().reach
+
+    def proof(self) -> ImplicitStepProof:
+        """The reach b with its proof.
 
         Raises Infeasible if no proof of this degree is found, SolverError as the solver does.
         """
         (beta,) = variables("beta")
-        found = solve(self._program(beta - self.square, minimise=beta))
+        square = self.square.rounded()
+        found = solve(self._program(beta - square, minimise=beta))
         room = ROOM
         for _ in range(ATTEMPTS):
-            level = found.objective * (1.0 + room)
-            again = solve(self._program(constant(level, names=self.names) - self.square))
+            reach = float(np.sqrt(max(found.objective, 0.0) * (1.0 + room)))
+            identity = solve(self._program(constant(reach**2, names=self.names) - square))["reach"]
+            first, second = (positive_semidefinite(gram) for gram in identity.multipliers)
+            proof = ImplicitStepProof(
+                reach, identity.gram, (first, second), tuple(identity.equality_multipliers)
+            )
             try:
-                self.prove(level, again["reach"])
+                self.prove(proof)
             except CertificateRejected:
                 room *= 10.0
                 continue
-            return float(np.nextafter(np.sqrt(level), np.inf))
+            return proof
         raise Infeasible("no exact proof of this step; use smaller radii or a smaller bound R")
 
-    def prove(self, level: float, identity: Identity) -> float:
-        """Prove |rows|² ≤ level on the domain from an identity; raises CertificateRejected."""
+    def prove(self, identity: ImplicitStepProof) -> float:
+        """Prove |rows| ≤ reach on the domain from an identity; raises CertificateRejected."""
         return prove_lower_bound(
             -self.square,
-            -level,
+            -(Fraction(identity.reach) ** 2),
             identity.gram,
             domain=self.domain,
             multipliers=identity.multipliers,
@@ -93,7 +105,8 @@ class ImplicitStep:
         )
 
     def _program(self, p: Polynomial, *, minimise: Polynomial | None = None) -> Program:
-        constraint = SumOfSquares(p, domain=self.domain, equalities=self.equations, name="reach")
+        equations = tuple(h.rounded() for h in self.equations)
+        constraint = SumOfSquares(p, domain=self.domain, equalities=equations, name="reach")
         return Program(self.names, (constraint,), minimise=minimise)
 
 

@@ -1,6 +1,7 @@
 """A motion to track and what follows it: direct transcription, time-varying LQR, observer."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,7 +12,7 @@ from nlsid_core._types import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 from nlsid_core.funnels.riccati import Feedback, discrete_tvlqr
-from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.tracking_policy import TrackingPolicy
 
 __all__ = ["Feedback", "observer_gain", "plan_motion", "track", "tvlqr"]
@@ -20,10 +21,20 @@ ITERATIONS = 30  # of linearising the model around the last motion
 SETTLED = 1e-6  # largest defect of a motion, in half-widths of the data box, when it is done
 RESERVE = 0.1  # of the box's half-width, kept free for feedback and funnel
 SMOOTHNESS = 10.0  # weight of changes of the input against the input itself
+NEARNESS = 1e-3  # weight of the state against the input where no motion is given ...
+FIDELITY = 1e5  # ... and of being near a motion that is given
+
+
+@dataclass(frozen=True, eq=False)
+class _Pull:
+    """weight·|x - towards|² in the cost, towards (N + 1, n) in unit variables of the box."""
+
+    towards: FloatArray
+    weight: float
 
 
 def plan_motion(
-    model: StateModel,
+    model: MeasuredState,
     start: ArrayLike,
     goal: ArrayLike,
     *,
@@ -42,6 +53,34 @@ def plan_motion(
     for end in ends:
         if end.shape != (n,):
             raise ShapeError(f"start and goal should have shape ({n},), one has {end.shape}")
+    straight = ends[0] + np.linspace(0.0, 1.0, steps + 1)[:, None] * (ends[1] - ends[0])
+    return _transcribed(model, straight, reserve=reserve, fidelity=None)
+
+
+def follow_motion(
+    model: MeasuredState, samples: ArrayLike, *, reserve: float = RESERVE
+) -> tuple[FloatArray, FloatArray]:
+    """The model's own motion nearest to given states (N + 1, n), one per period: x and u (N, p).
+
+    It starts and ends where they do, with smooth inputs, within the data box. Raises as
+    `plan_motion`.
+    """
+    given = np.asarray(samples, dtype=np.float64)
+    if given.ndim != 2 or given.shape[1] != len(model) or len(given) < 2:
+        raise ShapeError(f"samples should be (N + 1, {len(model)}), N > 0; they are {given.shape}")
+    if not np.isfinite(given).all():
+        raise DataError("the samples of the motion hold NaN or infinity")
+    return _transcribed(model, given, reserve=reserve, fidelity=FIDELITY)
+
+
+def _transcribed(
+    model: MeasuredState, given: FloatArray, *, reserve: float, fidelity: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Sequential quadratic programs from the states (N + 1, n) `given`, which fix the ends.
+
+    fidelity: weight of staying near them; None: only the ends count.
+    """
+    for end in (given[0], given[-1]):
         outside = (end < model.x_range[:, 0]) | (end > model.x_range[:, 1])
         if outside.any():
             i = int(np.argmax(outside))
@@ -49,12 +88,12 @@ def plan_motion(
                 f"{model.x[i].name} {end[i]:g} is outside {model.x_range[i].tolist()}, where the "
                 "model has data"
             )
-    centre_u = model.u_range.mean(axis=1)
-    x: FloatArray = ends[0] + np.linspace(0.0, 1.0, steps + 1)[:, None] * (ends[1] - ends[0])
-    u: FloatArray = np.tile(centre_u, (steps, 1))
-    half = np.diff(model.x_range, axis=1)[:, 0] / 2
+    half, middle = np.diff(model.x_range, axis=1)[:, 0] / 2, model.x_range.mean(axis=1)
+    near = np.zeros_like(given) if fidelity is None else (given - middle) / half
+    pull = _Pull(near, NEARNESS if fidelity is None else fidelity)
+    x, u = given, np.tile(model.u_range.mean(axis=1), (len(given) - 1, 1))
     for _ in range(ITERATIONS):
-        x, u = _subproblem(model, x, u, ends, reserve)
+        x, u = _subproblem(model, x, u, (given[0], given[-1]), reserve, pull)
         defect = float(np.abs((x[1:] - model(x[:-1], u)) / half).max())
         if defect < SETTLED:
             return _rolled_out(model, x, u), u
@@ -62,7 +101,7 @@ def plan_motion(
 
 
 def tvlqr(
-    model: StateModel,
+    model: MeasuredState,
     x: FloatArray,
     u: FloatArray,
     *,
@@ -78,7 +117,7 @@ def tvlqr(
     return discrete_tvlqr(A, B, Q=Q, R=R, P_final=(P_final + P_final.T) / 2)
 
 
-def observer_gain(model: StateModel) -> FloatArray:
+def observer_gain(model: MeasuredState) -> FloatArray:
     """L (n, n) of x̂⁺ = f + L(y⁺ - f), Kalman's for the model's noise and disturbance.
 
     Linearised at the middle of the data box.
@@ -89,7 +128,7 @@ def observer_gain(model: StateModel) -> FloatArray:
     return np.asarray(np.linalg.solve(prior + R, prior).T)
 
 
-def track(model: StateModel, x: FloatArray, u: FloatArray, feedback: Feedback) -> TrackingPolicy:
+def track(model: MeasuredState, x: FloatArray, u: FloatArray, feedback: Feedback) -> TrackingPolicy:
     """The policy that follows a motion with this feedback and the model's observer."""
     return TrackingPolicy(
         x=x,
@@ -101,18 +140,19 @@ def track(model: StateModel, x: FloatArray, u: FloatArray, feedback: Feedback) -
     )
 
 
-def _rolled_out(model: StateModel, x: FloatArray, u: FloatArray) -> FloatArray:
+def _rolled_out(model: MeasuredState, x: FloatArray, u: FloatArray) -> FloatArray:
     """The model's own motion under u, so that no defect is left but rounding."""
     states = model.simulate(x[0], u)
     return states if np.isfinite(states).all() else x
 
 
 def _subproblem(
-    model: StateModel,
+    model: MeasuredState,
     x: FloatArray,
     u: FloatArray,
     ends: Sequence[FloatArray],
     reserve: float,
+    pull: "_Pull",
 ) -> tuple[FloatArray, FloatArray]:
     """The quadratic program linearised at (x, u), in unit variables of the box."""
     N, n, p = len(u), len(model), len(model.u)
@@ -139,10 +179,10 @@ def _subproblem(
     bound[free] = 2.0
     changes = sp.eye(N * p, format="csr")[p:] - sp.eye(N * p, format="csr")[:-p]
     cost = sp.eye(N * p) + SMOOTHNESS * N * (changes.T @ changes)
-    P = sp.block_diag([1e-3 * sp.eye((N + 1) * n), cost], format="csc")
+    P = sp.block_diag([pull.weight * sp.eye((N + 1) * n), cost], format="csc")
     program = ConeProgram(
         P=sp.csc_matrix(P),
-        q=np.concatenate([np.zeros((N + 1) * n), np.tile(mid_u / half_u, N)]),
+        q=np.concatenate([-pull.weight * pull.towards.ravel(), np.tile(mid_u / half_u, N)]),
         A=sp.vstack([*rows, pick, -pick], format="csc"),
         b=np.concatenate([*right, bound, bound]),
         cones=(Cone("zero", (N + 2) * n), Cone("nonnegative", 2 * size)),

@@ -7,6 +7,7 @@ the tube: where starts in the inlet get to. Every step of both is one semidefini
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -14,11 +15,15 @@ from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import proof_document, reach
 from nlsid_core.certificate.discrete_funnel import CHAINS, StepProof, disturbed, refuse_assumption
+from nlsid_core.certificate.implicit_reach import ImplicitStepProof
 from nlsid_core.discrete_funnel import DiscreteFunnel, DisturbanceAssumption
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.implicit_funnel import ImplicitFunnelStep
 from nlsid_core.funnels.motion import Feedback
 from nlsid_core.funnels.reach import Step
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.tracking_monitor import disturbance_of
 from nlsid_core.tracking_policy import TrackingPolicy
 from nlsid_core.trajectory import Dataset
@@ -31,18 +36,24 @@ BISECTIONS = 40
 SMALLEST = 1e-3  # of the box: below it no radius is worth having
 INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
 
+ROOTS = 3.0  # radii of the tube within which the roots of an implicit step are claimed
+
 Progress = Callable[[str, float], None]
+AnyProof: TypeAlias = StepProof | ImplicitStepProof
 
 
 @dataclass(frozen=True, eq=False)
 class FunnelDesign:
-    """A funnel, its policy and model, and the proof: T (N, n, n) and one step proof per sample."""
+    """A funnel, its policy and model, and the proof: T and one step proof per sample and chain.
 
-    model: StateModel
+    T: (N, n, n); of an implicit model (N + 1, n, n).
+    """
+
+    model: MeasuredState
     policy: TrackingPolicy
     funnel: DiscreteFunnel
     T: FloatArray
-    steps: Mapping[str, Sequence[StepProof]]
+    steps: Mapping[str, Sequence[AnyProof]]
 
     def proof_document(self, *, model: str, policy: str, funnel: str) -> Json:
         """The proof file's content; the arguments name the three files beside it."""
@@ -53,20 +64,15 @@ class FunnelDesign:
         }
         proof: Json = {"T": self.T.tolist()}
         for chain in CHAINS:
-            proof[chain] = [
-                {
-                    "reach": step.reach,
-                    "Q": step.Q[np.tril_indices(len(step.Q))].tolist(),
-                    "sigma": step.sigma[np.tril_indices(len(step.sigma))].tolist(),
-                }
-                for step in self.steps[chain]
-            ]
-        return proof_document({"kind": "discrete_funnel", "about": about}, proof)
+            proof[chain] = [step.document() for step in self.steps[chain]]
+        implicit = isinstance(self.model, TrapezoidalModel)
+        kind = "implicit_funnel" if implicit else "discrete_funnel"
+        return proof_document({"kind": kind, "about": about}, proof)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Norms and steps along a motion, before any radius: S, T = S⁻¹, the response's A, and caps.
+    """Norms along a motion, before any radius: S and T = S⁻¹ (N + 1), the response's A, and caps.
 
     cap: (N + 1,) the largest radius in the box of the data, policy's inputs included.
     """
@@ -77,7 +83,7 @@ class Frame:
     cap: FloatArray
 
 
-def frame(model: StateModel, policy: TrackingPolicy, feedback: Feedback) -> Frame:
+def frame(model: MeasuredState, policy: TrackingPolicy, feedback: Feedback) -> Frame:
     """The norms |S x̄|, S'S the LQR cost, and how far the box of the data lets them grow."""
     S = np.array([np.linalg.cholesky(P).T for P in feedback.P])
     T = np.array([np.triu(np.linalg.inv(s)) for s in S])
@@ -94,11 +100,11 @@ def frame(model: StateModel, policy: TrackingPolicy, feedback: Feedback) -> Fram
         cap.append(float((np.concatenate(room) / size).min()) * INSIDE_BOX)
     if min(cap) <= 0:
         raise Infeasible("the motion touches the box of the model's data; keep more in reserve")
-    return Frame(S, T[:-1], np.array(A), np.array(cap))
+    return Frame(S, T, np.array(A), np.array(cap))
 
 
 def design_state_funnel(
-    model: StateModel,
+    model: MeasuredState,
     policy: TrackingPolicy,
     feedback: Feedback,
     *,
@@ -122,16 +128,18 @@ def design_state_funnel(
             f"at sample {k} the disturbance alone ({assumption.bound:.3g}) fills the box of the "
             f"data ({norms.cap[k]:.3g}); record more widely, or disturb less"
         )
-    steps = [_DisturbedStep.at(model, policy, norms, k, assumption) for k in range(len(policy))]
+    steps = _steps(model, policy, norms, assumption)
     for k, step in enumerate(steps):
         cap[k] = step.largest(float(cap[k]))
     inlet, inlet_proof = _inlet(steps, cap, goal, progress)
+    implicit = isinstance(model, TrapezoidalModel)
+    roots = ROOTS * (inlet + assumption.widens)
     first = float(inlet[0]) if start is None else start
     if not 0 < first <= inlet[0]:
         raise DataError(
             f"start {first:.4g} should be positive and at most the inlet {inlet[0]:.4g}"
         )
-    tube, tube_proof = _tube(steps, first, progress)
+    tube, tube_proof = _tube(steps, first, roots, progress)
     funnel = DiscreteFunnel(
         S=norms.S,
         A=norms.A,
@@ -140,12 +148,14 @@ def design_state_funnel(
         assumption=assumption,
         model=policy.model,
         policy=_json.digest(policy.document()),
+        roots=roots if implicit else None,
     )
-    return FunnelDesign(model, policy, funnel, norms.T, {"tube": tube_proof, "inlet": inlet_proof})
+    T = norms.T if implicit else norms.T[:-1]
+    return FunnelDesign(model, policy, funnel, T, {"tube": tube_proof, "inlet": inlet_proof})
 
 
 def assume(
-    model: StateModel,
+    model: MeasuredState,
     policy: TrackingPolicy,
     feedback: Feedback,
     runs: Dataset,
@@ -221,7 +231,7 @@ class _DisturbedStep:
         kappa = reach.inflation(reach.rational(norms.S[k]) @ exact_T)
         return cls(Step(g), curvature, kappa, assumption)
 
-    def from_radius(self, radius: float) -> tuple[StepProof, float]:
+    def from_radius(self, radius: float, _roots: float) -> tuple[StepProof, float]:
         """The proof of one step from `radius`, and the radius it needs next."""
         proof = self.step.reach(reach.inflate(self.inflation, radius))
         added = disturbed(self.assumption, self.curvature, self.inflation, radius)
@@ -246,9 +256,32 @@ class _DisturbedStep:
         return low
 
 
+class FunnelStep(Protocol):
+    """One step of either kind of model."""
+
+    assumption: DisturbanceAssumption
+
+    def from_radius(self, radius: float, roots: float, /) -> tuple[AnyProof, float]:
+        """The proof from `radius`, next rates within `roots`, and the radius it needs next."""
+
+    def largest(self, cap: float) -> float:
+        """The largest radius up to `cap` at which the form's own condition holds."""
+
+
+def _steps(
+    model: MeasuredState, policy: TrackingPolicy, norms: Frame, a: DisturbanceAssumption
+) -> list[Any]:
+    if isinstance(model, TrapezoidalModel):
+        return [
+            ImplicitFunnelStep.at(model, policy, k, S=norms.S, T=norms.T, A=norms.A, assumption=a)
+            for k in range(len(policy))
+        ]
+    return [_DisturbedStep.at(model, policy, norms, k, a) for k in range(len(policy))]
+
+
 def _inlet(
-    steps: list[_DisturbedStep], cap: FloatArray, goal: float | None, progress: Progress
-) -> tuple[FloatArray, list[StepProof]]:
+    steps: list[FunnelStep], cap: FloatArray, goal: float | None, progress: Progress
+) -> tuple[FloatArray, list[AnyProof]]:
     """Backward: at each sample the largest radius whose step fits in the next one."""
     N = len(steps)
     radii, proofs = np.empty(N + 1), []
@@ -257,9 +290,10 @@ def _inlet(
     for k in range(N - 1, -1, -1):
         target = float(radii[k + 1])
         radius = min(target * growth, float(cap[k]))
-        best: tuple[float, StepProof] | None = None
+        roots = ROOTS * (target + steps[k].assumption.widens)
+        best: tuple[float, AnyProof] | None = None
         for _ in range(ATTEMPTS):
-            proof, needed = steps[k].from_radius(radius)
+            proof, needed = steps[k].from_radius(radius, roots)
             if needed <= target:
                 if best is None or radius > best[0]:
                     best = (radius, proof)
@@ -278,12 +312,12 @@ def _inlet(
 
 
 def _tube(
-    steps: list[_DisturbedStep], start: float, progress: Progress
-) -> tuple[FloatArray, list[StepProof]]:
+    steps: list[FunnelStep], start: float, roots: FloatArray, progress: Progress
+) -> tuple[FloatArray, list[AnyProof]]:
     """Forward: what each step needs is the next radius."""
     radii, proofs = [start], []
     for k, step in enumerate(steps):
-        proof, needed = step.from_radius(radii[-1])
+        proof, needed = step.from_radius(radii[-1], float(roots[k + 1]))
         radii.append(needed)
         proofs.append(proof)
         progress("tube", (k + 1) / len(steps))
@@ -294,7 +328,7 @@ def _gain(norms: Frame, rate: float) -> float:
     """c of E⁺ = rate·E + c|d|², with half of what the linear part leaves kept for curvature."""
     linear = max(
         float(np.linalg.norm(S @ A @ T, 2))
-        for S, A, T in zip(norms.S[1:], norms.A, norms.T, strict=True)
+        for S, A, T in zip(norms.S[1:], norms.A, norms.T[:-1], strict=True)
     )
     mu = (linear + np.sqrt(rate)) / 2
     if linear >= np.sqrt(rate):

@@ -1,7 +1,9 @@
-"""`identify_states`: a polynomial map of a measured state from repeats of the same excitations.
+"""`identify_states`: a polynomial model of a measured state from repeats of the same excitations.
 
 Noise in the regressors biases least squares. Repeats have independent noise, so the monomials of
-one repeat are instrumented by those of the mean of the others: Σ Z'(x⁺ - x - Φθ) = 0.
+one repeat are instrumented by those of the mean of the others: Σ Z'(x⁺ - x - Φθ) = 0. Of a map all
+states are fitted on the monomials at a sample; of a trapezoidal step the rates are, on the mean of
+the monomials at both its ends, so that the discretisation's error does not end up in θ.
 Source: the instrumental-variable method; repeats as in thesis Chapter 3.
 """
 
@@ -13,9 +15,11 @@ from math import comb
 import numpy as np
 
 from nlsid_core._types import FloatArray, IntArray
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, SolverError
 from nlsid_core.models import Signal
+from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.state_map import StateModel
+from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.trajectory import Dataset, Trajectory
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds
@@ -25,6 +29,7 @@ LEAST_DISTURBANCE = (
     0.1  # of the measurement noise: no model is so good that its robot may not change
 )
 REPEATED_INPUT = 1e-3  # relative; a driver may quantise, but repeats play the same inputs
+SHORTEST = 50  # samples of a stretch in the box worth simulating
 SLICES = 8  # of each variable's range, to say where a model class fails
 
 
@@ -36,7 +41,7 @@ class StateFit:
     diverged or was not determined). error: the chosen model's.
     """
 
-    model: StateModel
+    model: MeasuredState
     error: float
     errors: tuple[tuple[tuple[int, ...], float], ...]
 
@@ -48,13 +53,15 @@ def identify_states(
     degrees: Sequence[tuple[int, ...]] | None = None,
     refuse_above: float = REFUSED_ERROR,
     biased_without_repeats: bool = False,
+    implicit: bool = False,
 ) -> StateFit:
     """Fit x⁺ = f(x, u) to repeats; trajectories hold the measured state in y.
 
-    degrees: classes to try, the highest power of each of [x; u]; default `classes_to_try`. The
-    least free-run error on `validation` wins. biased_without_repeats: least squares on single
-    runs, for recordings that have no repeats. Raises DataError if there are none and that was not
-    asked for, or if no class describes the data to `refuse_above` %, saying where they fail.
+    implicit: a `TrapezoidalModel`, of states [q; v], instead of an explicit map. degrees: classes
+    to try, the highest power of each of [x; u]; default `classes_to_try`. The least free-run error
+    on `validation` wins. biased_without_repeats: least squares on single runs, for recordings that
+    have no repeats. Raises DataError if there are none and that was not asked for, or if no class
+    describes the data to `refuse_above` %, saying where they fail.
     """
     groups = list(train.repeats().values())
     if not groups and biased_without_repeats:
@@ -71,14 +78,14 @@ def identify_states(
         raise DataError(f"{(first.y_names + first.u_names)[int(np.argmin(scale))]} is always zero")
     best: StateFit | None = None
     tried: list[tuple[tuple[int, ...], float]] = []
-    for choice in degrees if degrees is not None else classes_to_try(n, p):
+    for choice in degrees if degrees is not None else classes_to_try(n, p, implicit=implicit):
         exponents = monomials_of(choice)
-        theta = _instrumented(groups, exponents, scale)
+        theta = _instrumented(groups, exponents, scale, implicit=implicit)
         if theta is None:
             tried.append((tuple(choice), np.inf))
             continue
-        model = _model(train, groups, exponents, theta, scale, data)
-        error = free_run_error(model, validation)
+        model = _model(train, groups, exponents, theta, scale, data, implicit=implicit)
+        error = free_run_error(model, validation, in_box=True)
         tried.append((tuple(choice), error))
         if best is None or error < USEFUL * best.error:
             best = StateFit(model, error, ())
@@ -91,33 +98,52 @@ def identify_states(
     return StateFit(best.model, best.error, tuple(tried))
 
 
-def classes_to_try(n: int, p: int) -> list[tuple[int, ...]]:
+def classes_to_try(n: int, p: int, *, implicit: bool = False) -> list[tuple[int, ...]]:
     """Degrees per variable, [positions; rates; inputs], small first, that a funnel can prove."""
     half = n // 2
     choices = []
     for position, rate in product((1, 3, 5), (1, 2, 3)):
-        if rate <= position and comb(n + position, n) <= LARGEST_GRAM:
+        # a step's square has twice the degree; implicitly it has more variables, not more degree
+        variables, degree = (n + half, (position + 1) // 2) if implicit else (n, position)
+        if rate <= position and comb(variables + degree, variables) <= LARGEST_GRAM:
             choices.append((position,) * half + (rate,) * (n - half) + (1,) * p)
     return choices
 
 
-def free_run_error(model: StateModel, dataset: Dataset) -> float:
-    """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread."""
+def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = False) -> float:
+    """Worst 100·|x - x̂|/|x - mean(x)| of the trajectories, each state in units of its spread.
+
+    in_box: only of the stretches in the box of the model's data, each from its measured start;
+    outside it the model is not a claim about anything. Infinite if it diverges or nothing is left.
+    """
     errors = []
     for trial in dataset:
-        states = model.simulate(trial.y[0], trial.u[:-1])
-        spread = trial.y.std(axis=0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            missed = float(np.linalg.norm((trial.y - states) / spread))
-        whole = float(np.linalg.norm((trial.y - trial.y.mean(axis=0)) / spread))
-        errors.append(100.0 * missed / whole if np.isfinite(missed) else np.inf)
-    return max(errors)
+        spread, mean = trial.y.std(axis=0), trial.y.mean(axis=0)
+        missed = whole = 0.0
+        for part in _stretches(model, trial) if in_box else [slice(0, len(trial))]:
+            y, u = trial.y[part], trial.u[part]
+            with np.errstate(over="ignore", invalid="ignore"):
+                missed += float(np.sum(((y - model.simulate(y[0], u[:-1])) / spread) ** 2))
+            whole += float(np.sum(((y - mean) / spread) ** 2))
+        if whole:
+            errors.append(100.0 * np.sqrt(missed / whole) if np.isfinite(missed) else np.inf)
+    return float(max(errors, default=np.inf))
 
 
-def where_it_fails(model: StateModel, dataset: Dataset) -> str:
+def _stretches(model: MeasuredState, trial: Trajectory) -> list[slice]:
+    """Where the trajectory stays in the box of the model's data for SHORTEST samples or more."""
+    outside = (trial.y < model.x_range[:, 0]) | (trial.y > model.x_range[:, 1])
+    ends = [-1, *np.flatnonzero(outside.any(axis=1)).tolist(), len(trial)]
+    return [slice(a + 1, b) for a, b in pairwise(ends) if b - a > SHORTEST]
+
+
+def where_it_fails(model: MeasuredState, dataset: Dataset) -> str:
     """The slice of a variable in which one step ahead is worst, in words."""
     points = np.concatenate([np.hstack([t.y[:-1], t.u[:-1]]) for t in dataset])
-    missed = np.concatenate([t.y[1:] - model(t.y[:-1], t.u[:-1]) for t in dataset])
+    try:
+        missed = np.concatenate([t.y[1:] - model(t.y[:-1], t.u[:-1]) for t in dataset])
+    except SolverError:
+        return "some of its steps have no solution"
     size = np.sqrt(np.mean((missed / missed.std(axis=0)) ** 2, axis=1))
     worst, words = 0.0, ""
     for j, signal in enumerate((*model.x, *model.u)):
@@ -155,20 +181,30 @@ def features(exponents: IntArray, points: FloatArray) -> FloatArray:
 
 
 def _instrumented(
-    groups: Sequence[Sequence[Trajectory]], exponents: IntArray, scale: FloatArray
+    groups: Sequence[Sequence[Trajectory]],
+    exponents: IntArray,
+    scale: FloatArray,
+    *,
+    implicit: bool,
 ) -> FloatArray | None:
-    """θ (m, n) of x⁺ - x in scaled monomials; None if the excitation does not determine it."""
+    """θ of x⁺ - x (m, n), or of v⁺ - v (m, n/2), in scaled monomials; None if undetermined."""
     m, n = len(exponents), groups[0][0].y.shape[1]
-    moments, target = np.zeros((m, m)), np.zeros((m, n))
+    fitted = slice(n // 2, n) if implicit else slice(n)
+    moments, target = np.zeros((m, m)), np.zeros((m, len(range(n)[fitted])))
+
+    def monomials_at(y: FloatArray, u: FloatArray) -> FloatArray:
+        now = features(exponents, np.hstack([y[:-1], u]) / scale)
+        if not implicit:
+            return now
+        return np.asarray((now + features(exponents, np.hstack([y[1:], u]) / scale)) / 2)
+
     for members in groups:
         total = np.sum([member.y for member in members], axis=0)
         for member in members:
             others = (total - member.y) / (len(members) - 1) if len(members) > 1 else total
-            u = member.u[:-1]
-            instruments = features(exponents, np.hstack([others[:-1], u]) / scale)
-            regressors = features(exponents, np.hstack([member.y[:-1], u]) / scale)
-            moments += instruments.T @ regressors
-            target += instruments.T @ np.diff(member.y, axis=0)
+            instruments = monomials_at(others, member.u[:-1])
+            moments += instruments.T @ monomials_at(member.y, member.u[:-1])
+            target += instruments.T @ np.diff(member.y[:, fitted], axis=0)
     solution, _, rank, _ = np.linalg.lstsq(moments, target, rcond=None)
     return np.asarray(solution) if rank == m else None
 
@@ -180,11 +216,15 @@ def _model(
     theta: FloatArray,
     scale: FloatArray,
     data: FloatArray,
-) -> StateModel:
+    *,
+    implicit: bool,
+) -> MeasuredState:
     first = groups[0][0]
     n = first.y.shape[1]
     coefficients = theta / np.prod(scale**exponents, axis=1)[:, None]
-    for i in range(n):
+    if implicit:
+        coefficients = coefficients / train.period
+    for i in range(0 if implicit else n):
         unit = (exponents == np.eye(exponents.shape[1], dtype=np.int64)[i]).all(axis=1)
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
@@ -196,7 +236,8 @@ def _model(
             (first.u_names, first.u_units, first.u_paths),
         )
     ]
-    model = StateModel(
+    make = TrapezoidalModel if implicit else StateModel
+    model: MeasuredState = make(
         exponents=exponents,
         coefficients=coefficients,
         period=train.period,
@@ -223,7 +264,9 @@ def noise_between(groups: Sequence[Sequence[Trajectory]]) -> FloatArray:
     return spread
 
 
-def _with_disturbance(model: StateModel, groups: Sequence[Sequence[Trajectory]]) -> StateModel:
+def _with_disturbance(
+    model: MeasuredState, groups: Sequence[Sequence[Trajectory]]
+) -> MeasuredState:
     """What one step misses on the mean of the repeats, less what the noise left in it explains."""
     squares, noise = [], []
     for members in groups:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 import rclpy
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -17,7 +19,7 @@ from rclpy.node import Node
 from tests.ros.domains import fresh_domain
 
 ROOT = Path(__file__).parents[2]
-STARTED = 15.0  # s: patience with a process or with discovery on a busy machine
+STARTED = 60.0  # s: patience with a process or with discovery on a busy machine
 
 ros_test = [
     pytest.mark.ros,
@@ -87,3 +89,26 @@ def node_here(name: str) -> Iterator[tuple[Node, Callable[[Callable[[], bool]], 
         executor.shutdown()
         node.destroy_node()
         context.try_shutdown()
+
+
+def set_parameter(
+    node: Node,
+    spin_until: Callable[[Callable[[], bool]], None],
+    name: str,
+    key: str,
+    value: float | str,
+) -> str:
+    """Change a parameter of a running node; why it was refused, empty if it was not."""
+    client = node.create_client(SetParameters, f"/{name}/set_parameters")
+    spin_until(client.service_is_ready)
+    if isinstance(value, str):
+        wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
+    else:
+        wanted = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    answer = client.call_async(
+        SetParameters.Request(parameters=[Parameter(name=key, value=wanted)])
+    )
+    spin_until(answer.done)
+    [result] = answer.result().results
+    node.destroy_client(client)
+    return "" if result.successful else str(result.reason)

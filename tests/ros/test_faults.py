@@ -1,8 +1,9 @@
 """What goes wrong on a robot, done to the monitor and the recorder over DDS."""
 
 import math
+import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,115 +11,22 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
-from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
-from bags.samples import f1tenth
+from benchmarks.monitor import COMMAND, STATE, timing_funnel
 from nlsid_core import _json
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
 
-MONITOR = "nlsid_ros.funnel_monitor"
-PERIOD_NS = 25_000_000
-Spin = Callable[[Callable[[], bool]], None]
-
-
-class Robot:
-    """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
-
-    def __init__(self, node: Node, spin_until: Spin, folder: Path) -> None:
-        self.node, self.spin_until = node, spin_until
-        self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
-        self.latched: dict[str, Publisher] = {}
-        self.texts: dict[str, str] = {}
-        for role in ("model", "policy", "funnel"):
-            self.latched[role] = node.create_publisher(
-                String, f"/funnel_publisher/{role}", qos.DOCUMENT
-            )
-            self.texts[role] = (folder / f"{role}.json").read_text()
-            self.latched[role].publish(String(data=self.texts[role]))
-        self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
-        self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
-        self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
-
-    def _hear(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            values = {pair.key: pair.value for pair in status.values}
-            self.said.setdefault(status.name, []).append((status.message, values))
-
-    def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
-        """Whether `node` has said `text`."""
-        return any(text in said for said, _ in self.said.get(node, []))
-
-    def ready(self, monitors: int = 1) -> None:
-        """Wait until the monitors listen."""
-        self.spin_until(lambda: self.odom.get_subscription_count() >= monitors)
-        self.spin_until(lambda: self.command.get_subscription_count() >= monitors)
-
-    def restart(self) -> None:
-        """Begin a new run."""
-        self.ready()
-        client = self.node.create_client(Trigger, "/funnel_monitor/restart")
-        self.spin_until(client.service_is_ready)
-        self.said.clear()
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        self.spin_until(lambda: self.has_said("restarted"))
-        self.node.destroy_client(client)
-
-    def drive(
-        self,
-        samples: list[int],
-        *,
-        speed: float = 0.0,
-        odom: Publisher | None = None,
-        shift_ns: int = 0,
-        slower: float = 1.0,
-        clock: bool = False,
-    ) -> None:
-        """Samples by index, at 40 Hz by their stamps whatever these are."""
-        base = 10**18 + shift_ns
-        for k in samples:
-            command, state = TwistStamped(), Odometry()
-            for message in (command, state):
-                stamp = message.header.stamp
-                stamp.sec, stamp.nanosec = divmod(base + k * PERIOD_NS, 10**9)
-            state.twist.twist.linear.x = speed
-            if clock:
-                self.clock.publish(Clock(clock=state.header.stamp))
-            self.command.publish(command)
-            (odom or self.odom).publish(state)
-            due = time.monotonic() + slower * PERIOD_NS * 1e-9
-            self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
-
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's files."""
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out
-
-
-@pytest.fixture(scope="module")
-def robot(folder: Path) -> Iterator[Robot]:
+def robot(funnel: Path) -> Iterator[Robot]:
     """One robot with one monitor, which each test restarts."""
     with pytest.MonkeyPatch.context() as patch:
         use_domain_of_this_run(patch)
@@ -126,11 +34,8 @@ def robot(folder: Path) -> Iterator[Robot]:
             node_here("test_robot") as (node, spin_until),
             process(MONITOR, stale_after=0.5) as monitor,
         ):
-            yield Robot(node, spin_until, folder)
+            yield Robot(node, spin_until, funnel.parent)
             stop(monitor)
-
-
-GOOD = list(range(10))
 
 
 @pytest.mark.parametrize(
@@ -278,14 +183,59 @@ def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robo
     assert "RELIABILITY" in output
 
 
-def test_a_parameter_cannot_be_changed_under_a_running_monitor(robot: Robot) -> None:
-    robot.ready()
-    client = robot.node.create_client(SetParameters, "/funnel_monitor/set_parameters")
-    robot.spin_until(client.service_is_ready)
-    value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=-1.0)
-    request = SetParameters.Request(parameters=[Parameter(name="stale_after", value=value)])
-    answer = client.call_async(request)
-    robot.spin_until(answer.done)
-    [result] = answer.result().results
-    assert not result.successful
-    assert "stale_after" in result.reason
+@pytest.mark.parametrize("role", ["response", "excitation"])
+def test_an_array_of_another_length_is_named_and_ends_the_run(
+    monkeypatch: pytest.MonkeyPatch, role: str
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    said: list[str] = []
+
+    def hear(message: DiagnosticArray) -> None:
+        said.extend(status.message for status in message.status)
+
+    design = timing_funnel(1.0)
+    with (
+        node_here("test_joints") as (node, spin_until),
+        process(MONITOR, source="/benchmark", stale_after=5.0) as monitor,
+    ):
+        for document in ("model", "policy", "funnel"):
+            latched = node.create_publisher(String, f"/benchmark/{document}", qos.DOCUMENT)
+            text = _json.canonical(getattr(design, document).document()).decode()
+            latched.publish(String(data=text))
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
+        state, command = (
+            node.create_publisher(JointState, path.partition(":")[0], qos.STREAM)
+            for path in (STATE, COMMAND)
+        )
+        spin_until(lambda: min(p.get_subscription_count() for p in (state, command)) == 1)
+
+        def send(samples: range, *, short: str = "") -> None:
+            for k in samples:
+                for publisher, whose in ((command, "excitation"), (state, "response")):
+                    message = JointState(position=[] if whose == short else [0.0])
+                    message.header.stamp.sec, message.header.stamp.nanosec = 7, k * 10**6
+                    publisher.publish(message)
+
+        send(range(10))
+        spin_until(lambda: "inside" in said)
+        send(range(10, 11), short=role)
+        spin_until(lambda: any("'position' has 0 elements" in text for text in said))
+        count = len(said)
+        send(range(11, 20))
+        spin_until(lambda: len(said) > count + 1)  # a heartbeat or two
+        assert not [text for text in said[count:] if not text.startswith("unknown")]
+        stop(monitor)
+
+
+def test_discovery_is_kept_to_this_machine_and_to_one_domain_per_test(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    domains = set()
+    for _ in range(3):
+        use_domain_of_this_run(monkeypatch)
+        assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+        domains.add(os.environ["ROS_DOMAIN_ID"])
+        with node_here("test_elsewhere") as (node, spin_until):
+            spin_until(lambda: True)
+            assert node.get_node_names() == ["test_elsewhere"]
+    assert len(domains) == 3

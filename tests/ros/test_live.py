@@ -8,9 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.monitoring import documents
 from bags.samples import f1tenth
 from tests.ros.domains import fresh_domain
@@ -18,16 +15,6 @@ from tests.ros.domains import fresh_domain
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The F1TENTH chain's funnel.json, with everything it needs beside it."""
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
 
 
 @pytest.fixture
@@ -81,14 +68,3 @@ def test_the_publisher_refuses_what_is_not_proved(
     )  # fmt: skip
     assert done.returncode == 1
     assert "not published, not proved" in done.stderr + done.stdout
-
-
-def test_the_monitor_reads_unknown_when_the_state_stops_coming(
-    funnel: Path, environment: dict[str, str]
-) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.ros.listen_stale", str(funnel)],
-        capture_output=True, text=True, env=environment, timeout=100, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "unknown: no speed for 0.1 s" in done.stdout

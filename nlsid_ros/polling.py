@@ -1,10 +1,9 @@
-"""Subscriptions that take everything that has arrived, in one go.
+"""Subscriptions that are taken from a timer, everything that has arrived in one go.
 
 rclpy's executor builds a wait set of all the node's entities each time it wakes, which costs as
-much as taking a hundred messages. `subscribe` wakes for a message and then takes all there are, so
-a node that has fallen behind catches up; `Polled` subscriptions do not wake the node at all and are
-taken from a timer, for those that only keep what comes. Their events are polled too: in a wait set
-an event wakes the node at every message of its topic.
+much as taking a hundred messages. For a node that only keeps what comes, `Polled` subscriptions do
+not wake it at all. Their events are polled too: in a wait set an event wakes the node at every
+message of its topic.
 """
 
 from collections.abc import Callable
@@ -21,24 +20,6 @@ from rclpy.subscription import Subscription
 BATCH = 200  # messages in one go; then timers and services get their turn
 
 Received = Callable[[Any, dict[str, int]], None]
-
-
-def subscribe(
-    node: Node, kind: Any, topic: str, callback: Received, profile: QoSProfile
-) -> Subscription:
-    """As `node.create_subscription`, for a callback that takes a message and its info."""
-
-    def take_all(message: Any, info: dict[str, int]) -> None:
-        callback(message, info)
-        take(subscription, callback)
-
-    subscription: Subscription = node.create_subscription(
-        kind,
-        topic,
-        take_all,  # type: ignore[arg-type]
-        profile,
-    )
-    return subscription
 
 
 def take(subscription: Subscription, callback: Received, most: int = BATCH) -> int:

@@ -1,0 +1,113 @@
+"""A shipped launch file without ROS launch: its nodes as processes, started and ended together.
+
+`launch/*.launch.xml` is what `ros2 launch` reads, so that each workflow is written down once. Of
+its language this knows what those files use: arg, node, param, remap, `$(var NAME)` and `if`.
+"""
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from nlsid_core.errors import DataError
+
+LOOK = 0.2  # s between looks at whether all still run
+PATIENCE = 20.0  # s for a node to end when asked to
+_VARIABLE = re.compile(r"\$\(var (\w+)\)")
+
+
+@dataclass(frozen=True)
+class Argument:
+    """What a launch file can be told; default None: it has to be."""
+
+    name: str
+    default: str | None
+    description: str
+
+
+class LaunchFile:
+    """One workflow's arguments and nodes. Raises DataError if the file uses more than is known."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        root = ElementTree.parse(path).getroot()
+        self.arguments = [
+            Argument(arg.attrib["name"], arg.get("default"), arg.get("description", ""))
+            for arg in root.iter("arg")
+        ]
+        self._nodes = list(root.iter("node"))
+        unknown = {child.tag for child in root} - {"arg", "node"}
+        unknown |= {child.tag for node in self._nodes for child in node} - {"param", "remap"}
+        if unknown:
+            raise DataError(f"{path}: <{'>, <'.join(sorted(unknown))}> is for `ros2 launch` only")
+
+    def commands(self, given: Sequence[str]) -> list[list[str]]:
+        """A command line per node, for arguments written NAME:=VALUE.
+
+        Raises DataError if one is not known or a necessary one is missing.
+        """
+        values = self._values(given)
+        wanted = (n for n in self._nodes if _filled(n.get("if", "true"), values).lower() == "true")
+        return [_command(node, values) for node in wanted]
+
+    def _values(self, given: Sequence[str]) -> dict[str, str]:
+        values = {a.name: a.default for a in self.arguments}
+        for text in given:
+            name, assigned, value = text.partition(":=")
+            if not assigned or name not in values:
+                raise DataError(f"'{text}' is not one of the arguments of {self}")
+            values[name] = value
+        found = {name: value for name, value in values.items() if value is not None}
+        missing = values.keys() - found.keys()
+        if missing:
+            raise DataError(f"{', '.join(sorted(missing))} missing; the arguments of {self}")
+        return found
+
+    def __str__(self) -> str:
+        lines = [
+            f"  {a.name}:={'...' if a.default is None else a.default}  {a.description}"
+            for a in self.arguments
+        ]
+        return "\n".join([f"{self.path.name} are", *lines])
+
+
+def run_together(commands: Sequence[Sequence[str]]) -> int:
+    """Run until SIGINT or until one ends, then end all; the worst of their exit statuses."""
+    running = [subprocess.Popen(command) for command in commands]
+    try:
+        while all(process.poll() is None for process in running):
+            time.sleep(LOOK)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for process in running:
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(timeout=PATIENCE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+    return max(abs(process.wait()) for process in running)
+
+
+def _command(node: Element, values: Mapping[str, str]) -> list[str]:
+    def filled(element: Element, attribute: str) -> str:
+        return _filled(element.attrib[attribute], values)
+
+    renamed = [("__node", filled(node, "name")), ("__ns", filled(node, "namespace"))]
+    renamed += [(filled(each, "from"), filled(each, "to")) for each in node.iter("remap")]
+    settings = [part for old, new in renamed for part in ("-r", f"{old}:={new}")]
+    for each in node.iter("param"):
+        settings += ["-p", f"{filled(each, 'name')}:={filled(each, 'value')}"]
+    return [sys.executable, "-m", f"nlsid_ros.{filled(node, 'exec')}", "--ros-args", *settings]
+
+
+def _filled(text: str, values: Mapping[str, str]) -> str:
+    return _VARIABLE.sub(lambda match: values[match[1]], text)

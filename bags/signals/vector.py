@@ -1,0 +1,54 @@
+"""`SignalVector`: several signals of one topic, read and written as one vector."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rosbags.typesys.store import Typestore
+
+from bags.signals.signal import SignalPath
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import BagError
+
+
+@dataclass(frozen=True)
+class SignalVector:
+    """Signals in the messages of one topic, such as all positions and rates of a JointState."""
+
+    paths: tuple[SignalPath, ...]
+
+    @classmethod
+    def parse(cls, texts: Iterable[str]) -> "SignalVector":
+        """Read each `topic:field.path[index]`; BagError if they are not all on one topic."""
+        paths = tuple(SignalPath.parse(text) for text in texts)
+        topics = {path.topic for path in paths}
+        if len(topics) != 1:
+            raise BagError(
+                f"live and replayed samples come from one topic, not {', '.join(sorted(topics))}; "
+                "publish the whole state in one message"
+            )
+        return cls(paths)
+
+    def __str__(self) -> str:
+        fields = [str(path).removeprefix(f"{self.topic}:") for path in self.paths]
+        return f"{self.topic}:{', '.join(fields)}"
+
+    @property
+    def topic(self) -> str:
+        """The one topic."""
+        return self.paths[0].topic
+
+    def check(self, msgtype: str, types: Typestore) -> None:
+        """BagError unless messages of `msgtype` have a number at each."""
+        for path in self.paths:
+            path.check(msgtype, types)
+
+    def value(self, message: Any) -> FloatArray:
+        """The numbers in a decoded message; BagError as `SignalPath.value`."""
+        return np.array([path.value(message) for path in self.paths])
+
+    def assign(self, message: Any, values: FloatArray) -> None:
+        """Put the numbers in a decoded message; BagError as `SignalPath.assign`."""
+        for path, value in zip(self.paths, values, strict=True):
+            path.assign(message, float(value))

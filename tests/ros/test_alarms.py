@@ -1,0 +1,113 @@
+"""What an alarm does: it comes at once, says what it knows, and calls for help once."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from std_srvs.srv import Trigger
+
+from tests.ros.processes import (
+    node_here,
+    process,
+    ros_test,
+    set_parameter,
+    stop,
+    use_domain_of_this_run,
+)
+from tests.ros.robot import GOOD, MONITOR, Robot
+
+pytestmark = ros_test
+
+
+def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    slow: dict[str, object] = {"hysteresis": 1.0, "clear_after": 60.0, "stale_after": 5.0}
+    with node_here("test_robot") as (node, spin_until), process(MONITOR, **slow) as monitor:
+        robot = Robot(node, spin_until, funnel.parent)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        robot.drive([10], speed=1e3)
+        robot.spin_until(lambda: robot.has_said("outside"))
+        robot.said.clear()
+        robot.drive([11, 12, 13, 14])
+        settled = time.monotonic() + 1.5
+        robot.spin_until(lambda: time.monotonic() > settled)
+        assert not robot.has_said("inside")
+        assert not robot.has_said("warning")
+        texts, values = robot.said["funnel_monitor"][-1]
+        assert texts.startswith("outside")
+        assert {"margin", "worst axis", "budget spent", "time to exit [s]"} <= values.keys()
+        stop(monitor)
+
+
+def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0}
+    with node_here("test_robot") as (node, spin_until), process(MONITOR, **wary) as monitor:
+        robot = Robot(node, spin_until, funnel.parent)
+        robot.ready()
+        robot.drive(GOOD, speed=0.001)
+        robot.spin_until(lambda: robot.has_said("warning"))
+        assert not robot.has_said("inside")
+        assert set_parameter(node, spin_until, "funnel_monitor", "warning_margin", 0.0) == ""
+        robot.drive([10, 11, 12], speed=0.001)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        stop(monitor)
+
+
+def test_an_alarm_calls_the_services_it_was_given_once(
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    called: list[str] = []
+
+    def answer(name: str) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            called.append(name)
+            response.success = True
+            return response
+
+        return serve
+
+    services: dict[str, object] = {"stop_service": "/halt", "snapshot_service": "/keep"}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, **services) as monitor,
+    ):
+        for name in ("/halt", "/keep"):
+            node.create_service(Trigger, name, answer(name))
+        robot = Robot(node, spin_until, funnel.parent)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside"))
+        assert not called
+        robot.drive([10, 11, 12], speed=1e3)
+        robot.spin_until(lambda: len(called) == 2)
+        robot.drive([13, 14, 15], speed=1e3)
+        assert sorted(called) == ["/halt", "/keep"]
+        stop(monitor)
+
+
+def test_an_alarm_with_nobody_to_call_says_so(
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, stop_service="/nobody") as monitor,
+    ):
+        robot = Robot(node, spin_until, funnel.parent)
+        robot.ready()
+        robot.drive(GOOD)
+        robot.drive([10, 11], speed=1e3)
+        robot.spin_until(lambda: robot.has_said("outside"))
+        assert "/nobody is not there to be called" in stop(monitor)

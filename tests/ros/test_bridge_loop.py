@@ -1,0 +1,26 @@
+"""Plant, controller, recorder and monitor as nodes on a discrete funnel of an identified model."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")
+
+from benchmarks.bridge_live import design_swing, live
+from tests.ros.processes import ros_test, use_domain_of_this_run
+
+pytestmark = [*ros_test, pytest.mark.slow]
+
+
+def test_live_verdicts_on_an_identified_robot_equal_the_replay_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    result = live(design_swing(tmp_path), tmp_path / "bag", seconds=8.0)
+    assert result.runs == result.replayed >= 3
+    assert result.judged == result.expected > 200
+    assert result.live_equals_replay
+    assert result.flagged_runs == 1
+    assert 0 < result.push_detect_ms < 100
+    assert "disturbance response" in result.alarm

@@ -1,0 +1,157 @@
+"""The controller over DDS: its rate, its announcement, its limits, and all that makes it stop."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags.monitoring import documents
+from bags.monitoring.announcement import Run
+from nlsid_core import _json
+from nlsid_ros import qos
+from nlsid_ros.messages import stamp_ns_of
+from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+
+pytestmark = ros_test
+
+CONTROLLER = "nlsid_ros.tracking_controller"
+PERIOD_NS = 25_000_000
+STOP_RATE = 2.0
+
+
+class Stage:
+    """A controller that tracks, on the simulated plant, and what is heard of it."""
+
+    def __init__(self, stack: ExitStack, funnel: Path, **settings: object) -> None:
+        self.commands: list[tuple[int, float]] = []
+        self.said: list[str] = []
+        self.monitor: list[str] = []
+        self.node, self.spin_until = stack.enter_context(node_here("test_operator"))
+        self.node.create_subscription(TwistStamped, "/cmd_vel", self._hear, qos.STREAM)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear_said, qos.EVENTS)
+        self.publisher = stack.enter_context(process("nlsid_ros.funnel_publisher", funnel=funnel))
+        self.plant = stack.enter_context(
+            process("nlsid_ros.plant", model=funnel.with_name(documents.MODEL))
+        )
+        given = {"highest": 0.4, "stop_rate": STOP_RATE, "stale_after": 1.0} | settings
+        self.controller = stack.enter_context(process(CONTROLLER, **given))
+        self.spin_until(lambda: self.has_said("idle"))
+        self.spin_until(lambda: self.node.count_subscribers("/odom") >= 1)
+
+    def _hear(self, message: TwistStamped) -> None:
+        self.commands.append((stamp_ns_of(message), message.twist.linear.x))
+
+    def _hear_said(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            heard = {"tracking_controller": self.said, "funnel_monitor": self.monitor}
+            heard.get(status.name, []).append(status.message)
+
+    def has_said(self, text: str) -> bool:
+        """Whether the controller has said `text`."""
+        return any(text in said for said in self.said)
+
+    def call(self, service: str) -> Trigger.Response:
+        """The answer of a service of the controller."""
+        client = self.node.create_client(Trigger, f"/tracking_controller/{service}")
+        self.spin_until(client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        self.spin_until(answer.done)
+        response: Trigger.Response = answer.result()
+        return response
+
+    def track(self, above: float = 0.1) -> None:
+        """Begin, and wait until the robot is well on its way."""
+        assert self.call("start").success
+        self.spin_until(lambda: bool(self.commands) and self.commands[-1][1] > above)
+
+    def expect_ramp_down(self, because: str) -> None:
+        """It says why it stops, and comes to rest no faster than allowed."""
+        self.spin_until(lambda: self.has_said(f"idle; stopped: {because}"))
+        self.spin_until(lambda: self.commands[-1][1] == 0.0)
+        falling = np.diff([u for _, u in self.commands])
+        assert falling.min() >= -STOP_RATE * PERIOD_NS * 1e-9 * (1 + 1e-9)
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Callable[..., Stage]]:
+    """Sets a stage with parameters of the controller."""
+    use_domain_of_this_run(monkeypatch)
+    with ExitStack() as stack:
+        yield lambda **settings: Stage(stack, funnel, **settings)
+
+
+def test_commands_come_at_the_models_rate_and_the_start_is_announced_latched(
+    stage: Callable[..., Stage], funnel: Path
+) -> None:
+    runs: list[String] = []
+    robot = stage()
+    robot.track()
+    robot.node.create_subscription(String, "/tracking_controller/run", runs.append, qos.DOCUMENT)
+    robot.spin_until(lambda: len(runs) == 1)
+    run = Run.from_document(_json.parse_document(runs[0].data, source="run"))
+    assert run.funnel == _json.digest(_json.load_document(funnel))
+    stamps = np.array([stamp for stamp, _ in robot.commands])
+    assert run.start_ns > stamps[0]
+    assert (run.start_ns - stamps[0]) % PERIOD_NS == PERIOD_NS // 4, "a quarter period ahead"
+    assert set(np.diff(stamps)) == {PERIOD_NS}
+    assert not robot.call("start").success, "one run at a time"
+    assert robot.call("stop").success
+    robot.expect_ramp_down("asked to")
+
+
+def test_a_robot_that_falls_silent_is_stopped(stage: Callable[..., Stage]) -> None:
+    robot = stage(stale_after=0.3)
+    robot.track()
+    robot.plant.kill()
+    robot.expect_ramp_down("the response stopped coming")
+
+
+def test_a_state_that_is_no_number_stops_it(stage: Callable[..., Stage]) -> None:
+    robot = stage()
+    robot.track()
+    second = robot.node.create_publisher(Odometry, "/odom", qos.STREAM)
+    robot.spin_until(lambda: second.get_subscription_count() >= 1)
+    message = Odometry()
+    message.twist.twist.linear.x = math.nan
+    second.publish(message)
+    robot.expect_ramp_down("speed is nan")
+
+
+def test_a_funnel_replaced_in_mid_run_stops_it(stage: Callable[..., Stage], funnel: Path) -> None:
+    robot = stage()
+    robot.track()
+    latched = robot.node.create_publisher(String, "/funnel_publisher/funnel", qos.DOCUMENT)
+    robot.spin_until(lambda: latched.get_subscription_count() >= 1)
+    latched.publish(String(data=funnel.read_text()))
+    robot.expect_ramp_down("the funnel was replaced")
+
+
+def test_limits_hold_and_what_they_cut_off_is_not_the_policy_any_more(
+    stage: Callable[..., Stage],
+) -> None:
+    robot = stage(highest=0.2)
+    watching = {
+        "nominal": "profile",
+        "controller": "tracking_controller",
+        "stop_service": "tracking_controller/stop",
+        "command_wait": 0.5,
+        "stale_after": 1.0,
+    }
+    with process("nlsid_ros.funnel_monitor", **watching) as monitor:
+        robot.spin_until(lambda: any("waiting for the controller" in s for s in robot.monitor))
+        assert robot.call("start").success
+        robot.spin_until(lambda: any("is not the policy's" in said for said in robot.monitor))
+        robot.expect_ramp_down("asked to")
+        stop(monitor)
+    assert max(u for _, u in robot.commands) == pytest.approx(0.2)

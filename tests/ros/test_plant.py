@@ -1,0 +1,137 @@
+"""The simulated robots over DDS: real time, noise, delay, pushes, and what they refuse."""
+
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from nlsid_core._types import FloatArray
+from nlsid_ros import qos
+from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
+
+pytestmark = ros_test
+MUJOCO = pytest.mark.skipif(
+    subprocess.run([sys.executable, "-c", "import mujoco"], check=False).returncode != 0,
+    reason="needs the extra `sim`",
+)
+
+
+@pytest.fixture(autouse=True)
+def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_domain_of_this_run(monkeypatch)
+
+
+class Ear:
+    """Joint states by stamp (s since the first), and how old they were on arrival."""
+
+    def __init__(self) -> None:
+        self.t: list[float] = []
+        self.states: list[FloatArray] = []
+        self.ages: list[float] = []
+
+    def hear(self, message: JointState, now_ns: int) -> None:
+        """One sample."""
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        self.t.append(stamp_ns / 1e9)
+        self.states.append(np.array([*message.position, *message.velocity]))
+        self.ages.append((now_ns - stamp_ns) / 1e9)
+
+
+def heard(
+    samples: int, *, torque: list[float] | None = None, pushed: bool = False, **parameters: object
+) -> Ear:
+    """The first `samples` of a plant after it was given a torque or a push."""
+    ear = Ear()
+    with ExitStack() as stack:
+        node, spin_until = stack.enter_context(node_here("test_ear"))
+        clock = node.get_clock()
+        node.create_subscription(
+            JointState, "/joint_states", lambda m: ear.hear(m, clock.now().nanoseconds), qos.STREAM
+        )
+        commands = node.create_publisher(JointState, "/joint_commands", qos.STREAM)
+        pushing = node.create_client(Trigger, "/plant/push")
+        stack.enter_context(process("nlsid_ros.plant", **parameters))
+        spin_until(lambda: len(ear.t) > 10 and commands.get_subscription_count() == 1)
+        if torque is not None:
+            message = JointState(effort=torque)
+            message.header.stamp = clock.now().to_msg()
+            commands.publish(message)
+        if pushed:
+            spin_until(pushing.service_is_ready)
+            spin_until(pushing.call_async(Trigger.Request()).done)
+        before = len(ear.t)
+        spin_until(lambda: len(ear.t) >= before + samples)
+    return ear
+
+
+def test_a_pendulum_runs_on_an_exact_grid_in_real_time_and_answers_a_torque() -> None:
+    ear = heard(80, torque=[0.5], kind="pendulum", noise=0.001, rate_noise=0.01)
+    np.testing.assert_allclose(np.diff(ear.t), 0.01, atol=1e-6)
+    states = np.array(ear.states)
+    assert 5e-4 < states[:10, 0].std() < 2e-3
+    assert float(np.max(states[:, 0])) > 0.08  # towards 0.5 / (9.81 * 0.5) rad
+    assert sorted(ear.ages)[len(ear.ages) // 2] < 0.1  # a busy machine may be late, but it keeps up
+
+
+@MUJOCO
+@pytest.mark.parametrize(("robot", "joints"), [("pendulum", 1), ("arm", 2)])
+def test_a_mujoco_robot_publishes_noisy_angles_and_rates_at_100_hz(robot: str, joints: int) -> None:
+    ear = heard(200, kind=f"mujoco_{robot}")
+    np.testing.assert_allclose(np.diff(ear.t), 0.01, atol=1e-6)
+    spread = np.array(ear.states).std(axis=0)
+    expected = np.repeat([1e-3, 1e-2], joints)  # rad, rad/s; it hangs at rest
+    assert spread.shape == (2 * joints,)
+    assert (0.7 * expected < spread).all()
+    assert (spread < 1.4 * expected).all()
+
+
+def test_a_delay_is_seen_between_stamp_and_arrival() -> None:
+    ear = heard(30, kind="pendulum", delay=0.2)
+    assert min(ear.ages) >= 0.2
+    np.testing.assert_allclose(np.diff(ear.t), 0.01, atol=1e-6)
+
+
+def test_a_push_is_seen_and_only_where_it_acts() -> None:
+    ear = heard(20, pushed=True, kind="satellite", push=5.0, push_duration=0.05, push_input=1)
+    rates = np.array(ear.states)[:, 3:]
+    assert rates[-1, 1] == pytest.approx(5.0 * 0.05 / 3.0, rel=1e-6)  # H = diag(5, 3, 2)
+    assert (rates[:, [0, 2]] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"kind": "unicycle"}, "it should be one of model, pendulum, satellite, mujoco_pendulum"),
+        ({"kind": "model"}, "set the parameter model"),
+        ({"kind": "pendulum", "push_input": 1}, "pendulum has 1 inputs"),
+    ],
+)
+def test_a_plant_that_cannot_be_made_says_why(parameters: dict[str, object], said: str) -> None:
+    with process("nlsid_ros.plant", **parameters) as running:
+        output = running.communicate(timeout=30)[0]
+    assert running.returncode == 1
+    assert said in output
+
+
+def test_without_mujoco_its_robots_are_an_error_that_names_the_extra(tmp_path: Path) -> None:
+    """MuJoCo is hidden from a fresh process, as if it had not been installed."""
+    hidden = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from nlsid_ros.plant import main\n"
+        "main(['--ros-args', '-p', 'kind:=mujoco_arm'])\n"
+    )
+    script = tmp_path / "without_mujoco.py"
+    script.write_text(f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{hidden}")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 1
+    assert "pip install 'nlsid[sim]'" in done.stderr

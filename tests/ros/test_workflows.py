@@ -1,0 +1,187 @@
+"""The three workflows as one command starts them, and the launch files behind them."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from signal import SIGINT
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from bags.monitoring import documents
+from bags.recordings.bag import Bag
+from bags.samples import f1tenth
+from nlsid_core import _json
+from nlsid_core.models import DifferenceEquation
+from nlsid_ros import qos
+from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
+
+pytestmark = ros_test
+
+ENDED = 40.0  # s for all nodes of a workflow to end when asked to
+PATIENT = ["stale_after:=1.0", "command_wait:=0.5"]  # the machine may be busy with other tests
+
+
+class Operator:
+    """Hears what the nodes say and calls their services."""
+
+    def __init__(self, node: Node, spin_until: Callable[[Callable[[], bool]], None]) -> None:
+        self.node, self.spin_until = node, spin_until
+        self.said: dict[str, list[str]] = {}
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.said.setdefault(status.name, []).append(status.message)
+
+    def has_said(self, node: str, text: str) -> bool:
+        """Whether `node` has said something with `text`."""
+        return any(text in said for said in self.said.get(node, []))
+
+    def hears(self, node: str, text: str) -> None:
+        """Wait for it."""
+        self.spin_until(lambda: self.has_said(node, text))
+
+    def call(self, service: str) -> None:
+        """Call a std_srvs/Trigger that succeeds."""
+        client = self.node.create_client(Trigger, service)
+        self.spin_until(client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        self.spin_until(answer.done)
+        assert answer.result().success, answer.result().message
+
+    def waits(self, seconds: float) -> None:
+        """Let time pass."""
+        until = time.monotonic() + seconds
+        self.spin_until(lambda: time.monotonic() > until)
+
+
+@pytest.fixture
+def operator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Operator]:
+    use_domain_of_this_run(monkeypatch)
+    with node_here("test_operator") as (node, spin_until):
+        yield Operator(node, spin_until)
+
+
+@contextmanager
+def live(workflow: str, *arguments: str) -> Iterator[None]:
+    """`nlsid live`, interrupted at the end and then expected to have ended well."""
+    command = [sys.executable, "-m", "bags.commands.cli", "live", workflow, *arguments]
+    running = subprocess.Popen(command, cwd=ROOT)
+    try:
+        yield
+        running.send_signal(SIGINT)
+        assert running.wait(timeout=ENDED) == 0
+    finally:
+        if running.poll() is None:
+            running.send_signal(SIGINT)
+            running.wait(timeout=ENDED)
+
+
+def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> None:
+    trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
+    with live("monitor", f"funnel:={funnel}", *PATIENT):
+        operator.hears("funnel_monitor", " yet")
+        topics = "['/odom', '/cmd_vel']"
+        with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
+            operator.hears("funnel_monitor", "inside")
+            operator.hears("funnel_monitor", "unknown: no speed for 1 s")
+            assert player.wait(timeout=20) == 0
+    assert not operator.has_said("funnel_monitor", "outside")
+    assert not operator.has_said("funnel_monitor", "violated")
+
+
+def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
+    operator: Operator, funnel: Path
+) -> None:
+    def robot(name: str, push: float) -> list[str]:
+        return [
+            f"namespace:=/{name}",
+            f"odom:=/{name}/odom",
+            f"cmd_vel:=/{name}/cmd_vel",
+            f"funnel:={funnel}",
+            f"model:={funnel.with_name(documents.MODEL)}",
+            "plant:=true",
+            "highest:=0.4",
+            f"push:={push}",
+            *PATIENT,
+        ]
+
+    with ExitStack() as stack:
+        for name, push in (("gentle", 0.05), ("hard", 0.6)):
+            stack.enter_context(live("closed_loop", *robot(name, push)))
+        for name in ("gentle", "hard"):
+            operator.hears(f"{name}/tracking_controller", "idle")
+            operator.hears(f"{name}/funnel_monitor", "waiting for the controller")
+        for name in ("gentle", "hard"):
+            operator.call(f"/{name}/tracking_controller/start")
+        for name in ("gentle", "hard"):
+            operator.hears(f"{name}/funnel_monitor", "inside")
+        operator.waits(1.0)
+        for name in ("gentle", "hard"):
+            operator.call(f"/{name}/plant/push")
+        operator.hears("hard/funnel_monitor", "outside the tube")
+        operator.hears("hard/tracking_controller", "idle; stopped: asked to")
+        operator.hears("gentle/tracking_controller", "idle; stopped: the plan is over")
+        names = {name for name, _ in operator.node.get_topic_names_and_types()}
+    assert not operator.has_said("gentle/funnel_monitor", "outside")
+    assert not operator.has_said("gentle/funnel_monitor", "violated")
+    assert {"/gentle/odom", "/hard/odom", "/diagnostics"} <= names
+    assert not {"/odom", "/cmd_vel"} & names, "nothing is outside the namespaces"
+
+
+def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
+    operator: Operator, funnel: Path, tmp_path: Path
+) -> None:
+    trials = tmp_path / "trials"
+    trials.mkdir()
+    for bag in f1tenth():
+        (trials / bag.name).symlink_to(bag)
+    common = [f"config:={ROOT / 'config' / 'f1tenth.yaml'}", f"trials:={trials}"]
+    common.append(f"out:={tmp_path / 'out'}")
+    excite = ["excite:=true", "highest:=0.3", "slew:=1.0", "duration:=3.0"]
+    with (
+        process("nlsid_ros.plant", model=funnel.with_name(documents.MODEL), noise=0.002),
+        live("identify", *common, *excite, f"bag:={trials / 'trial_new'}"),
+    ):
+        listeners = {"/odom": 1, "/cmd_vel": 2}  # recorder and plant
+        operator.spin_until(
+            lambda: all(operator.node.count_subscribers(t) >= n for t, n in listeners.items())
+        )
+        operator.call("/excitation/start")
+        operator.waits(5.0)
+    with Bag(trials / "trial_new") as recorded:
+        assert recorded.count("/odom") > 100
+        assert recorded.count("/cmd_vel") > 80
+        assert recorded.count("/excitation/experiment") == 1
+
+    models: list[String] = []
+    operator.node.create_subscription(
+        String, "/model_identifier/model", models.append, qos.DOCUMENT
+    )
+    with live("identify", *common, f"bag:={tmp_path / 'another'}"):
+        operator.call("/model_identifier/identify")
+        operator.hears("model_identifier", "PROVED")
+        operator.spin_until(lambda: len(models) == 1)
+    model = DifferenceEquation.from_document(_json.parse_document(models[0].data))
+    assert len(model) == 4
+
+
+def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
+    command = [sys.executable, "-m", "bags.commands.cli", "live", "closed_loop"]
+    done = subprocess.run(
+        [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
+        capture_output=True, text=True, cwd=ROOT, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "'plants:=true' is not one of the arguments of closed_loop.launch.xml" in done.stderr
+    assert "stale_after:=0.1" in done.stderr

@@ -1,0 +1,143 @@
+"""The controller of a discrete funnel in the loop, and its runs replayed from a bag."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.chain.joint_bags import COMMANDS, JOINTS, STATES, _make
+from bags.monitoring.announcement import Run
+from bags.monitoring.designs import TrackingDesign, read_design
+from bags.monitoring.replay import announced_runs, replay_messages
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.vector import SignalVector
+from nlsid_core import _json
+from nlsid_core._types import FloatArray
+from nlsid_core.controller import Limits
+from nlsid_core.errors import BagError
+from nlsid_core.monitor import Nominal, Status
+from nlsid_core.tracking_controller import TrackingController
+from nlsid_core.tracking_monitor import TrackingMonitor
+from tests.tracked import PERIOD, STEPS, designed
+
+LIMITS = Limits(lowest=-9.0, highest=9.0, stop_rate=50.0)
+NOISE = np.array([1e-4, 1e-3])
+
+
+def design() -> TrackingDesign:
+    """The funnel of `tests.tracked` as the nodes read it, its signals on joint topics."""
+    made = designed()
+    documents = {role: getattr(made, role).document() for role in ("model", "policy", "funnel")}
+    for kind, names in (("x", ("position[0]", "velocity[0]")), ("u", ("effort[0]",))):
+        topic = STATES if kind == "x" else COMMANDS
+        for signal, name in zip(documents["model"][kind], names, strict=True):
+            signal["path"] = f"{topic}:{name}"
+    digest = _json.digest(documents["model"])
+    documents["policy"]["model"] = documents["funnel"]["model"] = digest
+    documents["funnel"]["policy"] = _json.digest(documents["policy"])
+    read = read_design(documents)
+    assert isinstance(read, TrackingDesign)
+    return read
+
+
+def run(controller: TrackingController, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """States and inputs of the model under the controller, until it ends."""
+    model, rng = controller.model, np.random.default_rng(seed)
+    x: FloatArray = np.zeros(2)
+    y, u = [], []
+    for k in range(STEPS + 50):
+        y.append(x + NOISE * rng.standard_normal(2))
+        controller.update(k * PERIOD, y[-1])
+        u.append(controller.u)
+        if controller.ended:
+            break
+        x = model(x, u[-1])
+    return np.array(y), np.array(u)
+
+
+def test_every_input_is_the_policys_and_the_run_stays_inside() -> None:
+    made = design()
+    controller = made.controller(LIMITS, 1.0)
+    y, u = run(controller)
+    assert controller.ended == "the plan is over"
+    assert len(y) == STEPS + 1
+    monitor = TrackingMonitor(made.model, made.policy, made.funnel)
+    said = [monitor.update(k * PERIOD, y[k], u[k]) for k in range(STEPS + 1)]
+    assert {reading.status for reading in said} == {Status.INSIDE}
+
+
+def test_a_robot_away_from_the_start_is_waited_for_and_then_given_up() -> None:
+    controller = design().controller(LIMITS, 0.1)
+    for k in range(10):
+        controller.update(k * PERIOD, np.array([1.1, 0.0]))
+    assert "not at the start of the plan after 0.1 s" in controller.ended
+
+
+@pytest.mark.parametrize(
+    ("t", "y", "said"),
+    [(2 * PERIOD, [np.nan, 0.0], "state is"), (3.5 * PERIOD, [0.0, 0.0], "between samples")],
+)
+def test_a_sample_that_cannot_be_used_ends_the_run(t: float, y: list[float], said: str) -> None:
+    controller = design().controller(LIMITS, 1.0)
+    for k in range(2):
+        controller.update(k * PERIOD, np.zeros(2))
+    u = controller.u
+    np.testing.assert_array_equal(controller.update(t, np.array(y)), u)
+    assert said in controller.ended
+
+
+def test_commands_are_cut_to_the_limits() -> None:
+    controller = design().controller(Limits(lowest=-0.1, highest=0.1, stop_rate=1.0), 1.0)
+    _, u = run(controller)
+    assert float(np.abs(u).max()) == 0.1
+
+
+@pytest.mark.parametrize("announced_late", [False, True])
+def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_start(
+    tmp_path: Path, announced_late: bool
+) -> None:
+    """An announcement may be recorded before its first sample or some samples after it."""
+    made = design()
+    runs = [run(made.controller(LIMITS, 1.0), seed) for seed in range(2)]
+    digest = _json.digest(made.funnel.document())
+    topics = standard_types()
+    with BagWriter(tmp_path / "bag") as writer:
+
+        def write(topic: str, kind: str, message: object, stamp_ns: int) -> None:
+            data = bytes(topics.serialize_cdr(message, kind, little_endian=True))
+            writer.write(topic, kind, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
+
+        def joints(stamp_ns: int, *fields: FloatArray) -> object:
+            stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
+            return _make(JOINTS, _make("std_msgs/msg/Header", stamp, ""), ["joint"], *fields)
+
+        empty, period_ns = np.zeros(0), round(PERIOD * 1e9)
+        for number, (y, u) in enumerate(runs):
+            start_ns = 10**12 + 2 * number * 10**9
+            stamps = [start_ns + (k - 3) * period_ns for k in range(len(y) + 3)]  # 3 of waiting
+            states = [y[0]] * 3 + list(y)
+            inputs = [np.zeros(1)] * 3 + list(u)
+            for k, stamp_ns in enumerate(stamps):
+                if k == (8 if announced_late else 1):
+                    text = _json.canonical(Run(start_ns, digest).document()).decode()
+                    message = _make("std_msgs/msg/String", text)
+                    write("/tracking_controller/run", "std_msgs/msg/String", message, stamp_ns)
+                write(
+                    STATES, JOINTS, joints(stamp_ns, states[k][:1], states[k][1:], empty), stamp_ns
+                )
+                write(COMMANDS, JOINTS, joints(stamp_ns, empty, empty, inputs[k]), stamp_ns)
+    assert len(announced_runs(made, tmp_path / "bag")) == 2
+    stamped = replay_messages(made, tmp_path / "bag", nominal=Nominal.PROFILE)
+    judged = [e for e in stamped if e.reading.status is not Status.UNKNOWN]
+    expected = []
+    for y, u in runs:
+        monitor = TrackingMonitor(made.model, made.policy, made.funnel)
+        expected += [monitor.update(k * PERIOD, y[k], u[k]).margin for k in range(len(y))]
+    assert [e.reading.margin for e in judged] == expected
+    assert {e.reading.status for e in judged} == {Status.INSIDE}
+
+
+def test_signals_on_several_topics_cannot_be_one_sample() -> None:
+    with pytest.raises(BagError, match="/a, /b"):
+        SignalVector.parse(["/a:data", "/b:data"])
