@@ -202,7 +202,8 @@ def designed(robot: Robot, task: Task, model: MeasuredState, seed: int) -> Made:
 def compared(design: FunnelDesign, feedback: Feedback) -> tuple[float, float]:
     """Inlet volume over that without disturbance; the tube's narrowest in mrad, from a small start.
 
-    Small: the part of the inlet that the disturbance itself fills.
+    Small: the part of the inlet that the disturbance itself fills. Narrowest: in the second half of
+    the motion, when the start is forgotten.
     """
     assumption = design.funnel.assumption
     ideal = design_state_funnel(
@@ -212,7 +213,8 @@ def compared(design: FunnelDesign, feedback: Feedback) -> tuple[float, float]:
         design.model, design.policy, feedback, assumption=assumption, start=assumption.bound
     )
     ratio = float(design.funnel.inlet[0] / ideal.funnel.inlet[0])
-    width = float(np.min(small.funnel.half_widths[:, 0]))
+    widths = small.funnel.half_widths[:, 0]
+    width = float(np.min(widths[len(widths) // 2 :]))
     return ratio ** len(design.model), 1e3 * width
 
 

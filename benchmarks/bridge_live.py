@@ -115,7 +115,7 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
         "funnel_monitor": {
             "controller": "tracking_controller",
             "stop_service": "/tracking_controller/stop",
-            "command_wait": 0.5,  # the machine may be busy
+            "command_wait": 1.0,  # the machine may be busy
             "stale_after": 2.0,
         },
         "tracking_controller": {
@@ -147,16 +147,20 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
         began = time.monotonic()
         while (passed := time.monotonic() - began) < seconds:
             heard.starts.clear()
+            heard.said.pop("tracking_controller", None)
             answer = start.call_async(Trigger.Request())
             spin_until(answer.done)
             if answer.result().success:
-                spin_until(lambda: bool(heard.starts))
-                runs += 1
+                spin_until(lambda: heard.starts or heard.ready("tracking_controller", "idle"))
+                runs += len(heard.starts)
             if not pushed_ns and passed > seconds / 2:
                 heard.into_run = 0
-                spin_until(lambda: heard.into_run > PUSH_AT)
-                pushed_ns = time.time_ns()
-                push.call_async(Trigger.Request())
+                spin_until(
+                    lambda: heard.into_run > PUSH_AT or heard.ready("tracking_controller", "idle")
+                )
+                if heard.into_run > PUSH_AT:
+                    pushed_ns = time.time_ns()
+                    push.call_async(Trigger.Request())
             spin_until(lambda: heard.ready("tracking_controller", "idle"))
         until = time.monotonic() + 1.0
         spin_until(lambda: time.monotonic() > until)  # the last verdicts are on their way
@@ -200,7 +204,7 @@ def compared(
     )
 
 
-def _operator(stack: ExitStack) -> tuple[Node, Callable[[Callable[[], bool]], None]]:
+def _operator(stack: ExitStack) -> tuple[Node, Callable[[Callable[[], object]], None]]:
     """A node of this process, and what spins it until a condition holds."""
     context = Context()
     rclpy.init(context=context)
@@ -208,7 +212,7 @@ def _operator(stack: ExitStack) -> tuple[Node, Callable[[Callable[[], bool]], No
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(operator)
 
-    def spin_until(condition: Callable[[], bool]) -> None:
+    def spin_until(condition: Callable[[], object]) -> None:
         deadline = time.monotonic() + PATIENCE
         while not condition():
             if time.monotonic() > deadline:

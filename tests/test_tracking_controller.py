@@ -21,6 +21,7 @@ from nlsid_core.tracking_controller import TrackingController
 from nlsid_core.tracking_monitor import TrackingMonitor
 from tests.tracked import PERIOD, STEPS, designed
 
+STRING = "std_msgs/msg/String"
 LIMITS = Limits(lowest=-9.0, highest=9.0, stop_rate=50.0)
 NOISE = np.array([1e-4, 1e-3])
 
@@ -93,40 +94,35 @@ def test_commands_are_cut_to_the_limits() -> None:
     assert float(np.abs(u).max()) == 0.1
 
 
-@pytest.mark.parametrize("announced_late", [False, True])
+@pytest.mark.parametrize("heard", [-3, 5, -80])
 def test_runs_that_follow_each_other_in_one_bag_are_each_replayed_from_their_start(
-    tmp_path: Path, announced_late: bool
+    tmp_path: Path, heard: int
 ) -> None:
-    """An announcement may be recorded before its first sample or some samples after it."""
+    """An announcement comes `heard` samples after its start: also late, or in the run before."""
     made = design()
     runs = [run(made.controller(LIMITS, 1.0), seed) for seed in range(2)]
     digest = _json.digest(made.funnel.document())
-    topics = standard_types()
-    with BagWriter(tmp_path / "bag") as writer:
-
-        def write(topic: str, kind: str, message: object, stamp_ns: int) -> None:
-            data = bytes(topics.serialize_cdr(message, kind, little_endian=True))
-            writer.write(topic, kind, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
-
-        def joints(stamp_ns: int, *fields: FloatArray) -> object:
+    empty, period_ns = np.zeros(0), round(PERIOD * 1e9)
+    events: list[tuple[int, str, str, object]] = []
+    for number, (y, u) in enumerate(runs):
+        start_ns = 10**12 + 2 * number * 10**9
+        text = _json.canonical(Run(start_ns, digest).document()).decode()
+        message = _make(STRING, text)
+        events.append(
+            (start_ns + heard * period_ns - 1, "/tracking_controller/run", STRING, message)
+        )
+        waiting = [(y[0], np.zeros(1))] * 3
+        for k, (state, effort) in enumerate([*waiting, *zip(y, u, strict=True)]):
+            stamp_ns = start_ns + (k - 3) * period_ns
             stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
-            return _make(JOINTS, _make("std_msgs/msg/Header", stamp, ""), ["joint"], *fields)
-
-        empty, period_ns = np.zeros(0), round(PERIOD * 1e9)
-        for number, (y, u) in enumerate(runs):
-            start_ns = 10**12 + 2 * number * 10**9
-            stamps = [start_ns + (k - 3) * period_ns for k in range(len(y) + 3)]  # 3 of waiting
-            states = [y[0]] * 3 + list(y)
-            inputs = [np.zeros(1)] * 3 + list(u)
-            for k, stamp_ns in enumerate(stamps):
-                if k == (8 if announced_late else 1):
-                    text = _json.canonical(Run(start_ns, digest).document()).decode()
-                    message = _make("std_msgs/msg/String", text)
-                    write("/tracking_controller/run", "std_msgs/msg/String", message, stamp_ns)
-                write(
-                    STATES, JOINTS, joints(stamp_ns, states[k][:1], states[k][1:], empty), stamp_ns
-                )
-                write(COMMANDS, JOINTS, joints(stamp_ns, empty, empty, inputs[k]), stamp_ns)
+            header = _make("std_msgs/msg/Header", stamp, "")
+            states = _make(JOINTS, header, ["joint"], state[:1], state[1:], empty)
+            efforts = _make(JOINTS, header, ["joint"], empty, empty, effort)
+            events += [(stamp_ns, STATES, JOINTS, states), (stamp_ns, COMMANDS, JOINTS, efforts)]
+    with BagWriter(tmp_path / "bag") as writer:
+        for log_ns, topic, kind, content in sorted(events, key=lambda event: event[0]):
+            data = bytes(standard_types().serialize_cdr(content, kind, little_endian=True))
+            writer.write(topic, kind, data, log_time_ns=log_ns, publish_time_ns=log_ns)
     assert len(announced_runs(made, tmp_path / "bag")) == 2
     stamped = replay_messages(made, tmp_path / "bag", nominal=Nominal.PROFILE)
     judged = [e for e in stamped if e.reading.status is not Status.UNKNOWN]

@@ -63,14 +63,15 @@ class Watch:
     def begin(self, start_ns: int) -> list[Stamped]:
         """The run's sample 0 is the response stamped `start_ns`, past or to come; readings from it.
 
-        A second `begin` is a new run.
+        A second `begin` is a new run; samples stamped before it, whenever they come, are still of
+        the run before, so that verdicts do not depend on when the announcement came.
         """
         recent = list(self._recent)
         self._recent.clear()
         self._recent.extend(sample for sample in recent if sample.stamp_ns < start_ns)
-        self._start_ns = self.origin_ns = start_ns
-        self._running = False
-        self._alarm.restart()
+        self._start_ns = start_ns
+        if self.origin_ns is None:
+            self.origin_ns = start_ns
         return self._judge([sample for sample in recent if sample.stamp_ns >= start_ns])
 
     def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
@@ -106,9 +107,11 @@ class Watch:
             return []
         judged = []
         for sample in samples:
-            t = seconds(sample.stamp_ns, self.origin_ns)
-            if not self._running and self._starts(sample):
+            if self._start_ns is not None and sample.stamp_ns >= self._start_ns:
+                self.origin_ns, self._start_ns = self._start_ns, None
+                self._alarm.restart()
                 self._give_lags()
+            t = seconds(sample.stamp_ns, self.origin_ns)
             self._recent.append(sample)
             if self._running:
                 reading = self.monitor.update(t, sample.y, sample.u)
@@ -116,9 +119,6 @@ class Watch:
                 reading = self.monitor.waiting(t, sample.y, WAITING)
             judged.append(Stamped(sample.stamp_ns, reading, self._alarm.update(reading)))
         return judged
-
-    def _starts(self, sample: Sample) -> bool:
-        return self._start_ns is not None and sample.stamp_ns >= self._start_ns
 
     def _give_lags(self) -> None:
         """The samples before the start give the observer its state, if it needs any."""

@@ -210,7 +210,7 @@ def refuse_box(
 def refuse_strangers(
     about: Mapping[str, Json], policy: TrackingPolicy, funnel: DiscreteFunnel
 ) -> None:
-    """CertificateMismatch unless policy and funnel name the documents they are decided with."""
+    """Refuse a policy or funnel that names another model or policy than the bound one."""
     digests = {role: _json.digest(content) for role, content in about.items()}
     for owner, role, stated in (
         ("policy", "model", policy.model),
@@ -258,7 +258,7 @@ def _symmetric(entry: Json, key: str, source: str) -> FloatArray:
 
 
 def statement(model: MeasuredState, funnel: DiscreteFunnel, margin: float) -> Decision:
-    """What was proved, in words, and what it assumes."""
+    """The claim in words, from the numbers that were checked."""
     a, N = funnel.assumption, len(funnel)
     widths = ", ".join(
         f"{signal.name} {width:.3g} {signal.unit}".rstrip()
