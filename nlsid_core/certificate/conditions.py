@@ -57,7 +57,7 @@ def linear(E: Polynomials, F: Polynomials, delta: Number = 1) -> Inequality:
     Source: (2.19).
     """
     corner = E - delta * _identity(len(E))
-    return Inequality(_filled(np.block([[corner, F.T], [F, E]])))
+    return Inequality(filled(np.block([[corner, F.T], [F, E]])))
 
 
 def increments(
@@ -71,7 +71,7 @@ def increments(
     matrix[0, 0] = 2 * (gap @ moved) - gap @ P @ gap - delta * (gap @ gap)
     matrix[0, 1:] = matrix[1:, 0] = image
     matrix[1:, 1:] = P
-    return Inequality(_filled(matrix), _both(domain, hat), _gaps(states))
+    return Inequality(filled(matrix), _both(domain, hat), _gaps(states))
 
 
 def derivatives(
@@ -84,7 +84,7 @@ def derivatives(
     """
     E, F = _slopes(e, states), _slopes(f, states)
     corner = E + E.T - P - delta * _identity(len(e))
-    return Inequality(_filled(np.block([[corner, F.T], [F, P]])), domain)
+    return Inequality(filled(np.block([[corner, F.T], [F, P]])), domain)
 
 
 def implicit_increments(
@@ -106,7 +106,7 @@ def implicit_increments(
     next_V = wide.substitute(dict(zip(names, [*after, *gap_after], strict=True)))
     moved = h - _substituted(h, hat)
     p = 2 * (gap_v @ moved) + V - next_V - delta * (gap_x @ gap_x)
-    return Inequality(_filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps([*v, *x]))
+    return Inequality(filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps([*v, *x]))
 
 
 def storage(V: Polynomial, x: Sequence[str], *, domain: Domain = ()) -> Inequality:
@@ -130,19 +130,19 @@ def implicit_derivatives(
     top = H1 + H1.T - next_M[:n_v, :n_v]
     side = H2 - next_M[:n_v, n_v:] @ A
     corner = M - delta * _identity(n_x) - A.T @ next_M[n_v:, n_v:] @ A
-    return Inequality(_filled(np.block([[top, side], [side.T, corner]])), domain)
+    return Inequality(filled(np.block([[top, side], [side.T, corner]])), domain)
 
 
 def monotone(h: Polynomials, v: Sequence[str], m: Number, *, domain: Domain = ()) -> Inequality:
     """H₁ + H₁' - 2mI ⪰ 0, H₁ = ∂h/∂v: h is m-monotone in v. Source: (2.12)."""
     H1 = _slopes(h, v)
-    return Inequality(_filled(H1 + H1.T - 2 * m * _identity(len(v))), domain)
+    return Inequality(filled(H1 + H1.T - 2 * m * _identity(len(v))), domain)
 
 
 def regular(centre: Polynomials, v: Sequence[str], m: Number) -> Inequality:
     """E₀'E₀ - m²I ⪰ 0: a linear e₀ is a bijection, |e₀ - ê₀| ≥ m|v - v̂|."""
     E0 = _slopes(centre, v)
-    return Inequality(_filled(E0.T @ E0 - Fraction(m) ** 2 * _identity(len(v))))
+    return Inequality(filled(E0.T @ E0 - Fraction(m) ** 2 * _identity(len(v))))
 
 
 def centred(
@@ -153,7 +153,7 @@ def centred(
     Source: Proposition 2.7, (2.15).
     """
     H1, E0 = _slopes(h, v), _slopes(centre, v)
-    return Inequality(_filled(E0.T @ H1 + H1.T @ E0 - E0.T @ E0), domain)
+    return Inequality(filled(E0.T @ H1 + H1.T @ E0 - E0.T @ E0), domain)
 
 
 def centred_increments(
@@ -163,10 +163,10 @@ def centred_increments(
     hat, _ = _second(v)
     moved, moved_0 = h - _substituted(h, hat), centre - _substituted(centre, hat)
     p = 2 * (moved_0 @ moved) - moved_0 @ moved_0
-    return Inequality(_filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps(v))
+    return Inequality(filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps(v))
 
 
-def box(names: Sequence[str], ends: Sequence[Sequence[Number]]) -> Domain:
+def box(names: Sequence[str], ends: Sequence[Sequence[Number] | tuple[Number, Number]]) -> Domain:
     """low ≤ x ≤ high of states and inputs: (x - low)(high - x) ≥ 0; ends (low, high) each."""
     if len(names) != len(ends):
         raise ShapeError(f"{len(names)} names and the ends of {len(ends)} intervals")
@@ -230,7 +230,7 @@ def _identity(n: int) -> Polynomials:
     return np.eye(n, dtype=np.int64).astype(object)
 
 
-def _filled(matrix: Polynomials) -> Polynomials:
+def filled(matrix: Polynomials) -> Polynomials:
     """Every entry a polynomial."""
     result = np.empty(matrix.shape, dtype=object)
     for index in np.ndindex(matrix.shape):

@@ -24,6 +24,7 @@ from nlsid_core.identification.contraction import (
     traceless,
 )
 from nlsid_core.identification.inequalities import MatrixInequality, centre, minimise_linear
+from nlsid_core.identification.matrix_proof import MatrixProof
 from nlsid_core.identification.newton import Descent, minimise
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.state_affine import StateAffineRows
@@ -83,7 +84,7 @@ def certified_simulation_error(
 
 
 def descend_certified(
-    problem: StateAffineRows, model: StateAffineModel, proof: StateAffineProof
+    problem: StateAffineRows, model: StateAffineModel, proof: StateAffineProof | MatrixProof
 ) -> StateAffineModel:
     """The last step: a local minimum of the simulation error itself inside the certified set.
 
@@ -92,6 +93,8 @@ def descend_certified(
     while that goes on lowering it. Raises ShapeError as `certified_simulation_error` does.
     """
     _refuse_others(problem)
+    if isinstance(proof, MatrixProof):
+        raise ShapeError("the last step needs the proof by bounds of the leading coefficient")
     objective, best = SimulationError(problem.rows), model
     theta = np.concatenate([g.coefficients.ravel() for g in model.G])
     P, extra = proof.P, np.concatenate([proof.bounds, *proof.multipliers])

@@ -179,10 +179,9 @@ class Descent:
     def path(self, z: FloatArray, *, barrier: SchurBarrier | None = None) -> Minimum:
         """Follow the minimisers for μ → 0."""
         size = sum(inequality.F.shape[1] for inequality in self.inequalities)
-        gap, mu = INEQUALITY_GAP, self.objective.at(z[: self.parameters]).J / max(size, 1)
-        if barrier is not None:
-            size += barrier.U.shape[1]
-            gap, mu = GAP, FIRST_GAP * mu * max(size, 1) / size
+        size += 0 if barrier is None else barrier.U.shape[1]
+        gap = INEQUALITY_GAP if barrier is None else GAP
+        mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
         while True:
             found = self.to_minimum(z, mu=mu, barrier=barrier)
             z = np.concatenate([found.point.theta, found.extra])
