@@ -116,7 +116,10 @@ def descend_certified(
 
 def _refuse_others(problem: StateAffineRows) -> None:
     if not problem.has_constant_lags:
-        raise ShapeError("certified iterates are for one output and constant lagged coefficients")
+        raise ShapeError(
+            "certified iterates are for one output and constant lagged coefficients; minimise the "
+            "robust simulation error and prove that model instead"
+        )
     if (problem.left[0].sum(axis=1) > 2).any():
         raise ShapeError("certified iterates are for a leading coefficient of degree 2 at most")
 
