@@ -14,7 +14,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import check, proof_document
-from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Undecided
 from nlsid_core.identification.implicit import prove_implicit, prove_well_posed
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
@@ -367,3 +367,28 @@ def test_sets_that_do_not_exist_are_refused() -> None:
         prove_implicit(quintic(), delta=DELTA, set="2.9")
     with pytest.raises(DataError, match="delta"):
         prove_implicit(quintic(), delta=-1.0)
+
+
+def _huge_degree(_: Json, proof: Json) -> None:
+    proof["proof"]["V"]["exponents"][0][-1] = 10**6
+
+
+def _huge_expansion(model: Json, proof: Json) -> None:
+    model["shift"]["exponents"] = [[i, j, k] for i in range(4) for j in range(4) for k in range(4)]
+    model["shift"]["coefficients"] = [[1.0]] * 64
+    proof["proof"]["V"]["exponents"][0][-1] = 20
+
+
+def _huge_model(model: Json, _: Json) -> None:
+    model["h"]["exponents"] += [[20, 20, 20, 20 - k] for k in range(8)]
+    model["h"]["coefficients"] += [[1.0]] * 8
+
+
+@pytest.mark.parametrize("change", [_huge_degree, _huge_expansion, _huge_model])
+def test_a_document_that_would_take_forever_is_left_undecided(
+    change: Change, tmp_path: Path, made: dict[str, tuple[Json, Json]]
+) -> None:
+    model, proof = map(copied, made["increments, 2.10"])
+    change(model, proof)
+    with pytest.raises(Undecided, match="this checker takes"):
+        check(write(tmp_path, model, proof))

@@ -6,8 +6,9 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
+from benchmarks.rwse_scaling import boundary_rows, linear_matrix_inequality
 from nlsid_core.identification.bound import Bound
-from nlsid_core.identification.newton import SchurBarrier, minimise
+from nlsid_core.identification.newton import SchurBarrier, minimise, smallest_eigenvalues
 from nlsid_core.identification.prediction import one_step_residual
 from nlsid_core.identification.rie import IdentificationErrorBound, robust_identification_error
 from nlsid_core.identification.rows import Rows
@@ -283,3 +284,17 @@ def test_the_identification_error_is_the_worst_case_over_states_and_above_both_b
     assert best.J <= found.J * (1 + SOLVER)
     simulated = (model.simulate(trial.u, trial.y[:2]) - trial.y) / model.y_scale
     assert np.sum(simulated**2) <= found.J * (1 + EXACT)
+
+
+@pytest.mark.parametrize("N", [300, 500])
+def test_minimisers_where_eigenvalues_vanish_equal_the_cone_solver_s(N: int) -> None:
+    """A burst its input says nothing of: K is singular at the minimiser."""
+    rows = boundary_rows(N)
+    optimum, _ = linear_matrix_inequality(rows)
+    found = minimise(Bound(rows, None), rows.identity)
+    assert found.on_boundary
+    smallest, _ = smallest_eigenvalues(found.point.factor, len(rows), 4)
+    assert smallest[0] < 1e-4 * float(np.median(found.point.factor.pivots))
+    assert pytest.approx(optimum, rel=SOLVER) == found.point.J
+    dense_smallest = np.linalg.eigvalsh(dense_K(rows, found.point.theta, None))[0]
+    assert smallest[0] == pytest.approx(dense_smallest, rel=1e-2)

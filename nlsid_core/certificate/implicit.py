@@ -20,19 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core._types import IntArray, Json
 from nlsid_core.certificate import conditions, exact
 from nlsid_core.certificate import polynomial_data as data
 from nlsid_core.certificate.conditions import GAP, Domain, Inequality
 from nlsid_core.certificate.identity import Mode
 from nlsid_core.certificate.nonnegative import prove_lower_bound, quadratic_form
 from nlsid_core.certificate.verdict import Decision
-from nlsid_core.errors import CertificateRejected, DocumentError
+from nlsid_core.errors import CertificateRejected, DocumentError, Undecided
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import Gram, Polynomial
 
 SETS = ("2.10", "2.11", "2.12", "2.13", "2.19")
+MAX_DEGREE = 20  # of a storage
+MAX_TERMS = 1_000_000  # of one polynomial when it is expanded: seconds
 STORAGE = {"2.10": "V", "2.11": "M", "2.12": "P", "2.13": "P"}
 Ends = list[list[float]]
 Storage = Polynomial | NDArray[np.object_] | None
@@ -116,6 +118,7 @@ def inequalities(
 
     Raises CertificateRejected if the model is not of the set's form or the storage not a storage.
     """
+    _refuse_size(model, storage)
     found = _inequalities(model, kind, storage, delta, ends)
     return {key: part.relevant() for key, part in found.items()}
 
@@ -243,6 +246,30 @@ def _linear_parts(
     if any(E[i, j] != E[j, i] for i in range(len(E)) for j in range(i)):
         raise CertificateRejected("E is not symmetric; multiply the model's equation by E' first")
     return E, F
+
+
+def _refuse_size(model: ImplicitModel, storage: Storage) -> None:
+    """Expanding a document's polynomials at the second solution and the next state has to end."""
+    split = [_terms_at_gaps(part.exponents) for part in (model.h, model.shift)]
+    entries = storage.ravel() if isinstance(storage, np.ndarray) else [storage]
+    for V in (entry for entry in entries if entry is not None):
+        inner = [name[0] in "xw" for name in V.names]  # unknowns of a search do not count
+        powers = V.exponents[:, inner].sum(axis=1)
+        if np.max(powers, initial=0) > MAX_DEGREE:
+            raise Undecided(
+                f"a storage of degree {np.max(powers)}; this checker takes {MAX_DEGREE}"
+            )
+        widest = max(2.0, split[1])  # a shifted state or its gap has at most so many terms
+        split.append(
+            float(np.sum(widest**powers)) if split[1] > 2.0 else float(2.0 ** powers.max())
+        )
+    if max(split) > MAX_TERMS:
+        raise Undecided(f"about {max(split):.1e} terms to expand; this checker takes {MAX_TERMS}")
+
+
+def _terms_at_gaps(exponents: IntArray) -> float:
+    """At most how many terms polynomials have once x - x~ stands for x."""
+    return float(np.sum(np.prod(1.0 + exponents, axis=1)))
 
 
 def _refuse_offset(V: Polynomial, names: Names) -> None:
