@@ -255,14 +255,12 @@ def _refuse_size(model: ImplicitModel, storage: Storage) -> None:
     for V in (entry for entry in entries if entry is not None):
         inner = [name[0] in "xw" for name in V.names]  # unknowns of a search do not count
         powers = V.exponents[:, inner].sum(axis=1)
-        if np.max(powers, initial=0) > MAX_DEGREE:
-            raise Undecided(
-                f"a storage of degree {np.max(powers)}; this checker takes {MAX_DEGREE}"
-            )
-        widest = max(2.0, split[1])  # a shifted state or its gap has at most so many terms
-        split.append(
-            float(np.sum(widest**powers)) if split[1] > 2.0 else float(2.0 ** powers.max())
-        )
+        degree = int(np.max(powers, initial=0))
+        if degree > MAX_DEGREE:
+            raise Undecided(f"a storage of degree {degree}; this checker takes {MAX_DEGREE}")
+        # A shifted state or its gap has at most `widest` terms; two where nothing is shifted.
+        widest = max(2.0, split[1])
+        split.append(float(np.sum(widest**powers)) if widest > 2.0 else 2.0**degree)
     if max(split) > MAX_TERMS:
         raise Undecided(f"about {max(split):.1e} terms to expand; this checker takes {MAX_TERMS}")
 
