@@ -70,6 +70,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "region_of_attraction": attraction.decide,
         "implicit_stability": implicit.decide,
         "implicit_funnel": _exact_only(_implicit_funnel),
+        "well_posedness": implicit.decide_well_posed,
         "trajectory_funnel": _trajectory_funnel,
         "funnel_composition": _funnel_composition,
     }

@@ -14,21 +14,39 @@ from fractions import Fraction
 
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
-from nlsid_core.certificate import exact
+from nlsid_core.certificate import exact, state_affine_matrix
+from nlsid_core.certificate.state_affine_matrix import Box, window_box
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.state_affine import StateAffineModel
 
-Box = list[tuple[Fraction, Fraction]]
-
 
 def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
-    """Decide `{rate}` for the bound model with `{P, lower, upper, lower_box, upper_box}`."""
+    """Decide `{rate}` for the bound model: one of two forms of proof.
+
+    `{P, lower, upper, lower_box, upper_box}` as above; `{P, T, gram, multipliers}` for any model of
+    the class, as in `state_affine_matrix`.
+    """
     if set(about) != {"model"} or set(claim) != {"kind", "about", "rate"}:
         raise CertificateRejected("a state_affine_stability claim is about one file, the model")
     model = StateAffineModel.from_document(about["model"], source="model")
     rate = _json.number(claim, "rate", source="claim")
+    if "T" in proof:
+        state_affine_matrix.decide(model, rate, proof)
+    else:
+        _decide_bounds(model, rate, proof)
+    return Decision(
+        statement=(
+            f"incremental stability: solutions with the same input approach each other at "
+            f"{rate:.4f} a sample of {model.period:g} s or faster, for every input (inputs are "
+            "clipped to the model's range),"
+        ),
+        margin=1.0 - rate,
+    )
+
+
+def _decide_bounds(model: StateAffineModel, rate: float, proof: Json) -> None:
     n, n_w = len(model), len(model.window)
     refusal = contracts(
         model,
@@ -45,14 +63,6 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
     )
     if refusal is not None:
         raise CertificateRejected(refusal)
-    return Decision(
-        statement=(
-            f"incremental stability: solutions with the same input approach each other at "
-            f"{rate:.4f} a sample of {model.period:g} s or faster, for every input (inputs are "
-            "clipped to the model's range),"
-        ),
-        margin=1.0 - rate,
-    )
 
 
 def contracts(
@@ -92,16 +102,6 @@ def contracts(
         if not exact.is_positive_definite(decrease):
             return f"V = x'Px does not shrink by the stated rate {rate:.6g} at G_0 = {level}"
     return None
-
-
-def window_box(model: StateAffineModel) -> Box:
-    """Exact range of each entry of w: the clipped inputs, normalised without rounding."""
-    box = []
-    for i, _ in model.window:
-        offset, scale = (Fraction(float(v[i])) for v in (model.u_offset, model.u_scale))
-        low, high = ((Fraction(float(end)) - offset) / scale for end in model.u_range[i])
-        box.append((low, high))
-    return box
 
 
 def slack_matrix(

@@ -13,6 +13,7 @@ from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.certificate import proof_document
 from nlsid_core.certificate.state_affine import contracts
 from nlsid_core.identification.inequalities import MatrixInequality, minimise_linear
+from nlsid_core.identification.matrix_proof import MatrixProof, prove_by_matrix
 from nlsid_core.models import StateAffineModel
 
 BOUNDS_GAP = 1e-6  # relative to |G_0|, how tightly its bounds are stated
@@ -46,14 +47,18 @@ class StateAffineProof:
         return proof_document(claim, proof)
 
 
-def prove_state_affine(model: StateAffineModel) -> StateAffineProof | None:
-    """An exact proof, or None if the search finds none (or the model is of another form)."""
+def prove_state_affine(model: StateAffineModel) -> StateAffineProof | MatrixProof | None:
+    """An exact proof, or None if the search finds none.
+
+    By bounds of G_0 where the lagged coefficients are constant and G_0 is quadratic, one output;
+    else by a matrix inequality in the input.
+    """
     if (
         len(model.y) != 1
         or any(g.exponents.any() for g in model.G[1:])
         or (model.G[0].exponents.sum(axis=1) > 2).any()
     ):
-        return None
+        return prove_by_matrix(model)
     found = leading_bounds(model)
     if found is None:
         return None

@@ -52,9 +52,10 @@ class StateAffineClass:
 
 @dataclass(frozen=True, eq=False)
 class StateAffineRows:
-    """The rows of a dataset, and the way back from parameters to a model."""
+    """The rows of a dataset, their windows w (N, n_w), and the way back to a model."""
 
     rows: Rows
+    w: FloatArray
     dataset: Dataset
     left: tuple[IntArray, ...]
     right: IntArray
@@ -152,7 +153,7 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
         if len(model_class.u_range) != n_u:
             raise DataError(f"u_range has {len(model_class.u_range)} inputs, the data {n_u}")
         declared = np.array(model_class.u_range, dtype=np.float64)
-    return StateAffineRows(rows, dataset, left, right, R, window, y_scale, u_scale, declared)
+    return StateAffineRows(rows, w, dataset, left, right, R, window, y_scale, u_scale, declared)
 
 
 def _basis(degree: int, variables: int) -> IntArray:
