@@ -45,11 +45,13 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
     )
     if refusal is not None:
         raise CertificateRejected(refusal)
+    inputs = "every input (inputs are clipped to the model's range)"
+    if model.on_out_of_range == "refuse":
+        inputs = "every input in the model's range (others are refused)"
     return Decision(
         statement=(
             f"incremental stability: solutions with the same input approach each other at "
-            f"{rate:.4f} a sample of {model.period:g} s or faster, for every input (inputs are "
-            "clipped to the model's range),"
+            f"{rate:.4f} a sample of {model.period:g} s or faster, for {inputs},"
         ),
         margin=1.0 - rate,
     )

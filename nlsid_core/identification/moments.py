@@ -15,11 +15,13 @@ from functools import reduce
 from itertools import combinations
 from math import comb
 from operator import add
+from typing import ClassVar
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.models import MonotoneEquation
 from nlsid_core.trajectory import Trajectory
 
 DEGREES = (1, 3)  # of e
@@ -32,6 +34,7 @@ class MonotoneClass:
     lags: int
     delays: tuple[int, ...] | None = None
     degree: int = 3
+    kind: ClassVar[type[MonotoneEquation]] = MonotoneEquation
 
     def __post_init__(self) -> None:
         if self.lags < 1 or any(d < 0 for d in self.delays or ()):

@@ -60,6 +60,12 @@ class BlockCascade:
         if not (np.isfinite(self.period) and self.period > 0):
             raise DataError(f"period {self.period} s is not positive")
 
+    def __str__(self) -> str:
+        return (
+            f"block cascade: filters of orders {len(self.a1)} and {len(self.a2)}, "
+            f"{self.f.intervals} knot intervals, {self.phases} phases, {self.period:g} s a sample"
+        )
+
     @property
     def phases(self) -> int:
         """M, the instants a sample at which f is evaluated."""
