@@ -5,19 +5,20 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bags.chain.config import GridConfig, NonNegative, Positive, SignalConfig, _Section, read_yaml
+from bags.chain.config import GridConfig
+from bags.chain.sections import NonNegative, Positive, Section, SignalConfig, read_yaml
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1, strict=False)]
 
 
-class StateSignals(_Section):
+class StateSignals(Section):
     """The measured state (positions, then rates) and the inputs."""
 
     states: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
     inputs: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
 
 
-class StateIdentification(_Section):
+class StateIdentification(Section):
     """validation: bags that choose the degrees. refuse_above: % of error in free run.
 
     degrees: classes to try, the highest power of each state and input (default: a few).
@@ -32,7 +33,7 @@ class StateIdentification(_Section):
     biased_without_repeats: bool = False
 
 
-class MotionConfig(_Section):
+class MotionConfig(Section):
     """From `start` to `goal` (states) in `duration` s; weights relative to the box of the data."""
 
     start: Numbers
@@ -42,7 +43,7 @@ class MotionConfig(_Section):
     input_weight: Positive = 0.3
 
 
-class DisturbanceConfig(_Section):
+class DisturbanceConfig(Section):
     """form of the assumption, rate if it is fading; safety_factor over the largest run."""
 
     form: Literal["response", "peak", "energy", "fading"] = "response"
@@ -50,7 +51,7 @@ class DisturbanceConfig(_Section):
     rate: float = Field(default=1.0, gt=0.0, le=1.0)
 
 
-class SimulationConfig(_Section):
+class SimulationConfig(Section):
     """A robot of `bags.chain.plants` to record: peak torques in N·m, seconds of each excitation.
 
     runs: of the policy, to commission it, from starts up to `spread` of what the data box allows.
@@ -66,7 +67,7 @@ class SimulationConfig(_Section):
     seed: int = Field(default=0, ge=0)
 
 
-class TrackingConfig(_Section):
+class TrackingConfig(Section):
     """One robot's configuration file for `nlsid track`."""
 
     robot: str

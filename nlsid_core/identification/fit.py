@@ -61,9 +61,10 @@ class Candidate(Generic[M]):
         """100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation over `dataset`."""
         return simulation_percent(self.model, dataset, transient=self.transient)
 
-    def validate(self, dataset: Dataset) -> Validation:
+    def validate(self, dataset: Dataset, *, transient: int | None = None) -> Validation:
         """Simulation and prediction errors and the tests of the residuals over `dataset`."""
-        return validate(self.model, dataset, transient=self.transient)
+        skipped = self.transient if transient is None else transient
+        return validate(self.model, dataset, transient=skipped)
 
 
 @dataclass(frozen=True)
