@@ -12,7 +12,7 @@ from bags.pictures.choices import Scored, draw_comparison, draw_selection
 from bags.pictures.report import report_available
 from nlsid_core._json import write_atomically
 from nlsid_core.errors import DataError, Infeasible, SolverError
-from nlsid_core.identification import Model, Selection, describe, methods_of, select
+from nlsid_core.identification import Fit, Model, Selection, describe, methods_of, select
 from nlsid_core.identification.prediction import history
 
 
@@ -59,6 +59,7 @@ def select_bags(
         test=trials.test,
         iterations=base.iterations,
         transient=base.transient,
+        allow_unproved=base.allow_unproved,
         accept_untested_repeats=base.accept_untested_repeats,
         seed=base.seed,
         progress=part(progress, 0.3, 0.9),
@@ -104,17 +105,12 @@ def compare_bags(
     for number, section in enumerate(sections):
         label = describe(section.model_class)
         done = 0.3 + 0.7 * number / len(sections)
-        try:
-            fit = section.identify(
-                trials.train,
-                validation=trials.validation,
-                comparators=methods_of(section.model_class),
-                allow_unproved=True,
-                progress=part(progress, done, done + 0.7 / len(sections)),
-            )
-        except (DataError, SolverError) as refusal:
+        fit, refusal = _every_method(
+            section, trials, part(progress, done, done + 0.7 / len(sections))
+        )
+        if refusal:
             refusals.append(f"{label}: {refusal}")
-        else:
+        if fit is not None:
             found += [(label, candidate) for candidate in fit.candidates]
     if not found:
         raise Infeasible("no class has a model: " + "; ".join(refusals))
@@ -124,3 +120,25 @@ def compare_bags(
         for label, candidate in found
     )
     return Compared(rows, tuple(refusals), trials, start)
+
+
+def _every_method(
+    section: IdentificationConfig, trials: Trials, progress: Progress
+) -> tuple[Fit[Model] | None, str]:
+    """A fit with a candidate of every method there is one of, and why the configured has none."""
+    known = methods_of(section.model_class)
+    refusal = ""
+    for method in (section.method, *(m for m in known if m != section.method)):
+        try:
+            fit = section.model_copy(update={"method": method}).identify(
+                trials.train,
+                validation=trials.validation,
+                comparators=known,
+                allow_unproved=True,
+                progress=progress,
+            )
+        except (DataError, SolverError) as reason:
+            refusal = refusal or str(reason)
+        else:
+            return fit, refusal
+    return None, refusal

@@ -84,7 +84,10 @@ def write_identified(
     progress("drawing the report", 0.9)
     if report_available():
         files.append(out / documents.REPORT)
-        write_report(files[-1], fit, trials.train, trials.test, robot=config.robot)
+        write_report(
+            files[-1], fit, trials.train, trials.test,
+            validation=trials.validation, robot=config.robot,
+        )  # fmt: skip
     progress("done", 1.0)
     return Identified(fit, trials, tuple(files))
 

@@ -61,12 +61,13 @@ def draw_selection(selection: Selection[Model], options: Mapping[str, Sequence[o
             axes.annotate("no model", (nowhere, 0.02), xycoords=("data", "axes fraction"),
                           rotation=90, fontsize=7, color=colour, ha="center")  # fmt: skip
     axes.plot(*best, "o", ms=11, mfc="none", mec=plots.INK, mew=1.5, label="chosen")
-    axes.annotate(f"{best[1]:.2f} %", best, (0, 10), textcoords="offset points", fontsize=8,
-                  ha="center")  # fmt: skip
+    axes.annotate(f"{best[1]:.2f} %", best, (9, 7), textcoords="offset points", fontsize=8)
     if numeric:
         axes.xaxis.set_major_locator(MaxNLocator(integer=all(isinstance(v, int) for v in values)))
     else:
         axes.set_xticks(range(len(values)), [str(v) for v in values])
+    room = 0.06 * max(max(at) - min(at), 1.0)
+    axes.set_xlim(min(at) - room, max(at) + room)
     axes.set_xlabel(along)
     axes.set_ylabel("simulation error [%]")
     shown = [e for _, points in drawn for _, e, _ in points if np.isfinite(e)]
@@ -103,8 +104,9 @@ def draw_comparison(rows: Sequence[Scored]) -> bytes:
     axes.legend(
         handles=[Patch(color=plots.BLUE, label="proved stable"),
                  Patch(color=plots.GREY, label="not proved")],
-        fontsize=8, frameon=False, loc="upper right",
+        fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
     )  # fmt: skip
+    axes.set_ylim(-0.6, len(ranked) - 0.4)
     plots.tidy([axes])
     axes.grid(axis="y", visible=False)
     return plots.png(figure)

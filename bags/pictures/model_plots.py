@@ -20,6 +20,7 @@ MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 1000  # samples drawn of a trial: around its largest error
 DRAWN = 800  # points of a residual over time
 COLUMNS = 4
+LOGARITHMIC = 30.0  # largest over smallest value from which on an axis is logarithmic
 
 
 def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
@@ -99,15 +100,23 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
 
 
 def search_history(history: History) -> Figure:
-    """The value each step of the search reached."""
-    figure = Figure(figsize=(4.6, 3.0), layout="constrained")
-    axes = figure.subplots()
+    """The value each step of the search reached; choices by name, iterates as a line."""
     values = [step.value for step in history.steps]
-    axes.plot(np.arange(1, len(values) + 1), values, ".-", color=BLUE, lw=LINE, ms=5)
-    if min(values) > 0 and max(values) > 3 * min(values):
-        axes.set_yscale("log")
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("step", fontsize=8)
+    if all(step.what.rpartition(" ")[2].isdigit() for step in history.steps):
+        figure = Figure(figsize=(4.6, 3.0), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(np.arange(1, len(values) + 1), values, ".-", color=BLUE, lw=LINE, ms=5)
+        if min(values) > 0 and max(values) > LOGARITHMIC * min(values):
+            axes.set_yscale("log")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_xlabel("iterate", fontsize=8)
+    else:
+        figure = Figure(figsize=(6.2, 0.25 * len(values) + 0.8), layout="constrained")
+        axes = figure.subplots()
+        places = np.arange(len(values))[::-1]
+        colors = [BLUE if value == min(values) else GREY for value in values]
+        axes.barh(places, values, color=colors, height=0.6)
+        axes.set_yticks(places, [step.what for step in history.steps])
     axes.set_title(history.value, fontsize=8, loc="left")
     tidy([axes])
     return figure
@@ -151,12 +160,12 @@ def axis_name(trial: Trajectory, output: int) -> str:
 
 
 def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candidate[Model]) -> None:
+    title = "poles"
     axes.add_patch(Circle((0, 0), 1.0, fill=False, color=INK, lw=LINE))
     if chosen.proof is not None:
         rate = chosen.proof.rate
+        title += f", dashed: proved rate {rate:.4f}"
         axes.add_patch(Circle((0, 0), rate, fill=False, color=BLUE, ls="--", lw=LINE))
-        axes.text(0, 0.04 - rate, f"proved rate {rate:.3f}", color=BLUE, ha="center", va="bottom",
-                  fontsize=8)  # fmt: skip
     for (name, z), (marker, color) in zip(groups, (("x", RED), ("+", ORANGE)), strict=False):
         axes.plot(z.real, z.imag, marker, color=color, ms=7, label=name)
     if len(groups) > 1:
@@ -164,7 +173,7 @@ def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candida
     axes.set_aspect("equal")
     axes.set_xlim(-1.1, 1.1)
     axes.set_ylim(-1.1, 1.1)
-    axes.set_title("poles in the unit circle", fontsize=8, loc="left")
+    axes.set_title(title, fontsize=8, loc="left")
     tidy([axes])
 
 

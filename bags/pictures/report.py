@@ -20,6 +20,7 @@ h1 { font-size: 1.5rem } h2 { font-size: 1.1rem; margin-top: 2rem }
 table { border-collapse: collapse } th, td { padding: .3rem .8rem; text-align: right }
 th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
+ul { padding-left: 1.2rem }
 tbody tr { border-bottom: 1px solid #ddd } tr.chosen { background: #e8f1fa; font-weight: 600 }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
@@ -31,9 +32,19 @@ def report_available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def write_report(path: Path, fit: Fit[Model], train: Dataset, test: Dataset, *, robot: str) -> None:
+def write_report(
+    path: Path,
+    fit: Fit[Model],
+    train: Dataset,
+    test: Dataset,
+    *,
+    validation: Dataset | None = None,
+    robot: str,
+) -> None:
     """Write the page; needs the extra `report`."""
-    _json.write_atomically(path, page(fit, train, test, robot=robot).encode())
+    _json.write_atomically(
+        path, page(fit, train, test, validation=validation, robot=robot).encode()
+    )
 
 
 def write_margins(path: Path, replays: Sequence[Replay]) -> None:
@@ -43,7 +54,14 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
     _json.write_atomically(path, plots.png(plots.margins(replays)))
 
 
-def page(fit: Fit[Model], train: Dataset, test: Dataset, *, robot: str) -> str:
+def page(
+    fit: Fit[Model],
+    train: Dataset,
+    test: Dataset,
+    *,
+    validation: Dataset | None = None,
+    robot: str,
+) -> str:
     """The whole HTML page as text."""
     from bags.pictures import model_plots, plots  # matplotlib only where a report is drawn
 
@@ -52,6 +70,9 @@ def page(fit: Fit[Model], train: Dataset, test: Dataset, *, robot: str) -> str:
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
+    chosen_on = "" if validation is None else f"{len(validation)} validation trials, "
+    recordings = [(train, "training"), (validation, "validation"), (test, "test")]
+    listed = "".join(_recordings(data, use) for data, use in recordings if data is not None)
     rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
@@ -64,15 +85,15 @@ def page(fit: Fit[Model], train: Dataset, test: Dataset, *, robot: str) -> str:
 <th>stability</th></tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
 simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
-{len(train)} training trials, {len(test)} test trials; test trials were only used for this
-table and the pictures below.</p>
+{len(train)} training trials, {chosen_on}{len(test)} test trials; test trials were only used
+for this table and the pictures below.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
 {_residuals(chosen, test)}
 {_inside(fit)}
 <h2>Recordings</h2>
 <table class="left">
 <thead><tr><th>trial</th><th>samples</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
-<tbody>{_recordings(train, "training")}{_recordings(test, "test")}</tbody></table>
+<tbody>{listed}</tbody></table>
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """

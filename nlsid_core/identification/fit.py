@@ -86,6 +86,8 @@ class History:
         if not self.steps:
             return "solved directly"
         first, last = self.steps[0], self.steps[-1]
+        if len(self.steps) == 1:
+            return f"{self.value} {last.value:.4g}"
         return f"{self.value} {first.value:.4g} -> {last.value:.4g} in {len(self.steps)} steps"
 
 

@@ -106,12 +106,14 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     plain = plain_moments(train.trajectories, model_class, offsets)
     template = train.trajectories[0]
     trail: Trail[MonotoneEquation] = Trail(
-        task, lambda _: None, f"bound on the mean squared simulation error [{_unit(train)}²]"
+        task,
+        lambda _: None,
+        f"mean squared simulation error by the moments, at most [{_unit(train)}²]",
     )
 
     def solved(method: str, fit: MomentFit) -> tuple[MonotoneEquation, Proof]:
-        steps = (*trail.history.steps, Step(method, fit.bound))
-        trail.history = History(trail.history.value, steps)
+        if method == task.method:
+            trail.history = History(trail.history.value, (Step(method, fit.bound),))
         return fit.model, fit.proof
 
     def without_bias() -> MomentFit:

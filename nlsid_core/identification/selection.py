@@ -59,6 +59,7 @@ def select(
     test: Dataset | None = None,
     iterations: int = 40,
     transient: int = 0,
+    allow_unproved: bool = False,
     accept_untested_repeats: bool = False,
     seed: int = 0,
     executor: Executor | None = None,
@@ -66,8 +67,9 @@ def select(
 ) -> Selection[M]:
     """Identify every class on `train` and keep the one with the least error on `validation`.
 
-    A class that does not fit the data or has no proof counts as infinitely bad. Options are those
-    of `identify`; each class starts from the same seed. Raises Infeasible if no class has a model.
+    A class that does not fit the data or (unless `allow_unproved`) has no proof counts as
+    infinitely bad. Options are those of `identify`; each class starts from the same seed. Raises
+    Infeasible if no class has a model.
     """
     report = silent if progress is None else progress
     tried: list[Tried[M]] = []
@@ -83,6 +85,7 @@ def select(
                 test=test,
                 iterations=iterations,
                 transient=transient,
+                allow_unproved=allow_unproved,
                 accept_untested_repeats=accept_untested_repeats,
                 rng=np.random.default_rng(seed),
                 executor=executor,

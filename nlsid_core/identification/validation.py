@@ -185,16 +185,18 @@ def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) ->
 def prediction_percent(
     model: Model, dataset: Dataset, horizon: int, *, transient: int = 0
 ) -> float:
-    """The same error of predictions `horizon` samples ahead."""
-    n = history(model)
-    late = max(transient - n, 0)
+    """The same error, over the same samples, of predictions `horizon` samples ahead.
+
+    The first samples are predicted from the start of the trial, which is less than that ahead.
+    """
+    n, first = history(model), max(history(model), transient)
+    pairs = []
     with np.errstate(over="ignore", invalid="ignore"):
-        return _percent(
-            [
-                (trial.y[n + horizon - 1 + late :], predict(model, trial, horizon)[late:])
-                for trial in dataset
-            ]
-        )
+        for trial in dataset:
+            start = simulate_trial(model, trial)[: n + horizon - 1]
+            predicted = np.concatenate([start, predict(model, trial, horizon)])
+            pairs.append((trial.y[first:], predicted[first:]))
+    return _percent(pairs)
 
 
 def without_missing(trial: Trajectory, missing: FloatArray, *, shortest: int) -> tuple[
