@@ -39,9 +39,9 @@ class Task:
     executor: Executor | None = None
     progress: Progress = silent
 
-    def wants(self, *methods: str) -> bool:
-        """Whether one of these is asked for."""
-        return bool({self.method, *self.comparators} & set(methods))
+    def wants(self, method: str) -> bool:
+        """Whether it is asked for."""
+        return method == self.method or method in self.comparators
 
 
 class Trail(Generic[T]):
@@ -79,7 +79,7 @@ class Trail(Generic[T]):
     def follow(self, rows: Rows, model: Callable[[Iterate], T]) -> None:
         """The iterates of the robust simulation error; the first and the last are candidates."""
         task = self.task
-        if not task.wants(FIRST, FINAL):
+        if not (task.wants(FIRST) or task.wants(FINAL)):
             return
         iterations = task.iterations if task.wants(FINAL) else 1
         steps: list[Step] = []
