@@ -48,7 +48,7 @@ def write_saturating_bags(folder: Path) -> Path:
     """Six trials of unequal length: run_0 and run_1, run_2 and run_3 repeat one excitation."""
     for k in range(6):
         excitation, group = (k // 2, f"excitation {k // 2}") if k < 4 else (k, "")
-        samples = 500 + 60 * excitation
+        samples = 200 + 20 * excitation
         u = np.random.default_rng(excitation).uniform(-2.0, 2.0, samples)
         y = saturating().simulate(u) + 0.01 * np.random.default_rng(100 + k).standard_normal(
             samples
@@ -62,7 +62,7 @@ def write_coupled_bags(folder: Path) -> Path:
     A1, A2, B = MIMO
     for k in range(6):
         rng = np.random.default_rng(k)
-        u = rng.standard_normal((200 + 20 * k, 2))
+        u = rng.standard_normal((150 + 10 * k, 2))
         y = np.zeros_like(u)
         for t in range(2, len(u)):
             y[t] = A1 @ y[t - 1] + A2 @ y[t - 2] + B @ u[t - 1]

@@ -6,6 +6,8 @@ For one output, constant G_1 … G_n and quadratic q = G_0 on the box of clipped
   2. x⁺ = A(1/q) x with A(s) = S - s e₁[G_1 … G_n]; r²P - A(s)'PA(s) ≻ 0 at s = 1/ℓ and s = 1/h,
      hence for every s between: it is concave in s.
 Two solutions with the same input differ by Δ⁺ = A(1/q(w))Δ, so V = Δ'PΔ shrinks by r² a sample.
+For several outputs all of G_0 … G_n have to be constant; then P alone proves it, with A of the
+block row -G_0⁻¹[G_1 … G_n].
 Source: thesis Definition 2.3, (4.1); S-procedure for the box.
 """
 
@@ -24,25 +26,32 @@ Box = list[tuple[Fraction, Fraction]]
 
 
 def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
-    """Decide `{rate}` for the bound model with `{P, lower, upper, lower_box, upper_box}`."""
+    """Decide `{rate}` for the bound model with `{P, lower, upper, lower_box, upper_box}`.
+
+    With `{P}` alone where every coefficient of an output is constant.
+    """
     if set(about) != {"model"} or set(claim) != {"kind", "about", "rate"}:
         raise CertificateRejected("a state_affine_stability claim is about one file, the model")
     model = StateAffineModel.from_document(about["model"], source="model")
     rate = _json.number(claim, "rate", source="claim")
-    n, n_w = len(model), len(model.window)
-    refusal = contracts(
-        model,
-        rate,
-        P=_json.array(proof, "P", (n, n), source="proof"),
-        bounds=(
-            _json.number(proof, "lower", source="proof"),
-            _json.number(proof, "upper", source="proof"),
-        ),
-        multipliers=(
-            _json.array(proof, "lower_box", (n_w,), source="proof"),
-            _json.array(proof, "upper_box", (n_w,), source="proof"),
-        ),
-    )
+    states, n_w = len(model) * len(model.y), len(model.window)
+    P = _json.array(proof, "P", (states, states), source="proof")
+    if set(proof) == {"P"}:
+        refusal = contracts_constant(model, rate, P=P)
+    else:
+        refusal = contracts(
+            model,
+            rate,
+            P=P,
+            bounds=(
+                _json.number(proof, "lower", source="proof"),
+                _json.number(proof, "upper", source="proof"),
+            ),
+            multipliers=(
+                _json.array(proof, "lower_box", (n_w,), source="proof"),
+                _json.array(proof, "upper_box", (n_w,), source="proof"),
+            ),
+        )
     if refusal is not None:
         raise CertificateRejected(refusal)
     inputs = "every input (inputs are clipped to the model's range)"
@@ -94,6 +103,52 @@ def contracts(
         if not exact.is_positive_definite(decrease):
             return f"V = x'Px does not shrink by the stated rate {rate:.6g} at G_0 = {level}"
     return None
+
+
+def contracts_constant(model: StateAffineModel, rate: float, *, P: FloatArray) -> str | None:
+    """None if the claim holds exactly for constant G_0 … G_n of any number of outputs."""
+    r = Fraction(rate)
+    if not 0 < r < 1:
+        return f"rate is {rate:g}; stability needs 0 < rate < 1"
+    if any(g.exponents.any() for g in model.G):
+        return "coefficients of the outputs depend on the input; this proof is for constants"
+    A = block_matrix(model)
+    if A is None:
+        return "the leading coefficient G_0 is singular"
+    storage = exact.rational(P.tolist())
+    if not exact.is_positive_definite(storage):
+        return "P is not symmetric positive definite"
+    supply = [[r**2 * entry for entry in row] for row in storage]
+    decrease = exact.combine(supply, exact.congruence(A, storage), Fraction(-1))
+    if not exact.is_positive_definite(decrease):
+        return f"V = x'Px does not shrink by the stated rate {rate:.6g}"
+    return None
+
+
+def block_matrix(model: StateAffineModel) -> exact.Matrix | None:
+    """A of x = [ȳ(t-1); …; ȳ(t-n)] for constant coefficients; None if G_0 is singular.
+
+    Gauss-Jordan elimination on [G_0, G_1 … G_n] without rounding.
+    """
+    m, n = len(model.y), len(model)
+    constants = [
+        [[sum(map(Fraction, g.coefficients[:, a, b].tolist()), Fraction(0)) for b in range(m)]
+         for a in range(m)]
+        for g in model.G
+    ]  # fmt: skip
+    rows = [[entry for g in constants for entry in g[a]] for a in range(m)]
+    for k in range(m):
+        pivot = next((i for i in range(k, m) if rows[i][k] != 0), None)
+        if pivot is None:
+            return None
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [entry / rows[k][k] for entry in rows[k]]
+        for i in range(m):
+            if i != k:
+                factor = rows[i][k]
+                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
+    shifts = [[Fraction(int(j == i)) for j in range(n * m)] for i in range((n - 1) * m)]
+    return [[-entry for entry in row[m:]] for row in rows] + shifts
 
 
 def window_box(model: StateAffineModel) -> Box:
