@@ -6,8 +6,8 @@ For one output, constant G_1 … G_n and quadratic q = G_0 on the box of clipped
   2. x⁺ = A(1/q) x with A(s) = S - s e₁[G_1 … G_n]; r²P - A(s)'PA(s) ≻ 0 at s = 1/ℓ and s = 1/h,
      hence for every s between: it is concave in s.
 Two solutions with the same input differ by Δ⁺ = A(1/q(w))Δ, so V = Δ'PΔ shrinks by r² a sample.
-For several outputs all of G_0 … G_n have to be constant; then P alone proves it, with A of the
-block row -G_0⁻¹[G_1 … G_n].
+Where G_0 … G_n are all constant, as they have to be for several outputs, P alone proves it, with A
+of the block row -G_0⁻¹[G_1 … G_n].
 Source: thesis Definition 2.3, (4.1); S-procedure for the box.
 """
 

@@ -1,8 +1,9 @@
 """Search for the exact proof that a state-affine model is incrementally stable for every input.
 
 The bounds of G_0 on the input box are the tightest its S-procedure shows, and the storage function
-is common to both, at (nearly) the fastest rate there is one for. With several outputs there is a
-proof for constant coefficients of the outputs only.
+is common to both, at (nearly) the fastest rate there is one for. Where all coefficients of the
+outputs are constant, of one output or of several, the difference of two solutions is linear and P
+is found directly; for several outputs there is no other proof.
 """
 
 import warnings
@@ -51,9 +52,13 @@ class StateAffineProof:
 
 def prove_state_affine(model: StateAffineModel) -> StateAffineProof | None:
     """An exact proof, or None if the search finds none (or the model is of another form)."""
-    if len(model.y) > 1:
+    if not any(g.exponents.any() for g in model.G):
         return _prove_constant(model)
-    if any(g.exponents.any() for g in model.G[1:]) or (model.G[0].exponents.sum(axis=1) > 2).any():
+    if (
+        len(model.y) > 1
+        or any(g.exponents.any() for g in model.G[1:])
+        or (model.G[0].exponents.sum(axis=1) > 2).any()
+    ):
         return None
     found = leading_bounds(model)
     if found is None:
@@ -75,9 +80,7 @@ def prove_state_affine(model: StateAffineModel) -> StateAffineProof | None:
 
 
 def _prove_constant(model: StateAffineModel) -> StateAffineProof | None:
-    """The proof for several outputs: P solves (A/r)'P(A/r) - P + I = 0."""
-    if any(g.exponents.any() for g in model.G):
-        return None
+    """The proof for constant G_0 … G_n: P solves (A/r)'P(A/r) - P + I = 0."""
     exact = block_matrix(model)
     if exact is None:
         return None

@@ -86,7 +86,7 @@ class Trail(Generic[T]):
         started, last = time.perf_counter(), None
         for last in robust_simulation_error(rows, iterations=iterations):
             steps.append(Step(f"iterate {len(steps) + 1}", last.J))
-            if len(steps) == 1:
+            if len(steps) == 1 and task.wants(FIRST):
                 seconds, found = time.perf_counter() - started, model(last)
                 self._keep(FIRST, found, self.prove(found), seconds)
             done = 0.2 + 0.4 * len(steps) / iterations
