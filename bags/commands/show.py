@@ -26,7 +26,7 @@ COLOURS = {
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
-    table.add_column("method")
+    table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
     table.add_column("stability")

@@ -73,6 +73,7 @@ def draw_selection(selection: Selection[Model], options: Mapping[str, Sequence[o
     shown = [e for _, points in drawn for _, e, _ in points if np.isfinite(e)]
     if max(shown) > 5 * min(shown) > 0:
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
     axes.margins(y=0.15)
     axes.legend(fontsize=8, frameon=False)
     plots.tidy([axes])

@@ -17,7 +17,7 @@ from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.trajectory import Dataset, Trajectory
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
-LONGEST = 1000  # samples drawn of a trial: around its largest error
+LONGEST = 400  # samples drawn of a trial: around its largest error
 DRAWN = 800  # points of a residual over time
 COLUMNS = 4
 LOGARITHMIC = 30.0  # largest over smallest value from which on an axis is logarithmic
@@ -169,10 +169,10 @@ def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candida
     for (name, z), (marker, color) in zip(groups, (("x", RED), ("+", ORANGE)), strict=False):
         axes.plot(z.real, z.imag, marker, color=color, ms=7, label=name)
     if len(groups) > 1:
-        axes.legend(fontsize=7, frameon=False, loc="upper left")
+        axes.legend(fontsize=7, frameon=False, loc="upper center", ncols=len(groups))
     axes.set_aspect("equal")
     axes.set_xlim(-1.1, 1.1)
-    axes.set_ylim(-1.1, 1.1)
+    axes.set_ylim(-1.1, 1.1 if len(groups) == 1 else 1.4)
     axes.set_title(title, fontsize=8, loc="left")
     tidy([axes])
 

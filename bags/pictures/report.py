@@ -18,6 +18,7 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; marg
        padding: 0 1rem }
 h1 { font-size: 1.5rem } h2 { font-size: 1.1rem; margin-top: 2rem }
 table { border-collapse: collapse } th, td { padding: .3rem .8rem; text-align: right }
+th, td { white-space: nowrap } .left td { white-space: normal }
 th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
 ul { padding-left: 1.2rem }
@@ -70,7 +71,7 @@ def page(
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
-    chosen_on = "" if validation is None else f"{len(validation)} validation trials, "
+    chosen_on = "" if validation is None else f"{len(validation)} validation, "
     recordings = [(train, "training"), (validation, "validation"), (test, "test")]
     listed = "".join(_recordings(data, use) for data, use in recordings if data is not None)
     rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
@@ -85,7 +86,7 @@ def page(
 <th>stability</th></tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
 simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
-{len(train)} training trials, {chosen_on}{len(test)} test trials; test trials were only used
+Trials: {len(train)} training, {chosen_on}{len(test)} test; test trials were only used
 for this table and the pictures below.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
 {_residuals(chosen, test)}

@@ -45,7 +45,8 @@ class CascadeChoice:
     seconds: float
 
     def __str__(self) -> str:
-        return f"{self.phases} phases, {self.intervals} intervals, smoothing {self.smoothing:.0e}"
+        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
+        return f"{phases}, {self.intervals} intervals, smoothing {self.smoothing:.0e}"
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,9 @@ def block_cascade(
             train, validation, model_class,
             transient=task.transient, rng=task.rng, progress=task.progress,
         )  # fmt: skip
-        steps = [Step(str(choice), choice.validation_rms) for choice in found.choices]
+        *choices, last = found.choices
+        steps = [Step(str(choice), choice.validation_rms) for choice in choices]
+        steps.append(Step(f"{last}, minimised further", last.validation_rms))
         trail.history = History(trail.history.value, tuple(steps))
         return found.model, found.proof
 

@@ -61,9 +61,10 @@ class BlockCascade:
             raise DataError(f"period {self.period} s is not positive")
 
     def __str__(self) -> str:
+        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
         return (
             f"block cascade: filters of orders {len(self.a1)} and {len(self.a2)}, "
-            f"{self.f.intervals} knot intervals, {self.phases} phases, {self.period:g} s a sample"
+            f"{self.f.intervals} knot intervals, {phases}, {self.period:g} s a sample"
         )
 
     @property
