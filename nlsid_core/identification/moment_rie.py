@@ -16,12 +16,7 @@ from nlsid_core._types import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification.moment_inequalities import SPLITS, AffineMatrix, Layout
-from nlsid_core.identification.moments import (
-    Moments,
-    MonotoneClass,
-    Offsets,
-    refuse_unexcited,
-)
+from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
 from nlsid_core.identification.monotone_proof import MonotoneProof, prove_monotone_equation
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.trajectory import Trajectory
@@ -66,11 +61,9 @@ def minimise_moment_rie(
     """The stable model with the least bound on these moments, and its exact proof.
 
     template: names, units and sample time. kappa: bound on |R|_F in the model's units (None: none).
-    Raises DataError if the moments are not those of a signal or the input excites too little of the
-    window, Infeasible if the minimiser has no
+    Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
     exact proof, SolverError if the solver gives up.
     """
-    refuse_unexcited(moments, model_class, template, offsets)
     problem = _Problem.of(moments, model_class.lags)
     solution = problem.solve(kappa=kappa)
     x = problem.columns * solution.x

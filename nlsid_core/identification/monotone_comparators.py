@@ -16,12 +16,7 @@ from nlsid_core._types import FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError
 from nlsid_core.identification.moment_rie import equation
-from nlsid_core.identification.moments import (
-    Moments,
-    MonotoneClass,
-    Offsets,
-    refuse_unexcited,
-)
+from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.models.monotone_equation import is_increasing
 from nlsid_core.trajectory import Trajectory
@@ -39,10 +34,8 @@ def least_squares_equation(
 ) -> MonotoneEquation:
     """Minimise the mean squared equation error over increasing e; nothing makes the result stable.
 
-    e' ≥ ½ is [[c₁ - ½, c₂], [c₂, 3c₃]] ⪰ 0. Raises DataError if the input excites too little,
-    SolverError if the solver gives up.
+    e' ≥ ½ is [[c₁ - ½, c₂], [c₂, 3c₃]] ⪰ 0. Raises SolverError if the solver gives up.
     """
-    refuse_unexcited(moments, model_class, template, offsets)
     M = moments.matrix()
     size = len(M)
     D = np.sqrt(np.maximum(np.diag(M), np.finfo(float).tiny))

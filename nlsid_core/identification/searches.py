@@ -1,13 +1,13 @@
 """How the models of each class are found: which methods there are, and the search itself."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
 from nlsid_core.identification.certified import certified_simulation_error
 from nlsid_core.identification.contraction import prove_state_affine
@@ -27,7 +27,12 @@ from nlsid_core.identification.fit import (
 from nlsid_core.identification.from_repeats import identify_from_repeats
 from nlsid_core.identification.least_squares import least_squares
 from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
-from nlsid_core.identification.moments import MonotoneClass, offsets_of, plain_moments
+from nlsid_core.identification.moments import (
+    MonotoneClass,
+    offsets_of,
+    plain_moments,
+    refuse_unexcited,
+)
 from nlsid_core.identification.monotone_comparators import (
     least_squares_equation,
     minimise_monotone_simulation_error,
@@ -42,6 +47,7 @@ from nlsid_core.identification.state_affine import (
     build_state_affine_rows,
 )
 from nlsid_core.identification.trail import Task, Trail
+from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
 from nlsid_core.trajectory import Dataset
 
@@ -65,7 +71,7 @@ def state_affine(
     """State-affine models, of several inputs and outputs."""
     problem = build_state_affine_rows(train, model_class)
     trail: Trail[StateAffineModel] = Trail(task, prove_state_affine, BOUND)
-    trail.add(LEAST_SQUARES, lambda: equation_error(problem))
+    trail.add(LEAST_SQUARES, lambda: state_affine_equation_error(problem))
     if problem.has_constant_lags:
         trail.add(RIE, lambda: robust_identification_error(problem)[0])
     trail.follow(problem.rows, lambda i: problem.model(i.theta, i.p))
@@ -107,6 +113,7 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     offsets = offsets_of(train.trajectories)
     plain = plain_moments(train.trajectories, model_class, offsets)
     template = train.trajectories[0]
+    refuse_unexcited(plain, model_class, template, offsets)
     trail: Trail[MonotoneEquation] = Trail(
         task,
         lambda _: None,
@@ -127,12 +134,31 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     def biased() -> MomentFit:
         return minimise_moment_rie(plain, model_class, template, offsets)
 
-    trail.add(LEAST_SQUARES, lambda: least_squares_equation(plain, model_class, template, offsets))
+    def equation_error() -> MonotoneEquation:
+        return least_squares_equation(plain, model_class, template, offsets)
+
+    trail.add(LEAST_SQUARES, equation_error)
     trail.add_proved(RIE, lambda: solved(RIE, biased()))
     if train.repeats() or task.method == UNBIASED_RIE:
         trail.add_proved(UNBIASED_RIE, lambda: solved(UNBIASED_RIE, without_bias()))
-    trail.add(SEM, lambda: minimise_monotone_simulation_error(biased().model, train.trajectories))
+    starts = (equation_error, lambda: biased().model)
+    trail.add(SEM, lambda: _best_minimum(starts, train))
     return trail
+
+
+def _best_minimum(
+    starts: Sequence[Callable[[], MonotoneEquation]], train: Dataset
+) -> MonotoneEquation:
+    """The better of the local minima of the simulation error; DataError if every start diverges."""
+    found, reason = [], DataError("no start")
+    for start in starts:
+        try:
+            found.append(minimise_monotone_simulation_error(start(), train.trajectories))
+        except (DataError, SolverError) as refusal:
+            reason = DataError(str(refusal))
+    if not found:
+        raise reason
+    return min(found, key=lambda model: simulation_percent(model, train))
 
 
 @dataclass(frozen=True)
@@ -178,7 +204,7 @@ def methods_of(model_class: object) -> tuple[str, ...]:
     return tuple(method for method in offer.methods if method not in refused)
 
 
-def equation_error(problem: StateAffineRows) -> StateAffineModel:
+def state_affine_equation_error(problem: StateAffineRows) -> StateAffineModel:
     """Least squares on the equation error with G_0 normalised to 1 at its constant term."""
     rows = problem.rows
     fixed = rows.identity != 0.0
