@@ -21,7 +21,7 @@ from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import heat_exchanger, percent, single
 from nlsid_core import _json
-from nlsid_core.identification.certified import certified_simulation_error
+from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.contraction import prove_state_affine
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
@@ -74,6 +74,11 @@ def measure(data: Path, n: int) -> dict[str, float | bool]:
         _json.write_document(path, proof.document(model, "model.json"))
         keys["certified_proved"] = is_proved(path)
     keys["certified_rate"] = proof.rate
+    started = time.perf_counter()
+    lowest = descend_certified(problem, model, proof)
+    keys["last_step_seconds"] = time.perf_counter() - started
+    keys["last_step"] = score(lowest)
+    keys["last_step_proved"] = prove_state_affine(lowest) is not None
     return keys
 
 
@@ -83,9 +88,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with exchanger.dat")
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     arguments = parser.parse_args()
-    started = time.perf_counter()
+    started, processor = time.perf_counter(), time.process_time()
     keys = {f"n{n}": measure(arguments.data, n) for n in (2, 3, 4)}
-    seconds = time.perf_counter() - started
+    seconds, processor = time.perf_counter() - started, time.process_time() - processor
     print(f"heat exchanger, test error [%], ours (published), {describe()}\n")
     print(f"{'':40s}" + "".join(f"{name:>18s}" for name in keys))
     for label, key in (
@@ -94,6 +99,7 @@ def main() -> None:
         ("  5th iterate", "fifth"),
         (f"  converged (at most {ITERATES})", "converged"),
         ("  stable for every input", "certified"),
+        ("  and the simulation error minimised", "last_step"),
     ):
         published = PUBLISHED.get(key, ("-",) * 3)
         cells = zip(keys.values(), published, strict=True)
@@ -102,9 +108,9 @@ def main() -> None:
                        ("  seconds, converged", "seconds"),
                        ("  seconds, stable for every input", "certified_seconds")):  # fmt: skip
         print(f"{label:40s}" + "".join(f"{entry[key]!s:>18.8s}" for entry in keys.values()))
-    print(f"\nwhole benchmark {seconds:.1f} s")
+    print(f"\nwhole benchmark {seconds:.1f} s, {processor:.1f} s of one processor")
     if arguments.json:
-        print(json.dumps({**keys, "seconds": seconds}))
+        print(json.dumps({**keys, "seconds": seconds, "processor_seconds": processor}))
 
 
 if __name__ == "__main__":

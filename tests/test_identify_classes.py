@@ -9,8 +9,9 @@ import pytest
 
 from nlsid_core import _json
 from nlsid_core.certificate import check
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification import (
+    CERTIFIED_SEM,
     LEAST_SQUARES,
     METHODS,
     RIE,
@@ -330,3 +331,29 @@ def test_documents_of_each_class_validate_against_the_published_schemas(
     bent = fit.model.document() | ({"b1": []} if name == "block_cascade" else {"e": [1.0]})
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(bent, _json.load_document(SCHEMAS / f"{name}.schema.json"))
+
+
+# -- the last step -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model_class", [LinearClass(2), StateAffineClass(2, leading_degree=1)])
+def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
+    train: Dataset, model_class: LinearClass | StateAffineClass
+) -> None:
+    before = "rse" if isinstance(model_class, LinearClass) else "rse_certified"
+    fit = identify(train, model_class, method="sem_certified", comparators=[before], iterations=4)
+    errors = fit.errors["train"]
+    assert fit.proof.rate < 1.0
+    assert errors[CERTIFIED_SEM] <= errors[METHODS[before]] * (1 + 1e-9)
+
+
+def test_several_outputs_have_no_certified_iterates_and_say_what_to_use() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, 2))
+    data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
+    with pytest.raises(ShapeError, match="certified iterates are for one output"):
+        identify(data, StateAffineClass(1), method="rse_certified", comparators=())
+    beside = identify(
+        data, StateAffineClass(1), comparators=["rse_certified"], iterations=2, allow_unproved=True
+    )
+    assert beside.methods == ("robust simulation error, final iterate",)

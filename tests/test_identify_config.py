@@ -45,7 +45,7 @@ def test_each_section_says_a_model_class(
         ({"lags": 2, "orders": [1, 2]},
          r"identification.orders: there is no such key; there are: .*lags \(found \[1, 2\]\)"),
         ({"lags": 2, "method": "magic"},
-         r"identification.method: Input should be 'rse', .* or 'sem' \(found 'magic'\)"),
+         r"identification.method: Input should be 'rse', .* or 'sem_certified' \(found 'magic'\)"),
         ({"lags": 2, "seed": 1}, "identification.seed: there is no such key"),
         ({"model": "state_affine", "lags": 2, "lagged_degree": 1, "method": "rse_certified"},
          "method 'rse_certified' is not for these degrees"),

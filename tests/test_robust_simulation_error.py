@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from nlsid_core.identification.bound import Bound
-from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.newton import SchurBarrier, minimise
 from nlsid_core.identification.prediction import one_step_residual
-from nlsid_core.identification.rie import robust_identification_error
+from nlsid_core.identification.rie import IdentificationErrorBound, robust_identification_error
 from nlsid_core.identification.rows import Rows
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.state_affine import (
@@ -99,14 +99,20 @@ def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
     np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=EXACT * abs(expected).max())
     np.testing.assert_allclose(hessian, reduced, rtol=1e-7, atol=1e-9 * abs(reduced).max())
 
-    sign, log_determinant = np.linalg.slogdet(K)
-    assert sign == 1.0
-    assert point.factor.log_determinant == pytest.approx(log_determinant, rel=EXACT)
-    np.testing.assert_allclose(
-        bound.log_determinant_gradient(point),
-        [np.trace(inverse @ S) for S in slopes],
-        rtol=1e-8, atol=1e-9,
-    )  # fmt: skip
+    U = np.linalg.qr(np.random.default_rng(2).standard_normal((len(rows), 3)))[0]
+    barrier = SchurBarrier(bound, U)
+    middle = U.T @ inverse @ U
+    assert barrier.value(point) == pytest.approx(np.linalg.slogdet(middle)[1], rel=1e-9)
+    moved = [-U.T @ inverse @ S @ inverse @ U for S in slopes]
+    weights = np.linalg.inv(middle)
+    slope, curvature = barrier.derivatives(point)
+    np.testing.assert_allclose(slope, [np.trace(weights @ d) for d in moved], rtol=1e-7, atol=1e-9)
+    second = [
+        [2.0 * np.trace(weights @ U.T @ inverse @ S @ inverse @ T @ inverse @ U)
+         - np.trace(weights @ d @ weights @ c) for T, c in zip(slopes, moved, strict=True)]
+        for S, d in zip(slopes, moved, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-8 * np.abs(second).max())
 
 
 @pytest.mark.parametrize("outputs", [1, 2])
@@ -224,3 +230,56 @@ def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19()
         z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
         responses = np.linalg.inv(z[:, None, None] * np.eye(2) - A)[:, 0, 0]
         assert np.max(abs(responses)) ** 2 * (errors @ errors) <= J * (1 + SOLVER)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("lagged_degree", [0, 1])
+def test_the_identification_error_is_the_worst_case_over_states_and_above_both_bounds(
+    outputs: int, lagged_degree: int
+) -> None:
+    """(2.28) maximised row by row, from the polynomials of the model, for the P that was found."""
+    stacked = problem(
+        trials=1, samples=120, outputs=outputs, noise=0.1,
+        model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+    )  # fmt: skip
+    bound = IdentificationErrorBound(stacked)
+    found = minimise(bound, bound.start(), inequalities=(bound.storage(),)).point
+    n_g, m = len(stacked.rows.identity), outputs
+    model = stacked.model(found.theta[:n_g], found.p)
+    P = np.zeros((2 * m, 2 * m))
+    P[np.triu_indices(2 * m)] = found.theta[n_g:]
+    P = P + np.triu(P, 1).T
+    trial = stacked.dataset.trajectories[0]
+    y = (trial.y - model.y_offset) / model.y_scale
+    w = model.windows(trial.u)
+    lead, lags = model.G[0](w), np.concatenate([g(w) for g in model.G[1:]], axis=-1)
+    rng, total = np.random.default_rng(0), 0.0
+    for row, t in enumerate(range(2, len(trial))):
+        past = np.concatenate([y[t - 1], y[t - 2]])
+        error = lead[row] @ y[t] + lags[row] @ past + model.p(w)[row]
+
+        def integrand(z: np.ndarray, row: int = row, error: np.ndarray = error) -> float:
+            gap, nu = z[: 2 * m], z[2 * m :]
+            after = np.concatenate([nu, gap[:m]])
+            h = lead[row] @ nu + lags[row] @ gap + error
+            return float(gap[:m] @ gap[:m] - gap @ P @ gap + after @ P @ after - 2.0 * nu @ h)
+
+        unit = np.eye(3 * m)
+        zero, ones = integrand(np.zeros(3 * m)), [integrand(e) for e in unit]
+        minus = [integrand(-e) for e in unit]
+        slope = 0.5 * (np.array(ones) - np.array(minus))
+        square = np.array([
+            [0.5 * (integrand(a + b) - integrand(a) - integrand(b) + zero) for a in unit]
+            for b in unit
+        ])  # fmt: skip
+        worst = -0.5 * np.linalg.solve(square, slope)
+        assert np.linalg.eigvalsh(square)[-1] < 0.0
+        total += integrand(worst)
+        assert integrand(worst) >= integrand(worst + 0.1 * rng.standard_normal(3 * m))
+    assert pytest.approx(total, rel=1e-7) == found.J
+    start = bound.at(bound.start()).J
+    assert 0.9 * start > found.J
+    best = minimise(Bound(stacked.rows, None), stacked.rows.identity).point
+    assert best.J <= found.J * (1 + SOLVER)
+    simulated = (model.simulate(trial.u, trial.y[:2]) - trial.y) / model.y_scale
+    assert np.sum(simulated**2) <= found.J * (1 + EXACT)

@@ -139,9 +139,9 @@ def test_another_model_with_right_digests_is_rejected(
         (lambda _: {"P": np.eye(4).tolist()}, "does not shrink"),
         (lambda _: {"P": np.eye(2).tolist()}, "should have shape"),
         (lambda p: {"P": np.triu(p["P"]).tolist()}, "positive definite"),
-        (lambda p: p | {"note": 1}, "lower"),
+        (lambda p: p | {"note": 1}, "should have shape"),
         (lambda p: p | {"lower": 1.0, "upper": 1.0, "lower_box": [1.0], "upper_box": [1.0]},
-         "this proof is for one"),
+         "should have shape"),
     ],
 )  # fmt: skip
 def test_a_forged_proof_is_rejected(

@@ -1,6 +1,5 @@
 """The convex sets of stable models: what they contain, what they exclude, exact proofs."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from examples import not_a_contraction
+from nlsid_core import _json
 from nlsid_core.certificate import check, proof_document
 from nlsid_core.errors import CertificateRejected, Infeasible, ShapeError, SolverError
 from nlsid_core.identification import stable_sets
@@ -40,15 +40,17 @@ def random_matrix(seed: int, radius: float) -> np.ndarray:
 def test_example_2_3_1_gives_the_published_slope_and_an_exact_proof(tmp_path: Path) -> None:
     computed, published = not_a_contraction.example()
     assert computed == pytest.approx(published, abs=5e-4)
-    document = not_a_contraction.document()
+    model, proof = not_a_contraction.model, not_a_contraction.proof()
     path = tmp_path / "example.proof.json"
-    path.write_text(json.dumps(document))
-    assert check(path).statement.startswith("matrix inequality")
-    claim = json.loads(json.dumps(document["claim"]))
-    corner = claim["matrix"][0][0]
-    constant = corner["exponents"].index([0])
-    corner["coefficients"][constant] = float(corner["coefficients"][constant]) - 1.6
-    path.write_text(json.dumps(proof_document(claim, document["proof"])))
+    _json.write_document(tmp_path / "model.json", model.document())
+    _json.write_document(path, proof.document(model, "model.json"))
+    assert "for every input" in check(path).statement
+    steeper = model.document()
+    steeper["h"]["coefficients"][-1] = [-0.6]
+    _json.write_document(tmp_path / "model.json", steeper)
+    document = proof.document(model, "model.json")
+    document["claim"]["about"]["model"]["digest"] = _json.digest(steeper)
+    _json.write_document(path, proof_document(document["claim"], document["proof"]))
     with pytest.raises(CertificateRejected):
         check(path)
 
@@ -82,7 +84,7 @@ def test_proposition_2_14_stable_matrices_satisfy_lemma_2_13(seed: int, radius: 
     e, f = linear_map(P, names), linear_map(P @ A, names)
     for condition in (stable_sets.derivatives, stable_sets.increments):
         assert feasible(
-            condition(e, f, P, names, delta=0.5), names=("x0", "x1", "x0^", "x1^")
+            condition(e, f, P, names, delta=0.5), names=("x0", "x1", "x0~", "x1~")
         )  # fmt: skip
 
 
@@ -111,13 +113,13 @@ def test_lemmas_2_10_and_2_11_tell_stable_delay_models_from_unstable_ones(
     a1: float, a2: float, stable: bool
 ) -> None:
     h, shift = delayed(a1, a2)
-    names, hats = ["x0", "x1"], ["x0^", "x1^"]
+    names, gaps = ["x0", "x1"], ["x0~", "x1~"]
     P = symmetric_template("P", 2)
-    gap = np.array(variables(names)) - np.array(variables(hats))
+    gap = np.array(variables(gaps))
     V = gap @ P @ gap
     pairs = stable_sets.implicit_increments(h, shift, V, ["v"], names, delta=0.01)
     positive = SumOfSquares(V)
-    everything = ("v", "v^", *names, *hats)
+    everything = ("v", "v~", *names, *gaps)
     assert feasible(pairs, positive, names=everything) == stable
     slopes = stable_sets.implicit_derivatives(h, shift, P, ["v"], names, delta=0.01)
     assert feasible(slopes, positive, names=everything) == stable
@@ -130,7 +132,7 @@ def test_proposition_2_7_contains_its_centre_and_not_its_negative() -> None:
         e = np.array([sign * centre[0]])
         assert feasible(stable_sets.invertible(e, centre, ["x"]), names=("x",)) == contained
         pairs = stable_sets.invertible_increments(e, centre, ["x"])
-        assert feasible(pairs, names=("x", "x^")) == contained
+        assert feasible(pairs, names=("x", "x~")) == contained
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:

@@ -11,7 +11,7 @@ from bags.monitoring import documents
 from bags.pictures.choices import Scored, draw_comparison, draw_selection
 from bags.pictures.report import report_available
 from nlsid_core._json import write_atomically
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.identification import Fit, Model, Selection, describe, methods_of, select
 from nlsid_core.identification.prediction import history
 
@@ -137,7 +137,7 @@ def _every_method(
                 allow_unproved=True,
                 progress=progress,
             )
-        except (DataError, SolverError) as reason:
+        except NlsidError as reason:
             refusal = refusal or str(reason)
         else:
             return fit, refusal

@@ -130,7 +130,7 @@ class LinearConfig(_Identification):
     hidden: ClassVar[frozenset[str]] = frozenset({"seed", "accept_untested_repeats"})
     model: Literal["linear"] = "linear"
     lags: Lags
-    method: Literal["rse", "rse_first", "least_squares", "sem"] = "rse"
+    method: Literal["rse", "rse_first", "least_squares", "sem", "sem_certified"] = "rse"
 
     @property
     def model_class(self) -> LinearClass:
@@ -155,7 +155,9 @@ class StateAffineConfig(_Identification):
     right_degree: Degree = 1
     input_range: Ranges | None = None
     on_out_of_range: Literal["clip", "refuse"] = "clip"
-    method: Literal["rse", "rse_first", "rse_certified", "rie", "least_squares"] = "rse"
+    method: Literal[
+        "rse", "rse_first", "rse_certified", "sem_certified", "rie", "least_squares"
+    ] = "rse"
 
     @property
     def model_class(self) -> StateAffineClass:

@@ -56,6 +56,7 @@ CLAIMS: Mapping[str, Decide] = MappingProxyType(
         "matrix_inequality": nonnegative.decide_matrix,
         "region_of_attraction": attraction.decide,
         "implicit_stability": implicit.decide,
+        "well_posedness": implicit.decide_well_posed,
         "trajectory_funnel": _trajectory_funnel,
     }
 )

@@ -6,8 +6,8 @@ For one output, constant G_1 … G_n and quadratic q = G_0 on the box of clipped
   2. x⁺ = A(1/q) x with A(s) = S - s e₁[G_1 … G_n]; r²P - A(s)'PA(s) ≻ 0 at s = 1/ℓ and s = 1/h,
      hence for every s between: it is concave in s.
 Two solutions with the same input differ by Δ⁺ = A(1/q(w))Δ, so V = Δ'PΔ shrinks by r² a sample.
-Where G_0 … G_n are all constant, as they have to be for several outputs, P alone proves it, with A
-of the block row -G_0⁻¹[G_1 … G_n].
+Where G_0 … G_n are all constant, of one output or of several, P alone proves it, with A of the
+block row -G_0⁻¹[G_1 … G_n].
 Source: thesis Definition 2.3, (4.1); S-procedure for the box.
 """
 
@@ -16,44 +16,36 @@ from fractions import Fraction
 
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, Json
-from nlsid_core.certificate import exact
+from nlsid_core.certificate import exact, state_affine_matrix
+from nlsid_core.certificate.state_affine_matrix import Box, window_box
 from nlsid_core.certificate.verdict import Decision
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.state_affine import StateAffineModel
 
-Box = list[tuple[Fraction, Fraction]]
-
 
 def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
-    """Decide `{rate}` for the bound model with `{P, lower, upper, lower_box, upper_box}`.
+    """Decide `{rate}` for the bound model: one of three forms of proof.
 
-    With `{P}` alone where every coefficient of an output is constant.
+    `{P}` where every coefficient of an output is constant; `{P, lower, upper, lower_box,
+    upper_box}` as above; `{P, T, gram, multipliers}` for any model of the class, as in
+    `state_affine_matrix`.
     """
     if set(about) != {"model"} or set(claim) != {"kind", "about", "rate"}:
         raise CertificateRejected("a state_affine_stability claim is about one file, the model")
     model = StateAffineModel.from_document(about["model"], source="model")
     rate = _json.number(claim, "rate", source="claim")
-    states, n_w = len(model) * len(model.y), len(model.window)
-    P = _json.array(proof, "P", (states, states), source="proof")
-    if set(proof) == {"P"}:
-        refusal = contracts_constant(model, rate, P=P)
-    else:
-        refusal = contracts(
-            model,
-            rate,
-            P=P,
-            bounds=(
-                _json.number(proof, "lower", source="proof"),
-                _json.number(proof, "upper", source="proof"),
-            ),
-            multipliers=(
-                _json.array(proof, "lower_box", (n_w,), source="proof"),
-                _json.array(proof, "upper_box", (n_w,), source="proof"),
-            ),
+    if "T" in proof:
+        state_affine_matrix.decide(model, rate, proof)
+    elif set(proof) == {"P"}:
+        states = len(model) * len(model.y)
+        refusal = contracts_constant(
+            model, rate, P=_json.array(proof, "P", (states, states), source="proof")
         )
-    if refusal is not None:
-        raise CertificateRejected(refusal)
+        if refusal is not None:
+            raise CertificateRejected(refusal)
+    else:
+        _decide_bounds(model, rate, proof)
     inputs = "every input (inputs are clipped to the model's range)"
     if model.on_out_of_range == "refuse":
         inputs = "every input in the model's range (others are refused)"
@@ -64,6 +56,25 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
         ),
         margin=1.0 - rate,
     )
+
+
+def _decide_bounds(model: StateAffineModel, rate: float, proof: Json) -> None:
+    n, n_w = len(model), len(model.window)
+    refusal = contracts(
+        model,
+        rate,
+        P=_json.array(proof, "P", (n, n), source="proof"),
+        bounds=(
+            _json.number(proof, "lower", source="proof"),
+            _json.number(proof, "upper", source="proof"),
+        ),
+        multipliers=(
+            _json.array(proof, "lower_box", (n_w,), source="proof"),
+            _json.array(proof, "upper_box", (n_w,), source="proof"),
+        ),
+    )
+    if refusal is not None:
+        raise CertificateRejected(refusal)
 
 
 def contracts(
@@ -149,16 +160,6 @@ def block_matrix(model: StateAffineModel) -> exact.Matrix | None:
                 rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
     shifts = [[Fraction(int(j == i)) for j in range(n * m)] for i in range((n - 1) * m)]
     return [[-entry for entry in row[m:]] for row in rows] + shifts
-
-
-def window_box(model: StateAffineModel) -> Box:
-    """Exact range of each entry of w: the clipped inputs, normalised without rounding."""
-    box = []
-    for i, _ in model.window:
-        offset, scale = (Fraction(float(v[i])) for v in (model.u_offset, model.u_scale))
-        low, high = ((Fraction(float(end)) - offset) / scale for end in model.u_range[i])
-        box.append((low, high))
-    return box
 
 
 def slack_matrix(

@@ -9,6 +9,7 @@ from nlsid_core.identification.cascade_proof import CascadeProof, prove_block_ca
 from nlsid_core.identification.contraction import StateAffineProof, prove_state_affine
 from nlsid_core.identification.fit import (
     CERTIFIED,
+    CERTIFIED_SEM,
     FINAL,
     FIRST,
     LEAST_SQUARES,
@@ -45,6 +46,7 @@ from nlsid_core.identification.validation import (
 
 __all__ = [
     "CERTIFIED",
+    "CERTIFIED_SEM",
     "FINAL",
     "FIRST",
     "LEAST_SQUARES",

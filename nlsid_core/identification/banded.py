@@ -28,19 +28,43 @@ def shift(x: FloatArray, D: int) -> FloatArray:
 
 
 def times(G: Diagonals, x: FloatArray) -> FloatArray:
-    """G x."""
+    """G x for x (N,) or (N, m)."""
     result = np.zeros_like(x)
     for D, diagonal in G.items():
-        result += diagonal * shift(x, D)
+        result += (diagonal if x.ndim == 1 else diagonal[:, None]) * shift(x, D)
     return result
 
 
 def transposed_times(G: Diagonals, x: FloatArray) -> FloatArray:
-    """G' x."""
+    """G' x for x (N,)."""
     result = np.zeros_like(x)
     for D, diagonal in G.items():
         result += shift(diagonal * x, -D)
     return result
+
+
+def product(G: Diagonals, H: Diagonals) -> Diagonals:
+    """GH by diagonals."""
+    result: dict[int, FloatArray] = {}
+    for D, a in G.items():
+        for E, b in H.items():
+            result[D + E] = result.get(D + E, 0.0) + a * shift(b, D)
+    return result
+
+
+def lower_band(K: Diagonals) -> FloatArray:
+    """(bandwidth + 1, N): the diagonals D ≥ 0 of K as LAPACK stores them, [D, s] = (s + D, s)."""
+    N = len(next(iter(K.values())))
+    band = np.zeros((max(K) + 1, N))
+    for D, diagonal in K.items():
+        if D >= 0:
+            band[D, : N - D] = diagonal[D:]
+    return band
+
+
+def diagonals_of(L: FloatArray) -> Diagonals:
+    """The lower band L (bandwidth + 1, N), as LAPACK stores it, by diagonals."""
+    return {D: shift(row, D) for D, row in enumerate(L)}
 
 
 def symmetric_product(G: Diagonals, H: Diagonals, bandwidth: int) -> FloatArray:
@@ -83,31 +107,6 @@ class Factor:
         return np.asarray(solved.reshape(B.shape, order="F"))
 
     @property
-    def log_determinant(self) -> float:
-        """log det K."""
-        return float(2.0 * np.log(self.L[0]).sum())
-
-    @property
-    def smallest_pivot(self) -> float:
-        """The smallest pivot of the elimination as a part of the median one."""
-        return float((self.L[0].min() / np.median(self.L[0])) ** 2)
-
-    def inverse_band(self) -> FloatArray:
-        """(bandwidth + 1, N): the entries of K⁻¹ on the band of K, by the recursion
-        K⁻¹ = L⁻ᵀL⁻¹ read from the last column to the first, O(N·bandwidth²).
-        """
-        L = self.L
-        B, N = L.shape[0] - 1, L.shape[1]
-        Z = np.zeros((B + 1, N))
-        window = np.zeros((B, B))  # K⁻¹ on rows and columns s+1 … s+B
-        for s in range(N - 1, -1, -1):
-            ratio = L[1:, s] / L[0, s]
-            ratio[max(0, N - 1 - s) :] = 0.0
-            below = -window @ ratio
-            Z[0, s] = 1.0 / L[0, s] ** 2 - ratio @ below
-            Z[1:, s] = below
-            if B:
-                window[1:, 1:] = window[:-1, :-1].copy()
-                window[0, 0] = Z[0, s]
-                window[0, 1:] = window[1:, 0] = below[:-1]
-        return Z
+    def pivots(self) -> FloatArray:
+        """(N,): the pivots of the elimination of K."""
+        return np.asarray(self.L[0] ** 2)

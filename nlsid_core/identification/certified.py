@@ -16,16 +16,27 @@ import numpy as np
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import ShapeError
 from nlsid_core.identification.bound import Bound, Point
-from nlsid_core.identification.contraction import box_inequalities, companion, traceless
+from nlsid_core.identification.contraction import (
+    StateAffineProof,
+    box_inequalities,
+    companion,
+    leading_bounds,
+    prove_state_affine,
+    traceless,
+)
 from nlsid_core.identification.inequalities import MatrixInequality, centre, minimise_linear
-from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.matrix_proof import MatrixProof
+from nlsid_core.identification.newton import Descent, minimise
+from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.state_affine import StateAffineRows
+from nlsid_core.models import StateAffineModel
 
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
 START_BOUNDS = (0.9, 1.1)  # of G_0 around the first iterate's start G = I
 START_SLACK = 0.05  # of those bounds, spent on the multipliers of the box
 GROWTH = 4.0  # of h from one iterate to the next, at most: with one lag nothing else bounds it
 TIGHT = 1e-4  # of h - ℓ, how tightly the bounds of G_0 are stated
+RENEWALS = 10  # of P and the bounds of G_0 in the last step
 STOP = 1e-4  # relative decrease of J that ends the iteration
 
 
@@ -50,10 +61,7 @@ def certified_simulation_error(
 
     Raises ShapeError for several outputs, input-dependent lagged coefficients or deg q > 2.
     """
-    if not problem.has_constant_lags:
-        raise ShapeError("certified iterates are for one output and constant lagged coefficients")
-    if (problem.left[0].sum(axis=1) > 2).any():
-        raise ShapeError("certified iterates are for a leading coefficient of degree 2 at most")
+    _refuse_others(problem)
     n, box = len(problem.left) - 1, problem.window_range()
     theta, linearised = problem.rows.identity, None
     weights = START_SLACK / (len(box) * 0.25 * (box[:, 1] - box[:, 0]) ** 2)
@@ -74,6 +82,53 @@ def certified_simulation_error(
         if previous * (1.0 - STOP) <= found.point.J:
             return
         previous = found.point.J
+
+
+def descend_certified(
+    problem: StateAffineRows, model: StateAffineModel, proof: StateAffineProof | MatrixProof
+) -> StateAffineModel:
+    """The last step: a local minimum of the simulation error itself inside the certified set.
+
+    From a model of the problem's class with its proof; the result is proved too and its simulation
+    error on the problem's data is never above the model's. P and the bounds of G_0 are renewed
+    while that goes on lowering it. Raises ShapeError as `certified_simulation_error` does.
+    """
+    _refuse_others(problem)
+    if isinstance(proof, MatrixProof):
+        raise ShapeError("the last step needs the proof by bounds of the leading coefficient")
+    objective, best = SimulationError(problem.rows), model
+    theta = np.concatenate([g.coefficients.ravel() for g in model.G])
+    bounds, multipliers = proof.bounds, proof.multipliers
+    if bounds is None or multipliers is None:  # a constant G_0 was proved without
+        found_bounds = leading_bounds(model)
+        if found_bounds is None:
+            raise ShapeError("the last step needs a positive leading coefficient")
+        bounds, multipliers = found_bounds
+    P, extra = proof.P, np.concatenate([bounds, *multipliers])
+    n, J = len(model), objective.at(theta).J
+    for _ in range(RENEWALS):
+        inequalities = _inequalities(problem, P, extra[:2])
+        found = Descent(objective, inequalities, len(theta)).path(np.concatenate([theta, extra]))
+        if found.point.J >= J * (1.0 - STOP):
+            break
+        theta, J = found.point.theta, found.point.J
+        lower = problem.model(theta, found.point.p)
+        if prove_state_affine(lower) is None:
+            break
+        best = lower
+        extra = _tightened(inequalities[2:], theta, found.extra)
+        P = _centred(P, [companion(theta[-n:], q) for q in extra[:2]])
+    return best
+
+
+def _refuse_others(problem: StateAffineRows) -> None:
+    if not problem.has_constant_lags:
+        raise ShapeError(
+            "certified iterates are for one output and constant lagged coefficients; minimise the "
+            "robust simulation error and prove that model instead"
+        )
+    if (problem.left[0].sum(axis=1) > 2).any():
+        raise ShapeError("certified iterates are for a leading coefficient of degree 2 at most")
 
 
 def _inequalities(

@@ -3,7 +3,7 @@
 The bounds of G_0 on the input box are the tightest its S-procedure shows, and the storage function
 is common to both, at (nearly) the fastest rate there is one for. Where all coefficients of the
 outputs are constant, of one output or of several, the difference of two solutions is linear and P
-is found directly; for several outputs there is no other proof.
+is found directly.
 """
 
 import warnings
@@ -17,6 +17,7 @@ from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.certificate import proof_document
 from nlsid_core.certificate.state_affine import block_matrix, contracts, contracts_constant
 from nlsid_core.identification.inequalities import MatrixInequality, minimise_linear
+from nlsid_core.identification.matrix_proof import MatrixProof, prove_by_matrix
 from nlsid_core.models import StateAffineModel
 
 BOUNDS_GAP = 1e-6  # relative to |G_0|, how tightly its bounds are stated
@@ -50,8 +51,13 @@ class StateAffineProof:
         return proof_document(claim, proof)
 
 
-def prove_state_affine(model: StateAffineModel) -> StateAffineProof | None:
-    """An exact proof, or None if the search finds none (or the model is of another form)."""
+def prove_state_affine(model: StateAffineModel) -> StateAffineProof | MatrixProof | None:
+    """An exact proof, or None if the search finds none.
+
+    By one Lyapunov equation where all coefficients of the outputs are constant; by bounds of G_0
+    where the lagged ones are and G_0 is quadratic, one output; else by a matrix inequality in the
+    input.
+    """
     if not any(g.exponents.any() for g in model.G):
         return _prove_constant(model)
     if (
@@ -59,7 +65,7 @@ def prove_state_affine(model: StateAffineModel) -> StateAffineProof | None:
         or any(g.exponents.any() for g in model.G[1:])
         or (model.G[0].exponents.sum(axis=1) > 2).any()
     ):
-        return None
+        return prove_by_matrix(model)
     found = leading_bounds(model)
     if found is None:
         return None

@@ -17,6 +17,7 @@ FIRST = "robust simulation error, first iterate"
 FINAL = "robust simulation error, final iterate"
 CERTIFIED = "robust simulation error, stable for every input"
 SEM = "simulation error minimisation"
+CERTIFIED_SEM = "simulation error minimisation, stable for every input"
 
 METHODS = {
     "least_squares": LEAST_SQUARES,
@@ -26,6 +27,7 @@ METHODS = {
     "rse": FINAL,
     "rse_certified": CERTIFIED,
     "sem": SEM,
+    "sem_certified": CERTIFIED_SEM,
 }
 
 M = TypeVar("M", bound=Model, covariant=True)

@@ -2,105 +2,178 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import _json
-from nlsid_core._types import FloatArray, Json
-from nlsid_core.certificate import exact, proof_document
+from nlsid_core._types import Json
+from nlsid_core.certificate import proof_document
+from nlsid_core.certificate.conditions import Inequality
 from nlsid_core.certificate.implicit import (
-    box,
-    monotonicity_matrix,
-    polynomials,
-    stability_matrix,
-    variable_names,
+    SETS,
+    STORAGE,
+    Names,
+    Storage,
+    inequalities,
+    prove,
+    well_posed,
 )
-from nlsid_core.certificate.nonnegative import prove_lower_bound, quadratic_form
-from nlsid_core.certificate.polynomial_data import write_gram
-from nlsid_core.errors import CertificateRejected, Infeasible, SolverError, Undecided
-from nlsid_core.identification.stable_sets import derivatives
+from nlsid_core.certificate.polynomial_data import write_gram, write_polynomial
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError, Undecided
+from nlsid_core.identification.stable_sets import constraint
 from nlsid_core.models import ImplicitModel
-from nlsid_core.polynomial import Gram, Polynomial
-from nlsid_core.sos import (
-    Identity,
-    Program,
-    forms_of,
-    matrix_sum_of_squares,
-    solve,
-    symmetric_template,
-)
+from nlsid_core.polynomial import Gram, Polynomial, monomials, variables
+from nlsid_core.polynomial.algebra import as_polynomial
+from nlsid_core.sos import Program, Solution, forms_of, solve, template
 from nlsid_core.sos.search import positive_semidefinite
+
+Identity = tuple[Gram, list[Gram]]
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitProof:
-    """P, δ, and the Gram matrices of both inequalities, decided exactly by the checker's code."""
+    """The set, δ, the storage, and the Gram matrices of every inequality; decided exactly."""
 
-    P: FloatArray
+    set: str
     delta: float
     box: tuple[tuple[float, float], ...]
-    stable: tuple[Gram, tuple[Gram, ...]]
-    monotone: Gram
+    storage: Storage
+    identities: dict[str, Identity]
 
     def document(self, model: ImplicitModel, file: str) -> Json:
         """The proof file's content for the model stored in `file` beside it."""
-        claim = {
-            "kind": "implicit_stability",
-            "delta": self.delta,
-            "box": [list(ends) for ends in self.box],
-            "about": {"model": {"file": file, "digest": _json.digest(model.document())}},
-        }
-        gram, multipliers = self.stable
-        proof = {
-            "P": self.P.tolist(),
-            "stable": {"gram": write_gram(gram), "multipliers": list(map(write_gram, multipliers))},
-            "monotone": {"gram": write_gram(self.monotone), "multipliers": []},
-        }
+        claim = _claim("implicit_stability", model, file, self.box)
+        claim |= {"set": self.set, "delta": self.delta}
+        proof = _proof(self.identities)
+        if self.set in STORAGE:
+            proof[STORAGE[self.set]] = _written(self.storage, self.set, Names.of(model))
         return proof_document(claim, proof)
 
 
-def prove_implicit(
-    model: ImplicitModel, *, delta: float, ends: Sequence[tuple[float, float]] = ()
-) -> ImplicitProof | None:
-    """A proof at the stated δ, or None if the search finds none (Lemma 2.13 with a constant P).
+@dataclass(frozen=True, eq=False)
+class WellPosednessProof:
+    """The Gram matrices that make the next state unique, for states and inputs in the box."""
 
-    ends: (low, high) of every state and input for a claim on that box; none is global.
+    box: tuple[tuple[float, float], ...]
+    identities: dict[str, Identity]
+
+    def document(self, model: ImplicitModel, file: str) -> Json:
+        """The proof file's content for the model stored in `file` beside it."""
+        return proof_document(
+            _claim("well_posedness", model, file, self.box), _proof(self.identities)
+        )
+
+
+def prove_well_posed(
+    model: ImplicitModel, *, ends: Sequence[tuple[float, float]] = ()
+) -> WellPosednessProof | None:
+    """A proof that every state and input has one next state: (2.12), or Proposition 2.7.
+
+    ends: as in `prove_implicit`. None if the search finds no proof, or there is none.
     """
-    n, names = len(model), variable_names(model)
-    local = tuple(box(names, [list(pair) for pair in ends])) if ends else ()
-    e, f = (
-        np.array([p.rounded().over(names) for p in polynomials(part, names[:size])])
-        for part, size in ((model.e, n), (model.f, len(names)))
-    )
-    unknown = symmetric_template("P", n)
-    condition = derivatives(
-        e, f, unknown, list(names[:n]), delta=delta, domain=tuple(g.rounded() for g in local)
-    )
     try:
-        found = solve(Program((*names, *forms_of(2 * n)), (condition,)))
-        P = np.array([[float(found.value(entry)) for entry in row] for row in unknown])
-        fixed = stability_matrix(model, exact.rational(P.tolist()), Fraction(delta))
-        stable = _identity(fixed, names, local)
-        monotone = _identity(monotonicity_matrix(model), names[:n], ())
-        multipliers = tuple(positive_semidefinite(gram) for gram in stable.multipliers)
-        for matrix, identity, domain, grams in (
-            (fixed, stable, local, multipliers),
-            (monotonicity_matrix(model), monotone, (), ()),
-        ):
-            p = quadratic_form(matrix)
-            wide = [g.over(p.names) for g in domain]
-            prove_lower_bound(p, 0, identity.gram, domain=wide, multipliers=grams)
+        parts = well_posed(model, ends=[list(pair) for pair in ends])
+        identities = _identities(parts, Names.of(model))
     except (Infeasible, SolverError, CertificateRejected, Undecided):
         return None
-    return ImplicitProof(P, delta, tuple(ends), (stable.gram, multipliers), monotone.gram)
+    return WellPosednessProof(tuple((a, b) for a, b in ends), identities)
 
 
-def _identity(
-    matrix: NDArray[np.object_], names: Sequence[str], domain: Sequence[Polynomial]
-) -> Identity:
-    rounded = np.array([[entry.rounded() for entry in row] for row in matrix], dtype=object)
-    local = tuple(g.rounded() for g in domain)
-    constraint = matrix_sum_of_squares(rounded, domain=local, name="identity")
-    return solve(Program((*names, *forms_of(len(matrix))), (constraint,)))["identity"]
+def prove_implicit(
+    model: ImplicitModel, *, delta: float, set: str = "2.13",
+    ends: Sequence[tuple[float, float]] = (), storage_degree: int = 0,
+) -> ImplicitProof | None:  # fmt: skip
+    """A proof at the stated δ that the model is in the set, or None if the search finds none.
+
+    set: of thesis Chapter 2; "2.10" and "2.11" for any model, "2.12" and "2.13" for separable ones,
+    "2.19" for linear ones. ends: (low, high) of every state and input for a claim on that box; none
+    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ).
+    Raises DataError for an unknown set or a negative δ.
+    """
+    if set not in SETS or not delta > 0.0:
+        raise DataError(f"set '{set}' (known: {', '.join(SETS)}), delta {delta:g} (positive)")
+    names, box = Names.of(model), [list(pair) for pair in ends]
+    unknown = _template(set, names, 0 if ends and set == "2.11" else storage_degree)
+    try:
+        wanted = inequalities(model, set, unknown, delta=delta, ends=box)
+        of_storage = {key: part for key, part in wanted.items() if key in ("stable", "storage")}
+        storage = _valued(unknown, _solved(of_storage, names)) if set in STORAGE else None
+        parts = inequalities(model, set, storage, delta=delta, ends=box)
+        identities = _identities(parts, names)
+    except (Infeasible, SolverError, CertificateRejected, Undecided):
+        return None
+    return ImplicitProof(set, delta, tuple((a, b) for a, b in ends), storage, identities)
+
+
+def _identities(parts: dict[str, Inequality], names: Names) -> dict[str, Identity]:
+    """Gram matrices for each inequality; raises CertificateRejected if the checker refuses one."""
+    identities: dict[str, Identity] = {}
+    for key, part in parts.items():
+        found = _solved({key: part}, names)[key]
+        multipliers = [positive_semidefinite(gram) for gram in found.multipliers]
+        prove(part, found.gram, multipliers, names)
+        identities[key] = (found.gram, multipliers)
+    return identities
+
+
+def _claim(kind: str, model: ImplicitModel, file: str, box: Sequence[tuple[float, float]]) -> Json:
+    about = {"model": {"file": file, "digest": _json.digest(model.document())}}
+    return {"kind": kind, "box": [list(ends) for ends in box], "about": about}
+
+
+def _proof(identities: dict[str, Identity]) -> Json:
+    written = {
+        key: {"gram": write_gram(gram), "multipliers": list(map(write_gram, multipliers))}
+        for key, (gram, multipliers) in identities.items()
+    }
+    return {"inequalities": written}
+
+
+def _template(kind: str, names: Names, degree: int) -> Storage:
+    """The storage with an unknown at every coefficient."""
+    if kind not in STORAGE:
+        return None
+    n, key = len(names.x), STORAGE[kind]
+    inner = names.x if key != "V" else names.x + Names.gaps(names.x)
+    basis = monomials(len(inner), range(degree + 1 if key != "P" else 1))
+    M = np.empty((n, n), dtype=object)
+    for i in range(n):
+        for j in range(i, n):
+            M[i, j] = M[j, i] = template(f"M[{i},{j}]", basis, inner)
+    if key != "V":
+        return M
+    gap = np.array(variables(Names.gaps(names.x)))
+    V: Polynomial = gap @ M @ gap
+    return V
+
+
+def _valued(storage: Storage, solution: Solution) -> Storage:
+    """With the unknowns at their values, exactly these floats."""
+    if isinstance(storage, Polynomial):
+        return solution.value(storage).exact()
+    assert storage is not None
+    result: NDArray[np.object_] = np.empty(storage.shape, dtype=object)
+    for index in np.ndindex(*storage.shape):
+        result[index] = solution.value(as_polynomial(storage[index])).exact()
+    return result
+
+
+def _solved(parts: dict[str, Inequality], names: Names) -> Solution:
+    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order."""
+    constraints = tuple(constraint(part, name=key) for key, part in parts.items())
+    sizes = [len(part.matrix) for part in parts.values()]
+    forms = forms_of(max(sizes)) if max(sizes) > 1 else ()
+    everything = {name for part in parts.values() for name in part.variables(names.all)}
+    used = tuple(name for name in names.all if name in everything)
+    return solve(Program((*used, *forms), constraints))
+
+
+def _written(storage: Storage, kind: str, names: Names) -> Json | list[list[Any]]:
+    if isinstance(storage, Polynomial):
+        return write_polynomial(storage.over(names.x + Names.gaps(names.x)))
+    assert storage is not None
+    if STORAGE[kind] == "P":
+        return [[float(entry) for entry in row] for row in storage]
+    return [[write_polynomial(entry.over(names.x)) for entry in row] for row in storage]

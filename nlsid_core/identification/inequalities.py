@@ -21,7 +21,8 @@ class MatrixInequality:
 
     def at(self, z: FloatArray) -> FloatArray:
         """The matrix at z."""
-        return np.asarray(self.F[0] + np.tensordot(z, self.F[1:], axes=1))
+        moved = z @ self.F[1:].reshape(len(z), -1)
+        return np.asarray(self.F[0] + moved.reshape(self.F.shape[1:]))
 
     def barrier(self, z: FloatArray) -> float:
         """-log det; infinite outside."""
@@ -32,9 +33,8 @@ class MatrixInequality:
 
     def derivatives(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the barrier."""
-        L = np.linalg.cholesky(self.at(z))
-        half = np.linalg.solve(L, self.F[1:])
-        scaled = np.linalg.solve(L, half.transpose(0, 2, 1))
+        inverse = np.linalg.inv(np.linalg.cholesky(self.at(z)))
+        scaled = inverse @ self.F[1:] @ inverse.T
         flat = scaled.reshape(len(scaled), scaled.shape[1] ** 2)
         return -np.trace(scaled, axis1=1, axis2=2), flat @ flat.T
 

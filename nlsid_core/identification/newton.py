@@ -1,12 +1,16 @@
 """Newton's method on the robust simulation error, with a barrier where the minimiser needs one.
 
 A minimiser can lie on the boundary of K ≻ 0, where J stays finite and damped Newton stalls at a
-wrong value. Then J - μ log det K is minimised for μ → 0: the barrier has parameter N, so the last
-iterate is within μN of the minimum. Matrix inequalities on θ join as further barrier terms.
+wrong value. Only a few eigenvalues of K vanish there. With U their vectors where Newton stalled,
+    J + μ log det(U'K⁻¹U)
+is minimised for μ → 0: (U'K⁻¹U)⁻¹ is a Schur complement of K, concave in K, so the barrier is
+convex, keeps K ≻ 0 and has parameter rank U; the last iterate is within μ·rank U of the minimum.
+Its derivatives are exact and cost a few solves, log det K would need every entry of K⁻¹. If other
+eigenvalues vanish on the way, they join U. Matrix inequalities on θ join as further barriers.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +18,7 @@ from scipy.linalg import LinAlgError
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification.bound import Point
+from nlsid_core.identification.bound import Point, Root
 from nlsid_core.identification.inequalities import MatrixInequality
 from nlsid_core.identification.rows import Rows
 
@@ -22,18 +26,24 @@ DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of t
 PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding
 STALLED = 1e-7  # decrement relative to J at which rounding of J may end the line search
 MAX_NEWTON = 200
+MAX_CENTRING = 20  # with a barrier; more, and some eigenvalue vanishes that it does not hold
 ARMIJO = 1e-4  # the usual sufficient-decrease fraction
 SHORTEST_STEP = 2.0**-30
 BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken to the barrier
-GAP = 1e-8  # μ·(barrier parameter) relative to J at which the barrier path of K ends
+SMALL = 0.1  # eigenvalue of K relative to its size that may vanish at the minimum
+FEWEST, WIDEST, MAX_BASES = 2, 4, 8  # vectors that join U at once, and how often they do
+INVERSE_ITERATIONS = 4  # of a subspace: what matters is orders of magnitude apart
+SHORT_STEP, SHORT_STEPS = 2.0**-5, 3  # so many steps so short, and Newton alone has stalled
+GAP = 1e-7  # μ·(barrier parameter) relative to J at which the barrier path of K ends
 INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
-MU_FALL = 0.1  # of μ from one point of the path to the next
+FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near by itself
+MU_FALL = 0.01
 CENTRED = 0.1  # decrement relative to μ at which a point of the path is close enough
-PROBES = 16  # random vectors behind the metric of log det K
+MU_FALL_K, CENTRED_K = 0.01, 1.0  # the same two on the path of K, whose barrier is of low rank
 
 
-class Convex(Protocol):
-    """A convex function of the left parameters, p projected out."""
+class Objective(Protocol):
+    """A function of the left parameters, p projected out."""
 
     rows: Rows
 
@@ -42,26 +52,30 @@ class Convex(Protocol):
         ...
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian."""
+        """Gradient, and Hessian or a positive semidefinite stand-in."""
         ...
 
-    def log_determinant_gradient(self, point: Point) -> FloatArray:
-        """Gradient of log det K."""
-        ...
 
-    def log_determinant_curvature(self, point: Point, probes: FloatArray) -> FloatArray:
-        """Hessian of -log det K, exact or estimated with random probes."""
+class Convex(Objective, Protocol):
+    """min_p ε'K⁻¹ε with ε and K affine in the left parameters."""
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """(N, n): K_i x, K_i the derivatives of K."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """The point found, the extra unknowns beside θ, and how many Newton steps it took."""
+    """The point found, the extra unknowns beside θ, and how many Newton steps it took.
+
+    converged: the decrement is small; otherwise no step goes down any more.
+    """
 
     point: Point
     extra: FloatArray
     steps: int
-    on_boundary: bool
+    converged: bool
+    on_boundary: bool = False
 
 
 def minimise(
@@ -76,104 +90,165 @@ def minimise(
     extra: start of further unknowns that only occur in the inequalities.
     Raises SolverError if no minimiser is found.
     """
+    descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
-    search = _Search(bound, tuple(inequalities), len(start))
-    if inequalities:
-        found = search.path(z, barrier_on_K=False)
-    else:
-        found = search.descend(z, mu=0.0, barrier_on_K=False)
-    if found is not None and found.point.factor.smallest_pivot > BOUNDARY_PIVOT:
+    found = descent.path(z) if inequalities else descent.to_minimum(z)
+    pivots = found.point.factor.pivots
+    if found.converged and np.min(pivots) > BOUNDARY_PIVOT * np.median(pivots):
         return found
-    inside = search.path(z, barrier_on_K=True)
-    if inside is None:
-        raise SolverError(f"no minimiser of J after {search.steps} Newton steps")
-    if found is not None and found.point.J < inside.point.J:
-        return found
-    return inside
+    return _on_boundary(bound, descent, z, found)
 
 
-class _Search:
+def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
+    """Minimise where eigenvalues of K vanish; `start` is well inside, Newton ended at `found`."""
+    U, best = np.zeros((len(found.point.x), 0)), found if found.converged else None
+    for _ in range(MAX_BASES):
+        U = np.linalg.qr(np.column_stack([U, _vanishing(found.point)]))[0]
+        # K is affine: half way back to the start no eigenvalue is small.
+        z = 0.5 * (start + np.concatenate([found.point.theta, found.extra]))
+        found = descent.path(z, barrier=SchurBarrier(bound, U))
+        if found.converged:
+            if best is not None and best.point.J <= found.point.J:
+                found = best
+            return replace(found, steps=descent.steps, on_boundary=True)
+    if best is None:
+        raise SolverError(f"no minimiser of J after {descent.steps} Newton steps")
+    return best
+
+
+def _vanishing(point: Point) -> FloatArray:
+    """(N, r): the vectors of the eigenvalues of K that may vanish."""
+    values, vectors = smallest_eigenvalues(point.factor, len(point.x), WIDEST)
+    small = int((values < SMALL * np.median(point.factor.pivots)).sum())
+    return vectors[:, : max(FEWEST, small)]
+
+
+def smallest_eigenvalues(factor: Root, N: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """(values, (N, count) orthonormal vectors): about the smallest of K = LL', ascending.
+
+    Inverse iteration on a subspace; values are Rayleigh quotients of K⁻¹.
+    """
+    U: FloatArray = np.random.default_rng(0).standard_normal((N, min(N, count)))
+    for _ in range(INVERSE_ITERATIONS):
+        U = np.linalg.qr(factor.half_solve_transposed(factor.half_solve(U)))[0]
+    half = factor.half_solve(U)
+    inverses, rotation = np.linalg.eigh(half.T @ half)
+    return 1.0 / inverses[::-1], U @ rotation[:, ::-1]
+
+
+class SchurBarrier:
+    """log det(U'K⁻¹U): keeps a Schur complement of K positive definite. parameter: its rank."""
+
+    def __init__(self, bound: Convex, U: FloatArray) -> None:
+        self.bound, self.U = bound, U
+
+    def value(self, point: Point) -> float:
+        """At a point of J."""
+        R = np.linalg.qr(point.factor.half_solve(self.U), mode="r")
+        return float(2.0 * np.log(abs(np.diag(R))).sum())
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian.
+
+        With M_i = L⁻¹K_iL⁻ᵀ and orthonormal columns Y of L⁻¹U: gradient_i = -tr(Y'M_iY),
+        Hessian_ij = tr(Y'M_iY Y'M_jY) + 2 tr(Y'M_i(I - YY')M_jY).
+        """
+        Y = np.linalg.qr(point.factor.half_solve(self.U))[0]
+        X = point.factor.half_solve_transposed(Y)
+        parts = [point.factor.half_solve(self.bound.slopes(x)) for x in X.T]
+        inner = np.array([Y.T @ part for part in parts])  # (r, r, n): [a, b, i] = y_b'M_iy_a
+        flat = inner.reshape(-1, inner.shape[-1])
+        hessian = flat.T @ flat
+        for a, part in enumerate(parts):
+            outer = part - Y @ inner[a]
+            hessian += 2.0 * outer.T @ outer
+        return -np.einsum("aai->i", inner), hessian
+
+
+class Descent:
+    """Damped Newton on J + μ·barriers in z = [θ; extra]; counts its steps."""
+
     def __init__(
-        self, bound: Convex, inequalities: tuple[MatrixInequality, ...], parameters: int
+        self, objective: Objective, inequalities: Sequence[MatrixInequality], parameters: int
     ) -> None:
-        self.bound, self.inequalities, self.parameters = bound, inequalities, parameters
-        self.perfect = PERFECT_FIT * bound.rows.unit
+        self.objective, self.inequalities = objective, tuple(inequalities)
+        self.parameters = parameters
+        self.perfect = PERFECT_FIT * objective.rows.unit
         self.steps = 0
-        self._probes: FloatArray | None = None
 
-    def path(self, z: FloatArray, *, barrier_on_K: bool) -> Minimum | None:
-        """Follow the barrier's minimisers for μ → 0."""
-        size = len(self.bound.rows) if barrier_on_K else 0
-        size += sum(inequality.F.shape[1] for inequality in self.inequalities)
-        J = self.bound.at(z[: self.parameters]).J
-        mu = J / size
-        gap = GAP if barrier_on_K else INEQUALITY_GAP
-        best: Minimum | None = None
+    def path(self, z: FloatArray, *, barrier: SchurBarrier | None = None) -> Minimum:
+        """Follow the minimisers for μ → 0."""
+        size = sum(inequality.F.shape[1] for inequality in self.inequalities)
+        size += 0 if barrier is None else barrier.U.shape[1]
+        gap = INEQUALITY_GAP if barrier is None else GAP
+        mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
         while True:
-            found = self.descend(z, mu=mu, barrier_on_K=barrier_on_K)
-            if found is None:
-                return best
-            best, z = found, np.concatenate([found.point.theta, found.extra])
-            if mu * size <= gap * found.point.J or self.perfect >= found.point.J:
-                return Minimum(found.point, found.extra, self.steps, barrier_on_K)
-            mu *= MU_FALL
+            found = self.to_minimum(z, mu=mu, barrier=barrier)
+            z = np.concatenate([found.point.theta, found.extra])
+            small = mu * size <= gap * found.point.J or self.perfect >= found.point.J
+            if small or not found.converged:
+                return found
+            mu *= MU_FALL if barrier is None else MU_FALL_K
 
-    def descend(self, z: FloatArray, *, mu: float, barrier_on_K: bool) -> Minimum | None:
-        """Damped Newton on J + μ·barrier; None if it stalls before the decrement is small."""
-        value, point = self._value(z, mu, barrier_on_K)
+    def to_minimum(
+        self, z: FloatArray, *, mu: float = 0.0, barrier: SchurBarrier | None = None
+    ) -> Minimum:
+        """Newton's method for one μ."""
+        value, point = self._value(z, mu, barrier)
         if point is None:
             raise SolverError("Newton's method was started where J is infinite")
-        for _ in range(MAX_NEWTON):
-            gradient, hessian = self._derivatives(z, point, mu, barrier_on_K)
+        short, limit = 0, MAX_NEWTON if barrier is None else MAX_CENTRING
+        for _ in range(limit):
+            gradient, hessian = self._derivatives(z, point, mu, barrier)
             scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
             step = (
                 -scale
                 * np.linalg.lstsq(hessian * np.outer(scale, scale), gradient * scale, rcond=None)[0]
             )
             decrement = -float(gradient @ step)
-            enough = max(DECREMENT * point.J, CENTRED * mu)
+            enough = max(DECREMENT * point.J, (CENTRED if barrier is None else CENTRED_K) * mu)
             if decrement <= enough or self.perfect >= point.J:
-                return Minimum(point, z[self.parameters :], self.steps, barrier_on_K)
+                return Minimum(point, z[self.parameters :], self.steps, converged=True)
             self.steps += 1
             length = 1.0
             while True:
                 candidate = z + length * step
-                new_value, new_point = self._value(candidate, mu, barrier_on_K)
+                new_value, new_point = self._value(candidate, mu, barrier)
                 if new_point is not None and new_value <= value - ARMIJO * length * decrement:
                     break
                 length /= 2
-                if length < SHORTEST_STEP and decrement <= max(STALLED * point.J, mu):
-                    return Minimum(point, z[self.parameters :], self.steps, barrier_on_K)
                 if length < SHORTEST_STEP:
-                    return None
+                    near = decrement <= max(STALLED * point.J, mu)
+                    return Minimum(point, z[self.parameters :], self.steps, converged=near)
             z, value, point = candidate, new_value, new_point
-        return None
+            short += length < SHORT_STEP
+            if short >= SHORT_STEPS and not mu:
+                break
+        return Minimum(point, z[self.parameters :], self.steps, converged=False)
 
-    def _value(self, z: FloatArray, mu: float, barrier_on_K: bool) -> tuple[float, Point | None]:
-        barrier = sum(inequality.barrier(z) for inequality in self.inequalities)
-        if not np.isfinite(barrier):
+    def _value(
+        self, z: FloatArray, mu: float, barrier: SchurBarrier | None
+    ) -> tuple[float, Point | None]:
+        total = sum(inequality.barrier(z) for inequality in self.inequalities)
+        if not np.isfinite(total):
             return np.inf, None
         try:
-            point = self.bound.at(z[: self.parameters])
+            point = self.objective.at(z[: self.parameters])
         except LinAlgError:
             return np.inf, None
-        if barrier_on_K:
-            barrier -= point.factor.log_determinant
-        return point.J + mu * barrier, point
+        if barrier is not None:
+            total += barrier.value(point)
+        return point.J + mu * total, point
 
     def _derivatives(
-        self, z: FloatArray, point: Point, mu: float, barrier_on_K: bool
+        self, z: FloatArray, point: Point, mu: float, barrier: SchurBarrier | None
     ) -> tuple[FloatArray, FloatArray]:
         gradient, hessian = np.zeros(len(z)), np.zeros((len(z), len(z)))
         inner = slice(0, self.parameters)
-        gradient[inner], hessian[inner, inner] = self.bound.derivatives(point)
-        if barrier_on_K:
-            gradient[inner] -= mu * self.bound.log_determinant_gradient(point)
-            if self._probes is None:
-                rng = np.random.default_rng(0)
-                signs = rng.integers(0, 2, size=(len(self.bound.rows), PROBES))
-                self._probes = np.where(signs, 1.0, -1.0)
-            curvature = self.bound.log_determinant_curvature(point, self._probes)
+        gradient[inner], hessian[inner, inner] = self.objective.derivatives(point)
+        if barrier is not None:
+            slope, curvature = barrier.derivatives(point)
+            gradient[inner] += mu * slope
             hessian[inner, inner] += mu * curvature
         for inequality in self.inequalities:
             slope, curvature = inequality.derivatives(z)

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from nlsid_core._types import FloatArray
-from nlsid_core.errors import DataError, SolverError
+from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
-from nlsid_core.identification.certified import certified_simulation_error
+from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.contraction import prove_state_affine
 from nlsid_core.identification.fit import (
     CERTIFIED,
+    CERTIFIED_SEM,
     FINAL,
     FIRST,
     LEAST_SQUARES,
@@ -39,6 +40,7 @@ from nlsid_core.identification.monotone_comparators import (
 )
 from nlsid_core.identification.regression import LinearClass, build_regression
 from nlsid_core.identification.rie import robust_identification_error
+from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.simulation_error import minimise_simulation_error
 from nlsid_core.identification.stability import prove_stability
 from nlsid_core.identification.state_affine import (
@@ -62,6 +64,15 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     trail.add(LEAST_SQUARES, lambda: least_squares(regression))
     trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p))
     trail.add(SEM, lambda: minimise_simulation_error(regression, least_squares(regression)))
+
+    def last_step() -> DifferenceEquation:
+        *_, last = robust_simulation_error(regression.rows, iterations=task.iterations)
+        start = regression.model(last.theta, last.p)
+        if prove_stability(start) is None:
+            raise Infeasible("the robust simulation error found no stable model to start from")
+        return minimise_simulation_error(regression, start, stable=True)
+
+    trail.add(CERTIFIED_SEM, last_step)
     return trail
 
 
@@ -72,10 +83,18 @@ def state_affine(
     problem = build_state_affine_rows(train, model_class)
     trail: Trail[StateAffineModel] = Trail(task, prove_state_affine, BOUND)
     trail.add(LEAST_SQUARES, lambda: state_affine_equation_error(problem))
-    if problem.has_constant_lags:
-        trail.add(RIE, lambda: robust_identification_error(problem)[0])
+    trail.add(RIE, lambda: robust_identification_error(problem)[0])
     trail.follow(problem.rows, lambda i: problem.model(i.theta, i.p))
     trail.add(CERTIFIED, lambda: _certified(problem, trail))
+
+    def last_step() -> StateAffineModel:
+        start = _certified(problem, trail)
+        proof = prove_state_affine(start)
+        if proof is None:
+            raise Infeasible("no proof for the last certified iterate, where the last step starts")
+        return descend_certified(problem, start, proof)
+
+    trail.add(CERTIFIED_SEM, last_step)
     return trail
 
 
@@ -172,11 +191,12 @@ class Offer:
 
 OFFERS: dict[type, Offer] = {
     LinearClass: Offer(
-        linear, ("rse", "least_squares", "rse_first", "sem"),
+        linear, ("rse", "least_squares", "rse_first", "sem", "sem_certified"),
         (LEAST_SQUARES, FIRST, FINAL, SEM),
     ),
     StateAffineClass: Offer(
-        state_affine, ("rse", "least_squares", "rie", "rse_first", "rse_certified"),
+        state_affine,
+        ("rse", "least_squares", "rie", "rse_first", "rse_certified", "sem_certified"),
         (LEAST_SQUARES, RIE, FIRST, FINAL),
     ),
     BlockCascadeClass: Offer(block_cascade, ("sem",), ()),
@@ -196,11 +216,10 @@ def methods_of(model_class: object) -> tuple[str, ...]:
         names = ", ".join(known.__name__ for known in OFFERS)
         raise DataError(f"{model_class!r} is no model class; there are: {names}")
     refused: set[str] = set()
-    if isinstance(model_class, StateAffineClass):
-        if model_class.lagged_degree:
-            refused = {"rie", "rse_certified"}
-        elif model_class.leading_degree > CERTIFIABLE_DEGREE:
-            refused = {"rse_certified"}
+    if isinstance(model_class, StateAffineClass) and (
+        model_class.lagged_degree or model_class.leading_degree > CERTIFIABLE_DEGREE
+    ):
+        refused = {"rse_certified", "sem_certified"}
     return tuple(method for method in offer.methods if method not in refused)
 
 
@@ -221,7 +240,7 @@ def _certified(problem: StateAffineRows, trail: Trail[StateAffineModel]) -> Stat
     for iterate in certified_simulation_error(problem, iterations=trail.task.iterations):
         steps.append(Step(f"certified iterate {len(steps) + 1}", iterate.J))
         last = iterate
-    if trail.task.method == CERTIFIED:
+    if trail.task.method in (CERTIFIED, CERTIFIED_SEM):
         trail.history = History(trail.history.value, tuple(steps))
     return problem.model(last.point.theta, last.point.p)
 

@@ -1,68 +1,138 @@
-"""Simulation error minimisation (SEM), the usual comparator."""
+"""Simulation error minimisation (SEM): the usual comparator, and a last step for proved models.
+
+With Δ = ŷ - ỹ over all rows, G Δ = -ε: the simulation error |Δ|²_W = |L⁻¹ε|² has the form of the
+robust bound with L = G C, W⁻¹ = CC', instead of a convex K. Its exact sensitivities are
+    ∂(L⁻¹ε)/∂θ_i = L⁻¹(ε_i - G_i r),   r = G⁻¹ε = -Δ,
+and p, which enters linearly, is projected out: Gauss-Newton in the left parameters only.
+Nothing makes the minimiser global. Source: thesis Definition 2.2 and Section 1.2.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.signal import lfilter, lfiltic
+from scipy.linalg import LinAlgError, cholesky_banded
+from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
 from nlsid_core._types import FloatArray
+from nlsid_core.identification.banded import (
+    Diagonals,
+    diagonals_of,
+    lower_band,
+    product,
+    shift,
+    times,
+)
+from nlsid_core.identification.bound import Point, Root, project
+from nlsid_core.identification.newton import Descent
 from nlsid_core.identification.regression import Regression
+from nlsid_core.identification.rows import Rows
+from nlsid_core.identification.stability import prove_stability
 from nlsid_core.models import DifferenceEquation
 
-UNSTABLE_RESIDUAL = 1e6  # in units of the signal's spread: a diverged simulation, kept finite
-LM_TOLERANCE = 1e-12  # relative decrease of the cost at which the minimiser stops
-LM_EVALUATIONS = 300
+SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
+
+
+class SimulationError:
+    """|ŷ - ỹ|²_W over all rows in the left parameters θ, where `inside` holds (None: anywhere)."""
+
+    def __init__(self, rows: Rows, *, inside: Callable[[FloatArray], bool] | None = None) -> None:
+        self.rows, self.inside = rows, inside
+        self._root: Diagonals | None = None
+        if rows.covariance is not None:
+            band = lower_band(rows.covariance)
+            self._root = diagonals_of(cholesky_banded(band, lower=True, check_finite=False))
+
+    def at(self, theta: FloatArray) -> Point:
+        """Value and best p; LinAlgError if the simulation diverges or G is singular."""
+        if self.inside is not None and not self.inside(theta):
+            raise LinAlgError("outside the set that is searched")
+        G = self.rows.G(theta)
+        return project(self.rows, theta, theta, Band.of(G if self._root is None else
+                                                        product(G, self._root)))  # fmt: skip
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient, and the Hessian of Gauss and Newton."""
+        rows = self.rows
+        r = point.residual if self._root is None else times(self._root, point.residual)
+        V = rows.errors.copy(order="F")
+        for D, group in rows.groups:
+            V[:, group] -= rows.weights[:, group] * shift(r, D)[:, None]
+        return 2.0 * V.T @ point.x, point.curvature(V)
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """L of L⁻¹ε: a banded matrix by its diagonals, lower triangular or factored by elimination."""
+
+    band: FloatArray
+    below: int
+    above: int
+    order: FloatArray | None  # of the elimination
+
+    @classmethod
+    def of(cls, L: Diagonals) -> Root:
+        """LinAlgError if L is singular."""
+        N, below, above = len(next(iter(L.values()))), max(L), max(0, -min(L))
+        if above == 0:
+            band = lower_band(L)
+            if not band[0].all():
+                raise LinAlgError("a leading coefficient is zero")
+            return cls(band, below, 0, None)
+        band = np.zeros((2 * below + above + 1, N), order="F")
+        for D, diagonal in L.items():
+            column = shift(diagonal, -D)
+            band[below + above + D] = column
+        factored, order, info = dgbtrf(band, below, above, overwrite_ab=True)
+        if info != 0:
+            raise LinAlgError(f"elimination failed ({info})")
+        return cls(factored, below, above, order)
+
+    @property
+    def pivots(self) -> FloatArray:
+        """(N,): of LL', up to the order of the elimination."""
+        diagonal = 0 if self.order is None else self.below + self.above
+        return np.asarray(self.band[diagonal] ** 2)
+
+    def half_solve(self, B: FloatArray, *, overwrite: bool = False) -> FloatArray:
+        """L⁻¹B."""
+        return self._solve(B, transposed=False, overwrite=overwrite)
+
+    def half_solve_transposed(self, B: FloatArray) -> FloatArray:
+        """L⁻ᵀB."""
+        return self._solve(B, transposed=True)
+
+    def _solve(self, B: FloatArray, *, transposed: bool, overwrite: bool = False) -> FloatArray:
+        columns = B[:, None] if B.ndim == 1 else B
+        if self.order is None:
+            trans = "T" if transposed else "N"
+            found, info = dtbtrs(self.band, columns, uplo="L", trans=trans, overwrite_b=overwrite)
+        else:
+            found, info = dgbtrs(
+                self.band, self.below, self.above, columns, self.order,
+                trans=int(transposed), overwrite_b=overwrite,
+            )  # fmt: skip
+        if info != 0:
+            raise LinAlgError(f"triangular solve failed ({info})")
+        return np.asarray(found.reshape(B.shape, order="F"))
 
 
 def minimise_simulation_error(
-    regression: Regression, start: DifferenceEquation
+    regression: Regression, start: DifferenceEquation, *, stable: bool = False
 ) -> DifferenceEquation:
-    """Levenberg-Marquardt on Σ (y - ŷ)² with exact sensitivities, from `start`'s coefficients.
+    """A local minimum of Σ (y - ŷ)² from `start`'s lagged coefficients, never above it.
 
-    Finds a local minimum; nothing makes the result stable. Source: thesis Section 1.2.
+    stable: search among stable models only, for a `start` that has a proof; the result has one
+    too, or is `start` itself. Otherwise nothing keeps the model stable.
     """
-    n = regression.lags
-    first_rows = np.flatnonzero(regression.row == 0)
-    bounds = list(zip(first_rows, [*first_rows[1:], len(regression.row)], strict=True))
-    columns = np.column_stack([regression.Y[:, 1:], regression.Q])
-    target = regression.Y[:, 0]
+    inside = _is_stable if stable else None
+    theta = np.concatenate([[1.0], -start.a])
+    objective = SimulationError(regression.rows, inside=inside)
+    point = Descent(objective, (), len(theta)).to_minimum(theta).point
+    found = regression.model(point.theta, point.p)
+    return start if stable and prove_stability(found) is None else found
 
-    def simulate(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        denominator = np.concatenate([[1.0], -theta[:n]])
-        forcing = regression.Q @ theta[n:]
-        outputs = np.empty_like(target)
-        regressors = columns.copy()
-        for begin, end in bounds:
-            history = regression.Y[begin, 1:]
-            state = lfiltic([1.0], denominator, history)
-            outputs[begin:end], _ = lfilter([1.0], denominator, forcing[begin:end], zi=state)
-            padded = np.concatenate([history[::-1], outputs[begin:end]])
-            for k in range(1, n + 1):
-                regressors[begin:end, k - 1] = padded[n - k : len(padded) - k]
-        return outputs, regressors
 
-    def residual(theta: FloatArray) -> FloatArray:
-        with np.errstate(all="ignore"):
-            difference = simulate(theta)[0] - target
-        finite: FloatArray = np.nan_to_num(difference)
-        return finite.clip(-UNSTABLE_RESIDUAL, UNSTABLE_RESIDUAL)
-
-    def jacobian(theta: FloatArray) -> FloatArray:
-        denominator = np.concatenate([[1.0], -theta[:n]])
-        with np.errstate(all="ignore"):
-            _, regressors = simulate(theta)
-            parts = [lfilter([1.0], denominator, regressors[b:e], axis=0) for b, e in bounds]
-        sensitivities: FloatArray = np.nan_to_num(np.concatenate(parts))
-        return sensitivities
-
-    theta_p = np.linalg.lstsq(regression.Q, target - columns[:, :n] @ start.a, rcond=None)[0]
-    found = least_squares(
-        residual,
-        np.concatenate([start.a, theta_p]),
-        jac=jacobian,
-        method="lm",
-        ftol=LM_TOLERANCE,
-        xtol=LM_TOLERANCE,
-        max_nfev=LM_EVALUATIONS,
-    )
-    g = np.concatenate([[1.0], -found.x[:n]])
-    return regression.model(g, found.x[n:])
+def _is_stable(theta: FloatArray) -> bool:
+    """Every pole of g_0 y(t) + … + g_n y(t-n) is inside the unit circle, with room for a proof."""
+    return bool(theta[0] and (abs(np.roots(theta)) < SLOWEST_POLE).all())

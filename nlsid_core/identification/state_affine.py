@@ -57,9 +57,10 @@ class StateAffineClass:
 
 @dataclass(frozen=True, eq=False)
 class StateAffineRows:
-    """The rows of a dataset, and the way back from parameters to a model."""
+    """The rows of a dataset, their windows w (N, n_w), and the way back to a model."""
 
     rows: Rows
+    w: FloatArray
     dataset: Dataset
     left: tuple[IntArray, ...]
     right: IntArray
@@ -157,7 +158,7 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
         identity=identity,
     )
     return StateAffineRows(
-        rows, dataset, left, right, R, window, y_scale, u_scale, declared,
+        rows, w, dataset, left, right, R, window, y_scale, u_scale, declared,
         model_class.on_out_of_range,
     )  # fmt: skip
 

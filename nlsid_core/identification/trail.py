@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from nlsid_core.errors import DataError, SolverError
+from nlsid_core.errors import NlsidError
 from nlsid_core.identification.fit import FINAL, FIRST, Candidate, History, Proof, Step
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rows import Rows
@@ -69,7 +69,7 @@ class Trail(Generic[T]):
         started = time.perf_counter()
         try:
             model, proof = make()
-        except (SolverError, DataError) as reason:
+        except NlsidError as reason:
             if method == self.task.method:
                 raise
             log.warning("no comparison with %s: %s", method, reason)

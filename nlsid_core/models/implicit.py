@@ -1,56 +1,105 @@
-"""`ImplicitModel`: e(x⁺) = f(x, w) with polynomial e and f, e strictly monotone.
+"""`ImplicitModel`: 0 = h(v, x, w), x⁺ = [v; ã(x, w)], polynomial, with a unique v for every (x, w).
 
-Source: thesis (2.7), (2.11)-(2.12).
+Separable models e(x⁺) = f(x, w) are h = e(v) - f(x, w) without ã.
+Source: thesis (2.4), (2.7), (2.11)-(2.15).
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
+from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import FORMAT, VERSION
 
 KIND = "implicit"
-RESIDUAL = 1e-12  # of e(v) = z relative to 1 + |z|: a few units of rounding
-NEWTON_STEPS = 60
-SHORTEST_STEP = 2.0**-30
-ELLIPSOID_STEPS = 4000  # each shrinks the volume by exp(-1/(2(n+1))) or more
+CENTRED = 0.5  # h is so monotone in e₀(v): Proposition 2.7
 
 
 @dataclass(frozen=True, eq=False)
 class ImplicitModel:
-    """e(x⁺) = f(x, w): n states, m inputs, one sample is `period` s.
+    """0 = h(v, x, w), x⁺ = [v; ã(x, w)]: n states, m inputs, one sample is `period` s.
 
-    e: polynomials in n variables, f: in n + m, both with (n,) coefficients. monotonicity: δ > 0 of
-    (v - v̂)'(e(v) - e(v̂)) ≥ δ|v - v̂|², which makes e a bijection and bounds its inverse.
+    h: n_v polynomials in [v; x; w]; shift: ã, n - n_v polynomials in [x; w]. monotonicity: δ > 0
+    of (v - v̂)'(h(v, x, w) - h(v̂, x, w)) ≥ δ|v - v̂|². With a centre e₀ (n_v polynomials in v) it is
+    e₀ that is so monotone, or linear with |e₀ - ê₀| ≥ δ|v - v̂|, and 2(e₀ - ê₀)'(h - ĥ) ≥
+    |e₀ - ê₀|². Both make v unique; `certificate` decides them.
 
     Raises ShapeError or DataError on parts that do not fit.
     """
 
-    e: Polynomials
-    f: Polynomials
+    h: Polynomials
+    shift: Polynomials
     monotonicity: float
     period: float
     states: tuple[str, ...]
     inputs: tuple[str, ...]
+    centre: Polynomials | None = None
 
     def __post_init__(self) -> None:
-        n, m = len(self.states), len(self.inputs)
-        for name, part, variables in (("e", self.e, n), ("f", self.f, n + m)):
+        n, m, n_v = len(self.states), len(self.inputs), self.unknowns
+        if self.h.coefficients.ndim != 2 or not 0 < n_v <= n:
+            raise ShapeError(f"h should have 1 to {n} polynomials, has {n_v}")
+        parts = [("h", self.h, n_v, n_v + n + m), ("shift", self.shift, n - n_v, n + m)]
+        if self.centre is not None:
+            parts.append(("centre", self.centre, n_v, n_v))
+        for name, part, rows, variables in parts:
+            if part.coefficients.shape[1:] != (rows,) or part.exponents.shape[1] != variables:
+                raise ShapeError(
+                    f"{name} should have {rows} polynomials in {variables} variables; has "
+                    f"exponents {part.exponents.shape}, coefficients {part.coefficients.shape}"
+                )
+        if not 0.0 < self.monotonicity < np.inf or not 0.0 < self.period < np.inf:
+            raise DataError("monotonicity and period should be positive")
+
+    @classmethod
+    def separable(
+        cls, e: Polynomials, f: Polynomials, *, monotonicity: float, period: float,
+        states: tuple[str, ...], inputs: tuple[str, ...], centre: Polynomials | None = None,
+    ) -> "ImplicitModel":  # fmt: skip
+        """e(x⁺) = f(x, w): e in n variables, f in n + m, both with (n,) coefficients."""
+        n, m = len(states), len(inputs)
+        for name, part, variables in (("e", e, n), ("f", f, n + m)):
             if part.coefficients.shape[1:] != (n,) or part.exponents.shape[1] != variables:
                 raise ShapeError(
                     f"{name} should have {n} polynomials in {variables} variables; has exponents "
                     f"{part.exponents.shape}, coefficients {part.coefficients.shape}"
                 )
-        if not n or not 0.0 < self.monotonicity < np.inf or not 0.0 < self.period < np.inf:
-            raise DataError("states, monotonicity and period should be positive")
+        left = np.hstack([e.exponents, np.zeros((len(e.exponents), n + m), dtype=np.int64)])
+        right = np.hstack([np.zeros((len(f.exponents), n), dtype=np.int64), f.exponents])
+        h = Polynomials(
+            np.concatenate([left, right]), np.concatenate([e.coefficients, -f.coefficients])
+        )
+        return cls(h, _nothing(n + m), monotonicity, period, states, inputs, centre)
+
+    def separated(self) -> tuple[Polynomials, Polynomials] | None:
+        """(e, f) if h = e(v) - f(x, w) and there is no ã, else None."""
+        n_v = self.unknowns
+        left = self.h.exponents[:, :n_v].any(axis=1)
+        if n_v < len(self) or self.h.exponents[left, n_v:].any():
+            return None
+        return (
+            Polynomials(self.h.exponents[left, :n_v], self.h.coefficients[left]),
+            Polynomials(self.h.exponents[~left, n_v:], -self.h.coefficients[~left]),
+        )
 
     def __len__(self) -> int:
         """The number of states n."""
         return len(self.states)
+
+    @property
+    def unknowns(self) -> int:
+        """The number n_v of equations, and of states they determine."""
+        return int(self.h.coefficients.shape[-1])
+
+    @property
+    def has_linear_centre(self) -> bool:
+        """There is a centre, of degree 1."""
+        return self.centre is not None and bool((self.centre.exponents.sum(axis=1) <= 1).all())
 
     def step(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """x⁺ (B, n) of states x (B, n) and inputs w (B, m), all trajectories at once."""
@@ -59,70 +108,65 @@ class ImplicitModel:
             len(now), len(self.inputs)
         ):  # fmt: skip
             raise ShapeError(f"x should be (B, {len(self)}), w (B, {len(self.inputs)})")
-        return self.invert(self.f(np.concatenate([now, given], axis=1)), start=now)
+        known = np.concatenate([now, given], axis=1)
+        v = self.solve(known, start=now[:, : self.unknowns])
+        return np.concatenate([v, self.shift(known)], axis=1)
 
-    def invert(self, z: FloatArray, *, start: FloatArray) -> FloatArray:
-        """v (B, n) with e(v) = z (B, n): Newton with step halving, else the ellipsoid method.
+    def solve(self, known: FloatArray, *, start: FloatArray) -> FloatArray:
+        """v (B, n_v) with h(v, known) = 0 for known = [x, w] (B, n + m).
 
-        Source: Theorem 2.5 and the remark after Proposition 2.7.
+        Newton's method with step halving; where it fails, the ellipsoid method, guaranteed for a
+        true monotonicity. Raises SolverError where that is not true.
         """
-        v = start.copy()
-        slope = self.e.jacobian(len(self))
-        tolerance = RESIDUAL * (1.0 + np.linalg.norm(z, axis=1))
-        residual = self.e(v) - z
-        size = np.linalg.norm(residual, axis=1)
-        for _ in range(NEWTON_STEPS):
-            active = np.flatnonzero(size > tolerance)
-            if not len(active):
-                return v
-            direction = np.linalg.solve(slope(v[active]), -residual[active][..., None])[..., 0]
-            length = np.ones(len(active))
-            waiting = np.arange(len(active))
-            while len(waiting):
-                rows = active[waiting]
-                trial = v[rows] + length[waiting, None] * direction[waiting]
-                found = self.e(trial) - z[rows]
-                better = np.linalg.norm(found, axis=1) < size[rows]
-                moved = rows[better]
-                v[moved], residual[moved] = trial[better], found[better]
-                size[moved] = np.linalg.norm(found[better], axis=1)
-                waiting = waiting[~better]
-                length[waiting] /= 2.0
-                waiting = waiting[length[waiting] >= SHORTEST_STEP]
-        for row in np.flatnonzero(size > tolerance):
-            v[row] = self.ellipsoid(z[row], start=start[row])
+        slope, n_v = self._slope, self.unknowns
+        size = 1.0 + np.linalg.norm(self.h(_with(np.zeros_like(start), known)), axis=1)
+
+        def c(v: FloatArray, rows: IntArray) -> FloatArray:
+            return self.h(_with(v, known[rows]))
+
+        def slope_of(v: FloatArray, rows: IntArray) -> FloatArray:
+            return slope(_with(v, known[rows]))[..., :n_v]
+
+        v, failed = newton(c, slope_of, start=start, size=size)
+        for row in failed:
+            v[row] = self.ellipsoid(known[row], start=start[row])
         return v
 
-    def ellipsoid(self, z: FloatArray, *, start: FloatArray) -> FloatArray:
-        """v (n,) with e(v) = z (n,) by the ellipsoid method; needs only that e is monotone.
+    def ellipsoid(self, known: FloatArray, *, start: FloatArray) -> FloatArray:
+        """v (n_v,) with h(v, known) = 0 for known = [x, w] (n + m,), by the ellipsoid method.
 
-        The first ball {v : |v - start| ≤ |e(start) - z|/δ} holds the solution, and (v - v*)'(e(v)
-        - z) ≥ 0 cuts every ellipsoid through its centre. Raises SolverError if the residual does
-        not get small: then `monotonicity` is not true.
+        With a centre it works in z = e₀(v). Raises SolverError if monotonicity is not true.
         """
-        n, v = len(self), start.copy()
-        best, least = v, np.inf
-        radius = float(np.linalg.norm(self.e(v[None])[0] - z)) / self.monotonicity
-        P = radius**2 * np.eye(n)
-        goal = np.sqrt(RESIDUAL) * (1.0 + float(np.linalg.norm(z)))
-        for _ in range(ELLIPSOID_STEPS):
-            g = self.e(v[None])[0] - z
-            size = float(np.linalg.norm(g))
-            if size < least:
-                best, least = v.copy(), size
-            if size <= RESIDUAL * (1.0 + float(np.linalg.norm(z))) or not g @ P @ g > 0.0:
-                break
-            step = P @ g / np.sqrt(g @ P @ g)
-            v = v - step / (n + 1)
-            if n == 1:
-                P = P / 4.0
-            else:
-                P = n**2 / (n**2 - 1.0) * (P - 2.0 / (n + 1) * np.outer(step, step))
-        if least > goal:
-            raise SolverError(
-                f"e(v) = z is solved to {least:.1e} only; e is not {self.monotonicity:g}-monotone"
-            )
-        return best
+        zero = self.h(_with(np.zeros_like(start), known)[None])
+        size = 1.0 + float(np.linalg.norm(zero))
+        if self.centre is None:
+            return ellipsoid(
+                lambda v: self.h(_with(v, known)[None])[0],
+                start=start, monotonicity=self.monotonicity, size=size,
+            )  # fmt: skip
+        z = ellipsoid(
+            lambda z: self.h(_with(self._uncentred(z, start), known)[None])[0],
+            start=self.centre(start[None])[0], monotonicity=CENTRED, size=size,
+        )  # fmt: skip
+        return self._uncentred(z, start)
+
+    def _uncentred(self, z: FloatArray, start: FloatArray) -> FloatArray:
+        """v with e₀(v) = z."""
+        centre = self.centre
+        assert centre is not None
+        slope, size = centre.jacobian(self.unknowns), np.array([1.0 + float(np.linalg.norm(z))])
+        if self.has_linear_centre:
+            missing = z - centre(start[None])[0]
+            return np.asarray(start + np.linalg.solve(slope(start[None])[0], missing))
+        v, failed = newton(
+            lambda v, _: centre(v) - z, lambda v, _: slope(v), start=start[None], size=size
+        )
+        if not len(failed):
+            return np.asarray(v[0])
+        return ellipsoid(
+            lambda v: centre(v[None])[0] - z,
+            start=start, monotonicity=self.monotonicity, size=float(size[0]),
+        )  # fmt: skip
 
     def simulate(self, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """States (B, N+1, n) from x (B, n) with inputs w (B, N, m)."""
@@ -135,26 +179,36 @@ class ImplicitModel:
         return np.stack(states, axis=1)
 
     def jacobian(self, after: ArrayLike, x: ArrayLike, w: ArrayLike) -> FloatArray:
-        """(B, n, n + m): ∂x⁺/∂[x; w] = E(x⁺)⁻¹ ∂f(x, w) along a step that has been made."""
-        now = np.concatenate([np.asarray(x, float), np.asarray(w, float)], axis=1)
-        slope_f = self.f.jacobian(now.shape[1])(now)
-        slope_e = self.e.jacobian(len(self))(np.asarray(after, dtype=np.float64))
-        return np.asarray(np.linalg.solve(slope_e, slope_f))
+        """(B, n, n + m): ∂x⁺/∂[x; w] = [-H₁⁻¹[H₂, H₃]; ∂ã] along a step that has been made."""
+        known = np.concatenate([np.asarray(x, float), np.asarray(w, float)], axis=1)
+        v = np.asarray(after, dtype=np.float64)[:, : self.unknowns]
+        slope = self._slope(_with(v, known))
+        top = -np.linalg.solve(slope[..., : self.unknowns], slope[..., self.unknowns :])
+        rest = self.shift.jacobian(known.shape[1])(known)
+        return np.concatenate([top, rest], axis=1)
+
+    @cached_property
+    def _slope(self) -> Polynomials:
+        return self.h.jacobian(self.h.exponents.shape[1])
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
-        return {
+        document: Json = {
             "format": FORMAT,
             "version": VERSION,
             "kind": KIND,
-            "equation": "e(x+) = f(x, w)",
+            "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]",
             "period": self.period,
             "states": list(self.states),
             "inputs": list(self.inputs),
             "monotonicity": self.monotonicity,
-            "e": self.e.document(),
-            "f": self.f.document(),
+            "h": self.h.document(),
         }
+        if self.unknowns < len(self):
+            document["shift"] = self.shift.document()
+        if self.centre is not None:
+            document["centre"] = self.centre.document()
+        return document
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "ImplicitModel":
@@ -169,18 +223,29 @@ class ImplicitModel:
         if not all(isinstance(name, str) for name in (*states, *inputs)):
             raise DocumentError(f"{source}: states and inputs should be names")
         n, m = len(states), len(inputs)
-        parts = {
-            key: Polynomials.from_document(
-                _json.member(document, key, dict, source=source), variables, (n,),
-                source=f"{source} {key}",
-            )
-            for key, variables in (("e", n), ("f", n + m))
-        }  # fmt: skip
+        left = _json.member(document, "h", dict, source=source)
+        n_v = _json.array(left, "coefficients", (None, None), source=f"{source} h").shape[1]
+        if not 0 < n_v <= n:
+            raise DocumentError(f"{source}: h should hold 1 to {n} polynomials, holds {n_v}")
+
+        def part(key: str, variables: int, size: int) -> Polynomials:
+            member = _json.member(document, key, dict, source=source)
+            return Polynomials.from_document(member, variables, (size,), source=f"{source} {key}")
+
         return cls(
-            e=parts["e"],
-            f=parts["f"],
+            h=part("h", n_v + n + m, n_v),
+            shift=part("shift", n + m, n - n_v) if n_v < n else _nothing(n + m),
             monotonicity=_json.number(document, "monotonicity", source=source),
             period=_json.number(document, "period", source=source),
             states=tuple(states),
             inputs=tuple(inputs),
+            centre=part("centre", n_v, n_v) if "centre" in document else None,
         )
+
+
+def _nothing(variables: int) -> Polynomials:
+    return Polynomials(np.zeros((0, variables), dtype=np.int64), np.zeros((0, 0)))
+
+
+def _with(v: FloatArray, known: FloatArray) -> FloatArray:
+    return np.concatenate([v, known], axis=-1)

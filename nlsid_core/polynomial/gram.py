@@ -26,7 +26,8 @@ class Gram:
     def __post_init__(self) -> None:
         Q = np.array(self.Q)
         Q = Q if Q.dtype == object else Q.astype(np.float64)
-        basis = np.array(self.basis, dtype=np.int64).reshape(len(Q), -1)
+        columns = -1 if len(Q) else len(self.names)
+        basis = np.array(self.basis, dtype=np.int64).reshape(len(Q), columns)
         if Q.shape != (len(basis), len(basis)) or basis.shape[1] != len(self.names):
             raise ShapeError(
                 f"{len(basis)} monomials in {basis.shape[1]} variables do not fit Q of shape "

@@ -183,6 +183,10 @@ class Builder:
             room = max(degree - inner_degree(g.exponents, inner), 0)
             basis = candidates(names, constraint.forms, room // 2)
             basis = basis[2 * basis.sum(axis=1) >= constraint.lowest]
+            if constraint.vanishing:
+                basis = basis[
+                    basis[:, [name in constraint.vanishing for name in names]].any(axis=1)
+                ]
             block = self._block(basis, symmetry)
             blocks.append(block)
             pieces.append(gram_terms(block, g))

@@ -26,6 +26,8 @@ class SumOfSquares:
     that fits p and the domain. modulo: one polynomial h; the identity then holds modulo h, without
     a multiplier (the sphere form). basis: (k, n) monomials v; default: chosen from the support.
     lowest: the least degree of the multipliers σ_i, for a p that vanishes at 0 to that order.
+    vanishing: variables at whose common zero p vanishes to second order; every monomial of the
+    multipliers then holds one, or no Gram matrix could be definite.
     forms: indeterminates in which p is a quadratic form, as `matrix_sum_of_squares` makes it.
     """
 
@@ -36,6 +38,7 @@ class SumOfSquares:
     modulo: Polynomial | None = None
     basis: IntArray | None = None
     lowest: int = 0
+    vanishing: tuple[str, ...] = ()
     forms: tuple[str, ...] = ()
     name: str = ""
 

@@ -1,0 +1,127 @@
+"""Linear models of measured states, stable by construction: the comparator for linear systems.
+
+    minimise Σ |E x⁺ - F x - G w - c|²   over [E - I, F'; F, E] ⪰ 0, E = E'
+in signals of unit spread. The set holds every stable A = E⁻¹F (2.19), so nothing stable is lost; an
+unstable truth gives the stable model nearest in this measure.
+Source: thesis (2.19), [70].
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.identification.implicit import ImplicitProof, prove_implicit
+from nlsid_core.identification.stable_sets import linear_models
+from nlsid_core.models import ImplicitModel
+from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.polynomial import variables
+from nlsid_core.sos import NormBound, Program, Solution, forms_of, solve, symmetric_template
+from nlsid_core.trajectory import Dataset
+
+DECREASE = 0.5  # δ that is proved, of the one the search asks for
+CONSTANT = 1e-10  # relative spread below which a signal is constant
+RANK_TOLERANCE = 1e-10  # relative singular value at which states and inputs repeat each other
+
+
+@dataclass(frozen=True, eq=False)
+class LinearStateFit:
+    """The model E x⁺ = F x + G w + c in the signals' units, and its exact proof."""
+
+    model: ImplicitModel
+    proof: ImplicitProof
+
+    @property
+    def A(self) -> FloatArray:
+        """(n, n): E⁻¹F."""
+        n = len(self.model)
+        zero = np.zeros((1, n + len(self.model.inputs)))
+        return self.model.jacobian(zero[:, :n], zero[:, :n], zero[:, n:])[0, :, :n]
+
+
+def identify_linear_states(dataset: Dataset) -> LinearStateFit:
+    """The stable linear model of the measured outputs as states, x⁺ one sample ahead.
+
+    Raises DataError for data too few or not rich enough, Infeasible if the minimiser has no exact
+    proof, SolverError as the solver does.
+    """
+    x_scale, u_scale = (
+        _scale(np.concatenate([getattr(trial, letter) for trial in dataset]), name)
+        for letter, name in (("y", "state"), ("u", "input"))
+    )
+    steps = [
+        [(t.y[1:] - x_scale[0]) / x_scale[1], (t.y[:-1] - x_scale[0]) / x_scale[1],
+         (t.u[:-1] - u_scale[0]) / u_scale[1], np.ones((len(t) - 1, 1))]
+        for t in dataset
+    ]  # fmt: skip
+    after, now, w, ones = (np.concatenate(parts) for parts in zip(*steps, strict=True))
+    data = np.hstack([after, now, w, ones])
+    _refuse_poor(data[:, after.shape[1] :])
+    n = after.shape[1]
+    R = np.linalg.qr(data, mode="r") / np.sqrt(len(data))
+    E, found = _solved(R, n)
+    F = _values(found, "F", n, n)
+    G = _values(found, "G", n, R.shape[1] - 2 * n)
+    first = dataset.trajectories[0]
+    D = np.diag(1.0 / x_scale[1])
+    E, F, B = D @ E @ D, D @ F @ D, D @ G[:, :-1] / u_scale[1]
+    E = (E + E.T) / 2.0
+    c = (E - F) @ x_scale[0] - B @ u_scale[0] + D @ G[:, -1]
+    units = np.eye(n + len(u_scale[0]), dtype=np.int64)
+    model = ImplicitModel.separable(
+        e=Polynomials(units[:n, :n], E.T),
+        f=Polynomials(np.vstack([units, np.zeros_like(units[:1])]), np.vstack([F.T, B.T, c])),
+        monotonicity=DECREASE * float(np.linalg.eigvalsh(E)[0]),
+        period=dataset.period,
+        states=tuple(first.y_names),
+        inputs=tuple(first.u_names),
+    )
+    delta = DECREASE / float(np.max(x_scale[1])) ** 2
+    proof = prove_implicit(model, delta=delta, set="2.19")
+    if proof is None:
+        raise Infeasible("no exact proof for the minimiser; give more data or fewer states")
+    return LinearStateFit(model, proof)
+
+
+def _solved(R: FloatArray, n: int) -> tuple[FloatArray, Solution]:
+    """E, and the solution that holds F and G, for the triangular factor R of [x⁺, x, w, 1]."""
+    E = symmetric_template("E", n)
+    F, G = _unknown("F", n, n), _unknown("G", n, R.shape[1] - 2 * n)
+    (bound,) = variables("bound")
+    residual = R[:, :n] @ E - R[:, n : 2 * n] @ F.T - R[:, 2 * n :] @ G.T
+    program = Program(
+        forms_of(2 * n),
+        (linear_models(E, F), NormBound(tuple(residual.ravel()), bound)),
+        minimise=bound,
+    )
+    found = solve(program)
+    values = [[float(found.value(entry)) for entry in row] for row in E]
+    return np.array(values), found
+
+
+def _unknown(name: str, rows: int, columns: int) -> np.ndarray:
+    names = [f"{name}[{i},{j}]" for i in range(rows) for j in range(columns)]
+    return np.array(variables(names), dtype=object).reshape(rows, columns)
+
+
+def _values(found: Solution, name: str, rows: int, columns: int) -> FloatArray:
+    entries = [[found.values[f"{name}[{i},{j}]"] for j in range(columns)] for i in range(rows)]
+    return np.array(entries)
+
+
+def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
+    mean, spread = values.mean(axis=0), values.std(axis=0)
+    for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
+        raise DataError(f"{role} {i} is constant ({mean[i]:g}): nothing can be identified from it")
+    return mean, spread
+
+
+def _refuse_poor(regressors: FloatArray) -> None:
+    if len(regressors) <= regressors.shape[1]:
+        raise DataError(
+            f"{len(regressors)} steps for {regressors.shape[1]} regressors; give more data"
+        )
+    singular = np.linalg.svd(regressors, compute_uv=False)
+    if singular[-1] < RANK_TOLERANCE * singular[0]:
+        raise DataError("states and inputs are not independent: excite them more, or drop some")

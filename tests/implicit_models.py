@@ -1,0 +1,71 @@
+"""Implicit models that tests share."""
+
+import numpy as np
+
+from nlsid_core.models import ImplicitModel
+from nlsid_core.models.polynomials import Polynomials
+
+
+def quintic() -> ImplicitModel:
+    """Example 2.3.1 with an input: x⁺ + x⁺⁵/5 = x³/3 + w."""
+    return ImplicitModel.separable(
+        e=Polynomials(np.array([[1], [5]]), np.array([[1.0], [0.2]])),
+        f=Polynomials(np.array([[3, 0], [0, 1]]), np.array([[1.0 / 3.0], [1.0]])),
+        monotonicity=0.5, period=0.1, states=("v",), inputs=("force",),
+    )  # fmt: skip
+
+
+def coupled() -> ImplicitModel:
+    """Two states: e = x + x³/10 each, f a rotation by half, cubic in the first state."""
+    return ImplicitModel.separable(
+        e=Polynomials(
+            np.array([[1, 0], [0, 1], [3, 0], [0, 3]]),
+            np.array([[1.0, 0.0], [0.0, 1.0], [0.1, 0.0], [0.0, 0.1]]),
+        ),
+        f=Polynomials(
+            np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [3, 0, 0]]),
+            np.array([[0.4, -0.3], [0.3, 0.4], [1.0, 0.0], [0.0, 0.05]]),
+        ),
+        monotonicity=0.9, period=0.1, states=("a", "b"), inputs=("u",),
+    )  # fmt: skip
+
+
+def lagged(a1: float = 0.5, a2: float = -0.3) -> ImplicitModel:
+    """3v + v³ = 3(a₁ x₀ + a₂ x₁) + w, x⁺ = [v; x₀]: a delay state with known structure."""
+    return ImplicitModel(
+        h=Polynomials(
+            np.array([[1, 0, 0, 0], [3, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+            np.array([[3.0], [1.0], [-3.0 * a1], [-3.0 * a2], [-1.0]]),
+        ),
+        shift=Polynomials(np.array([[1, 0, 0]]), np.array([[1.0]])),
+        monotonicity=1.5, period=0.1, states=("y1", "y2"), inputs=("u",),
+    )  # fmt: skip
+
+
+def cubic_spring() -> ImplicitModel:
+    """v + v³ + v w²/4 = x/2 + w: the unknown and the input are not separable."""
+    return ImplicitModel(
+        h=Polynomials(
+            np.array([[1, 0, 0], [3, 0, 0], [1, 0, 2], [0, 1, 0], [0, 0, 1]]),
+            np.array([[1.0], [1.0], [0.25], [-0.5], [-1.0]]),
+        ),
+        shift=Polynomials(np.zeros((0, 2), dtype=np.int64), np.zeros((0, 0))),
+        monotonicity=0.5, period=0.1, states=("x",), inputs=("u",),
+    )  # fmt: skip
+
+
+def rotated(degrees: float = 120.0) -> ImplicitModel:
+    """e = R c(x), R a rotation and c cubic: centred on e₀ = R, which need not be monotone (2.7)."""
+    angle = np.deg2rad(degrees)
+    R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    basis = np.array([[1, 0], [0, 1], [3, 0], [0, 3]])
+    values = np.vstack([np.eye(2), 0.25 * np.eye(2)])  # scaled without rounding
+    return ImplicitModel.separable(
+        e=Polynomials(basis, values @ R.T),
+        f=Polynomials(
+            np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+            np.array([[0.3, 0.1], [-0.1, 0.3], [1.0, 0.5]]),
+        ),
+        monotonicity=0.9, period=0.1, states=("a", "b"), inputs=("u",),
+        centre=Polynomials(basis[:2], R.T),
+    )  # fmt: skip
