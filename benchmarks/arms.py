@@ -99,14 +99,14 @@ def main() -> None:
         print(
             f"{name:10s}{naive.simulation_percent:12.1f}{naive.prediction_percent[1]:10.2f}"
             f"{ours.simulation_percent:12.1f}{ours.prediction_percent[1]:10.2f}"
-            f"{ours.prediction_percent[20]:10.1f}{rate:>9s}{ours.white!s:>7s}{seconds:7.2f}"
+            f"{ours.prediction_percent[20]:10.1f}{rate:>9s}{ours.one_step.white!s:>7s}{seconds:7.2f}"
         )
         keys[name] = {
             "ls_simulation": naive.simulation_percent,
             "simulation": ours.simulation_percent,
             "one_ahead": ours.prediction_percent[1],
             "proved": proof is not None,
-            "white": ours.white,
+            "white": ours.one_step.white,
         }
     white = sum(bool(entry["white"]) for entry in keys.values())
     better = sum(entry["simulation"] < entry["ls_simulation"] for entry in keys.values())

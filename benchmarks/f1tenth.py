@@ -62,8 +62,9 @@ def measure() -> dict[str, float | int | bool]:
             proved = all(is_proved(path) for path in proofs)
             seconds.append(time.perf_counter() - started)
         inside, caught = monitored(config, bags, out)
+        lags = len(documents.load_model(out / documents.MODEL))
     errors = {c.method: c.error_percent(result.test) for c in result.fit.candidates}
-    repeats = bias_removed(result.train, result.test, config.identification.lags)
+    repeats = bias_removed(result.train, result.test, lags)
     return {
         "ls": errors[LEAST_SQUARES],
         "first": errors[FIRST],
@@ -119,7 +120,7 @@ def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay]
     for bag in test:
         for name, fault in FAULTS.items():
             copy = out / f"{bag.name} {name}"
-            write_faulty_copy(bag, copy, config.signals.response.path, fault)
+            write_faulty_copy(bag, copy, config.signals.response[0].path, fault)
             faulty.append(replay_bag(proved, copy, nominal=nominal))
     return clean, faulty
 

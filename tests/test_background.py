@@ -78,7 +78,9 @@ def test_the_last_recordings_are_those_that_began_last_and_are_finished(tmp_path
 
 def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
     data = synthetic_dataset(0.01, trials=2, samples=80)
-    train, test = cut(data, 0.25)
+    trials = cut(data, 0.25)
+    train, test = trials.train, trials.test
+    assert trials.validation is None
     assert train.names == test.names == data.names
     for whole, fitted, scored in zip(data, train, test, strict=True):
         assert (len(fitted), len(scored)) == (60, 20)
@@ -87,6 +89,18 @@ def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
         assert scored.t[0] == 0.0
     with pytest.raises(DataError, match=r"0\.01 of 80 samples"):
         cut(data, 0.01)
+
+
+def test_trials_to_choose_by_are_left_whole() -> None:
+    data = synthetic_dataset(0.01, trials=2, samples=80)
+    name = data.names[0]
+    trials = cut(data, 0.25, validation=[name])
+    assert trials.validation is not None
+    assert trials.validation.names == (name,)
+    assert len(trials.validation[0]) == 80
+    assert trials.train.names == trials.test.names == data.names[1:]
+    with pytest.raises(DataError, match="all of the bags are validation trials"):
+        cut(data, 0.25, validation=data.names)
 
 
 def test_a_configuration_names_test_bags_or_a_share_but_not_both(tmp_path: Path) -> None:

@@ -17,7 +17,11 @@ from nlsid_core._types import FloatArray, Json
 from nlsid_core.certificate import check, proof_document
 from nlsid_core.certificate.block_cascade import is_schur, slope_range, state_matrix, states
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, ShapeError
-from nlsid_core.identification.block_cascade import CascadeFit, identify_block_cascade
+from nlsid_core.identification.block_cascade import (
+    BlockCascadeClass,
+    CascadeFit,
+    identify_block_cascade,
+)
 from nlsid_core.identification.cascade_fit import (
     Parameters,
     Trial,
@@ -72,10 +76,7 @@ def fit() -> CascadeFit:
     return identify_block_cascade(
         Dataset((recording(2500, 0), recording(1500, 1))),
         Dataset((recording(1500, 2),)),
-        orders=(2, 1),
-        phases=(1,),
-        intervals=(8, 16),
-        starts=4,
+        BlockCascadeClass(orders=(2, 1), phases=(1,), intervals=(8, 16), starts=4),
         transient=60,
         rng=np.random.default_rng(3),
     )
@@ -343,16 +344,16 @@ def test_an_unstable_cascade_has_no_proof() -> None:
 def test_bad_data_and_bad_models_say_what_is_wrong() -> None:
     rng, data = np.random.default_rng(0), Dataset((recording(900, 0),))
     with pytest.raises(DataError, match="transient"):
-        identify_block_cascade(data, data, transient=400, rng=rng)
+        identify_block_cascade(data, data, BlockCascadeClass(), transient=400, rng=rng)
     with pytest.raises(DataError, match="phases"):
-        identify_block_cascade(data, data, phases=(0,), rng=rng)
+        BlockCascadeClass(phases=(0,))
     t = np.arange(900.0)
     flat = Dataset((Trajectory(t=t, y=np.ones(900), u=rng.standard_normal(900)),))
     with pytest.raises(DataError, match="constant"):
-        identify_block_cascade(flat, flat, rng=rng)
+        identify_block_cascade(flat, flat, BlockCascadeClass(), rng=rng)
     two = Dataset((Trajectory(t=t, y=t, u=rng.standard_normal((900, 2))),))
     with pytest.raises(ShapeError, match="one input"):
-        identify_block_cascade(two, two, rng=rng)
+        identify_block_cascade(two, two, BlockCascadeClass(), rng=rng)
     model = truth()
     with pytest.raises(ShapeError, match="equal phases"):
         BlockCascade(model.a1, model.b1, model.f, model.a2, np.ones((2, 2)), 0.01, model.y, model.u)

@@ -176,7 +176,7 @@ def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
 
 def test_the_report_is_one_file_with_its_pictures(chain: Path) -> None:
     page = (chain / documents.REPORT).read_text()
-    assert page.count("<svg") == 3
+    assert page.count("<svg") == 4  # trials, residuals, poles, the search
     assert "src=" not in page
     assert 'href="http' not in page
     assert "decided exactly" in page
@@ -185,6 +185,7 @@ def test_the_report_is_one_file_with_its_pictures(chain: Path) -> None:
 def test_with_policy_none_the_funnel_is_a_prediction_tube(
     chain: Path, config: Config, tmp_path: Path
 ) -> None:
+    assert config.funnel is not None
     prediction = config.model_copy(
         update={"funnel": config.funnel.model_copy(update={"policy": None})}
     )

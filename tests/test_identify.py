@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from bags.chain.shipped import config_file
 from bags.commands.cli import app
 from bags.monitoring import documents
+from bags.pictures.report import page
 from bags.samples import f1tenth
 from nlsid_core.certificate import check
 from nlsid_core.errors import DataError, Infeasible
@@ -21,6 +22,7 @@ from nlsid_core.identification import (
     RIE,
     LinearClass,
     StateAffineClass,
+    describe,
     identify,
     select,
     validate,
@@ -106,6 +108,9 @@ def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not
     scores = validate(stable.model, data)
     assert not scores.white
     assert "NOT white" in str(scores)
+    report = page(stable, data, data, robot="unstable")
+    assert "simulation residual is NOT white (99 %)" in report
+    assert "one-step residual is NOT white (99 %)" in report
 
 
 def test_selection_takes_the_class_with_the_least_validation_error(train: Dataset) -> None:
@@ -116,7 +121,7 @@ def test_selection_takes_the_class_with_the_least_validation_error(train: Datase
     assert chosen.best == LinearClass(2)
     assert chosen.errors[0] > chosen.errors[1]
     assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
-    assert len(seen) == 3
+    assert seen == [*map(describe, classes), "done"]
     assert "LinearClass(lags=2)" in str(chosen)
     with pytest.raises(Infeasible, match="no class has a proved model"):
         select(train, validation, [LinearClass(60)])

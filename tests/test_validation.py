@@ -38,7 +38,7 @@ def equation_noise_dataset(seed: int, *, hidden: float = 0.0) -> Dataset:
 
 def test_the_truth_leaves_a_white_independent_residual() -> None:
     verdicts = [validate(truth(), equation_noise_dataset(seed)) for seed in range(20)]
-    assert sum(v.white for v in verdicts) >= 18  # 99 % tests: 0.2 failures are expected
+    assert sum(v.one_step.white for v in verdicts) >= 18  # 99 % tests: 0.2 failures are expected
     assert sum(v.independent for v in verdicts) >= 18
     assert "is white" in str(verdicts[0])
 
@@ -46,17 +46,17 @@ def test_the_truth_leaves_a_white_independent_residual() -> None:
 def test_a_missing_delay_shows_in_the_cross_correlation() -> None:
     found = validate(truth(), equation_noise_dataset(0, hidden=0.02))
     assert not found.independent
-    peak = int(np.argmax(abs(found.cross_correlation[0, 0]))) - 20
-    assert peak == 5
-    assert max(abs(found.cross_correlation[0, 0])) > found.cross_band[0, 0]
+    crossed = abs(found.one_step.cross_correlation[0, 0])
+    assert int(np.argmax(crossed)) - 20 == 5
+    assert max(crossed) > found.one_step.cross_band[0, 0]
     assert "NOT independent" in str(found)
 
 
 def test_output_noise_shows_as_a_residual_that_is_not_white() -> None:
     noisy = synthetic_dataset(0.05, trials=10, samples=400)
     found = validate(truth(), noisy)
-    assert not found.white
-    assert max(abs(found.autocorrelation[0])) > found.band
+    assert not found.one_step.white
+    assert max(abs(found.one_step.autocorrelation[0])) > found.one_step.band
 
 
 def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
@@ -101,7 +101,7 @@ def test_missing_segments_are_skipped_with_a_count() -> None:
 def test_trials_too_short_for_the_tests_are_refused() -> None:
     dataset = synthetic_dataset(0.0, trials=1, samples=40)
     with pytest.raises(DataError, match="need more than"):
-        validate(truth(), dataset)
+        validate(truth(), dataset, lags=20)
     with pytest.raises(DataError, match="a horizon of 0"):
         predict(truth(), dataset.trajectories[0], 0)
 

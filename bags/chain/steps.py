@@ -4,35 +4,48 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bags.chain.config import Config, SignalConfig
+from bags.chain.config import Config
+from bags.chain.sections import SignalConfig
 from bags.chain.training import load_training, save_training
 from bags.monitoring import documents
 from bags.pictures.report import report_available, write_report
-from bags.signals.grid import read_dataset
+from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import _json
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign, design_tube
-from nlsid_core.identification import (
-    AnyCandidate,
-    AnyFit,
-    Model,
-    Validation,
-    identify,
-    validate,
-)
+from nlsid_core.identification import Fit, Model
 from nlsid_core.trajectory import Dataset, Trajectory
 
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
+class Trials:
+    """The bags' trials by what they are for, and how many samples were skipped in gaps."""
+
+    train: Dataset
+    test: Dataset
+    validation: Dataset | None = None
+    skipped: int = 0
+
+
+@dataclass(frozen=True, eq=False)
 class Identified:
     """A fit with the data it was made and scored on, and the files written."""
 
-    fit: AnyFit
-    train: Dataset
-    test: Dataset
+    fit: Fit[Model]
+    trials: Trials
     files: tuple[Path, ...]
+
+    @property
+    def train(self) -> Dataset:
+        """The trials it was fitted to."""
+        return self.trials.train
+
+    @property
+    def test(self) -> Dataset:
+        """The trials that only scored it."""
+        return self.trials.test
 
 
 def identify_bags(
@@ -42,116 +55,118 @@ def identify_bags(
 
     Raises DataError (BagError for bags) before anything is written.
     """
-    train, test = read_split(
-        bags, config, progress=lambda what, fraction: progress(what, 0.5 * fraction)
+    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.5))
+    fit = config.identification.identify(
+        trials.train,
+        validation=trials.validation,
+        test=trials.test,
+        progress=part(progress, 0.5, 0.9),
     )
-    fit = identify(
-        train,
-        config.identification.model_class,
-        method=config.identification.method,
-        test=test,
-        iterations=config.identification.iterations,
-        progress=lambda what, fraction: progress(what, 0.5 + 0.4 * fraction),
-    )
+    return write_identified(fit, trials, config, out, progress=progress)
+
+
+def write_identified(
+    fit: Fit[Model], trials: Trials, config: Config, out: Path, *, progress: Progress
+) -> Identified:
+    """The files of one fit; a proof file of an earlier model does not stay beside an unproved."""
     out.mkdir(parents=True, exist_ok=True)
-    training = out / documents.TRAINING
-    model: Model = replace(fit.model, training=save_training(training, train))
-    _json.write_document(out / documents.MODEL, model.document())
-    proof = fit.proof.document(model, documents.MODEL)
-    _json.write_document(out / documents.MODEL_PROOF, proof)
-    files = [out / documents.MODEL, out / documents.MODEL_PROOF, training]
+    training, path, proof = (
+        out / name for name in (documents.TRAINING, documents.MODEL, documents.MODEL_PROOF)
+    )
+    model: Model = replace(fit.model, training=save_training(training, trials.train))
+    _json.write_document(path, model.document())
+    files = [path, training]
+    if fit.chosen.proof is None:
+        proof.unlink(missing_ok=True)
+    else:
+        _json.write_document(proof, fit.proof.document(model, documents.MODEL))
+        files.insert(1, proof)
     progress("drawing the report", 0.9)
     if report_available():
         files.append(out / documents.REPORT)
-        write_report(files[-1], fit, train, test, robot=config.robot)
+        write_report(
+            files[-1], fit, trials.train, trials.test,
+            validation=trials.validation, robot=config.robot,
+        )  # fmt: skip
     progress("done", 1.0)
-    return Identified(fit, train, test, tuple(files))
+    return Identified(fit, trials, tuple(files))
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """Every method's candidate with its scores on the test trials."""
-
-    rows: tuple[tuple[AnyCandidate, Validation], ...]
-    test: Dataset
+def part(progress: Progress, start: float, end: float) -> Progress:
+    """Progress of a part of the work that begins at `start` and ends at `end`."""
+    return lambda what, fraction: progress(what, start + (end - start) * fraction)
 
 
-def compare_bags(
-    bags: Sequence[Path], config: Config, lags: Sequence[int], *, progress: Progress
-) -> Compared:
-    """Every method of the configured model class at each number of lags, on the same test trials.
-
-    Writes nothing. Raises DataError as `identify_bags` does.
-    """
-    train, test = read_split(
-        bags, config, progress=lambda what, fraction: progress(what, 0.3 * fraction)
-    )
-    options = config.identification
-    rows: list[tuple[AnyCandidate, Validation]] = []
-    for number, n in enumerate(lags):
-        model_class = options.model_copy(update={"lags": n}).model_class
-        affine = options.model == "state_affine" and options.lagged_degree == 0
-        certifiable = affine and options.leading_degree <= 2
-        fit = identify(
-            train,
-            model_class,
-            method="rse_certified" if certifiable else "rse",
-            iterations=options.iterations,
-            allow_unproved=True,
-            progress=lambda what, fraction, done=number: progress(
-                what, 0.3 + 0.7 * (done + fraction) / len(lags)
-            ),
-        )
-        rows += [(candidate, validate(candidate.model, test)) for candidate in fit.candidates]
-    return Compared(tuple(rows), test)
-
-
-def read_split(
-    bags: Sequence[Path], config: Config, *, progress: Progress
-) -> tuple[Dataset, Dataset]:
-    """(training, test) trials of the configured signals on the configured grid."""
-    response, excitation = config.signals.response, config.signals.excitation
+def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> Trials:
+    """The trials of the configured signals on the configured grid, by what they are for."""
+    responses, excitations = config.signals.response, config.signals.excitation
     dataset = read_dataset(
         bags,
-        responses=[response.path],
-        excitations=[excitation.path],
+        responses=[signal.path for signal in responses],
+        excitations=[signal.path for signal in excitations],
         period=config.grid.period,
         max_gap=config.grid.max_gap,
+        split_gaps=config.grid.split_gaps,
         progress=lambda done, total: progress("reading bags", done / total),
     )
-    labelled = _labelled(dataset, response, excitation)
+    labelled = _labelled(dataset, responses, excitations)
     if config.split.share is not None:
-        return cut(labelled, config.split.share)
-    return split(labelled, config.split.test)
+        trials = cut(labelled, config.split.share, validation=config.split.validation)
+    else:
+        trials = split(labelled, test=config.split.test, validation=config.split.validation)
+    return replace(trials, skipped=skipped_samples(dataset))
 
 
-def _labelled(dataset: Dataset, response: SignalConfig, excitation: SignalConfig) -> Dataset:
+def _labelled(
+    dataset: Dataset, responses: Sequence[SignalConfig], excitations: Sequence[SignalConfig]
+) -> Dataset:
     """The same trials with the configured names, units and paths on their signals."""
     labels: dict[str, tuple[str, ...]] = {}
-    for letter, signal in (("y", response), ("u", excitation)):
-        labels[f"{letter}_names"] = (signal.name,)
-        labels[f"{letter}_units"] = (signal.unit,)
-        labels[f"{letter}_paths"] = (signal.path,)
+    for letter, signals in (("y", responses), ("u", excitations)):
+        labels[f"{letter}_names"] = tuple(signal.name for signal in signals)
+        labels[f"{letter}_units"] = tuple(signal.unit for signal in signals)
+        labels[f"{letter}_paths"] = tuple(signal.path for signal in signals)
     return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
-def split(dataset: Dataset, test: Sequence[str]) -> tuple[Dataset, Dataset]:
-    """(training, test) trials by name; DataError if either would be empty."""
-    present = [name for name in test if name in dataset.names]
-    if not present:
+def split(dataset: Dataset, *, test: Sequence[str], validation: Sequence[str] = ()) -> Trials:
+    """The trials by name of their bag; DataError if a name is for both, or a part is empty."""
+    if twice := set(test) & set(validation):
+        raise DataError(f"split: '{min(twice)}' is named for test and for validation")
+    chosen = {
+        "test": _of_bags(dataset, test),
+        "validation": _of_bags(dataset, validation),
+    }
+    present = ", ".join(dataset.names)
+    if not chosen["test"]:
         raise DataError(
             "none of the bags is a test trial, so no model can be scored; split.test names "
-            f"{', '.join(test) or 'nothing'}, the bags are {', '.join(dataset.names)}"
+            f"{', '.join(test) or 'nothing'}, the bags are {present}"
         )
-    if len(present) == len(dataset):
+    if validation and not chosen["validation"]:
+        raise DataError(
+            f"none of the bags is a validation trial; split.validation names "
+            f"{', '.join(validation)}, the bags are {present}"
+        )
+    held_out = [*chosen["test"], *chosen["validation"]]
+    if len(chosen["test"]) == len(dataset):
         raise DataError("all of the bags are test trials; give some to train on")
-    return dataset.without(present), dataset.select(present)
+    if len(held_out) == len(dataset):
+        raise DataError("all of the bags are test or validation trials; give some to train on")
+    return Trials(
+        dataset.without(held_out),
+        dataset.select(chosen["test"]),
+        dataset.select(chosen["validation"]) if chosen["validation"] else None,
+    )
 
 
-def cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:
-    """(training, test): every trial's start, and the `share` of it at its end."""
+def cut(dataset: Dataset, share: float, *, validation: Sequence[str] = ()) -> Trials:
+    """Test trials are the `share` at the end of every trial that is not for validation."""
+    held_out = _of_bags(dataset, validation)
+    if len(held_out) == len(dataset):
+        raise DataError("all of the bags are validation trials; give some to train on")
     parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
-    for trial in dataset:
+    for trial in dataset.without(held_out):
         count = round(share * len(trial.t))
         if not 2 <= count <= len(trial.t) - 2:
             raise DataError(
@@ -160,7 +175,16 @@ def cut(dataset: Dataset, share: float) -> tuple[Dataset, Dataset]:
         for part, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
             y, u = trial.y[rows], trial.u[rows]
             part.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
-    return Dataset(tuple(parts[0])), Dataset(tuple(parts[1]))
+    return Trials(
+        Dataset(tuple(parts[0])),
+        Dataset(tuple(parts[1])),
+        dataset.select(held_out) if held_out else None,
+    )
+
+
+def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
+    """The trials of the bags called so; a bag with gaps has several, `bag.1`, `bag.2`, ..."""
+    return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
 
 
 def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:
@@ -168,9 +192,11 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
 
     The disturbance is measured on training.npz beside the model. Raises DataError or Infeasible.
     """
+    options = config.funnel
+    if options is None:
+        raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
     model = documents.load_model(model_path)
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
-    options = config.funnel
     weights = options.policy
     design = design_tube(
         model,

@@ -5,19 +5,20 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from bags.chain.config import GridConfig, NonNegative, Positive, SignalConfig, _Section, read_yaml
+from bags.chain.config import GridConfig
+from bags.chain.sections import NonNegative, Positive, Section, SignalConfig, read_yaml
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1, strict=False)]
 
 
-class StateSignals(_Section):
+class StateSignals(Section):
     """The measured state (positions, then rates) and the inputs."""
 
     states: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
     inputs: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
 
 
-class StateIdentification(_Section):
+class StateIdentification(Section):
     """validation: bags that choose the degrees. refuse_above: % of error in free run.
 
     degrees: classes to try, the highest power of each state and input (default: a few).
@@ -34,7 +35,7 @@ class StateIdentification(_Section):
     implicit: bool = False
 
 
-class MotionConfig(_Section):
+class MotionConfig(Section):
     """From `start` to `goal` (states) in `duration` s, or near given `samples`.
 
     samples: a CSV file, headed by the states' names in their order, one row a period; a relative
@@ -58,7 +59,7 @@ class MotionConfig(_Section):
         return self
 
 
-class DisturbanceConfig(_Section):
+class DisturbanceConfig(Section):
     """form of the assumption, rate if it is fading; safety_factor over the largest run."""
 
     form: Literal["response", "peak", "energy", "fading"] = "response"
@@ -66,7 +67,7 @@ class DisturbanceConfig(_Section):
     rate: float = Field(default=1.0, gt=0.0, le=1.0)
 
 
-class SimulationConfig(_Section):
+class SimulationConfig(Section):
     """A robot of `bags.chain.plants` to record: peak torques in N·m, seconds of each excitation.
 
     runs: of the policy, to commission it, from starts up to `spread` of what the data box allows.
@@ -82,7 +83,7 @@ class SimulationConfig(_Section):
     seed: int = Field(default=0, ge=0)
 
 
-class TrackingConfig(_Section):
+class TrackingConfig(Section):
     """One robot's configuration file for `nlsid track`."""
 
     robot: str

@@ -41,6 +41,7 @@ def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
         excitations=[signal.path for signal in signals.inputs],
         period=config.grid.period,
         max_gap=config.grid.max_gap,
+        split_gaps=config.grid.split_gaps,
     )
     labelled = [
         replace(

@@ -1,4 +1,4 @@
-"""The command line `nlsid`: identify, funnel, compose, check, monitor, live, demo, `bag` tools."""
+"""The command line `nlsid`: the chain's verbs, and `bag` and `track` with verbs of their own."""
 
 import importlib.util
 import sys
@@ -9,10 +9,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from bags.chain.choosing import compare_bags, select_bags
 from bags.chain.config import load_config
 from bags.chain.problems import FunnelProblem
 from bags.chain.shipped import shipped_file
-from bags.chain.steps import compare_bags, design_funnel_files, identify_bags
+from bags.chain.steps import Identified, design_funnel_files, identify_bags
 from bags.commands import show
 from bags.commands.bag_cli import bag_app
 from bags.commands.demo import run_demo
@@ -57,29 +58,54 @@ def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> No
     folders = expand_bags(bags)
     with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)
-    out.print(show.methods_table(result.fit, result.test))
-    for file in result.files:
-        out.print(f"wrote {file}", soft_wrap=True)
-    if not report_available():
-        out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+    _say_identified(result)
+
+
+LagsOption = Annotated[list[int] | None, typer.Option(help="Numbers of lags to try, repeatable.")]
+
+
+@app.command()
+def select(
+    bags: BagsArgument, config: ConfigOption, out_dir: OutOption, lags: LagsOption = None
+) -> None:
+    """Choose orders and bases by the error on validation bags, and write the best model.
+
+    What is tried: the configuration's `select`, or --lags.
+    """
+    settings = load_config(config)
+    folders = expand_bags(bags)
+    options = {"lags": lags} if lags else None
+    with progress_bar("selecting") as progress:
+        result = select_bags(folders, settings, out_dir, options=options, progress=progress)
+    out.print(show.selection_table(result.selection))
+    _say_identified(result.identified)
 
 
 @app.command()
 def compare(
     bags: BagsArgument,
     config: ConfigOption,
-    lags: Annotated[
-        list[int] | None,
-        typer.Option(help="Numbers of lags to try, repeatable; default the configuration's."),
+    lags: LagsOption = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder for a picture of the test errors.")
     ] = None,
 ) -> None:
-    """Score every method on the same test bags: simulation, prediction, residual tests, proof."""
+    """Score every method on the same test bags: simulation, prediction, residual tests, proof.
+
+    What is compared: the configuration's `compare`, a list of model classes, or else the one it
+    identifies, with --lags at each number of lags.
+    """
     settings = load_config(config)
     folders = expand_bags(bags)
     with progress_bar("comparing") as progress:
-        tried = lags or [settings.identification.lags]
-        compared = compare_bags(folders, settings, tried, progress=progress)
+        compared = compare_bags(folders, settings, lags=lags or (), progress=progress)
     out.print(show.comparison_table(compared))
+    for refusal in compared.refusals:
+        out.print(f"no model: {escape(refusal)}", soft_wrap=True)
+    if out_dir is not None and report_available():
+        out_dir.mkdir(parents=True, exist_ok=True)
+        compared.draw(out_dir / documents.COMPARISON_PLOT)
+        out.print(f"wrote {out_dir / documents.COMPARISON_PLOT}", soft_wrap=True)
 
 
 @app.command()
@@ -225,6 +251,16 @@ def demo(
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     if not run_demo(out_dir, out):
         raise typer.Exit(1)
+
+
+def _say_identified(result: Identified) -> None:
+    out.print(show.methods_table(result.fit, result.test))
+    for line in show.notes(result):
+        out.print(line, soft_wrap=True, markup=False, highlight=False)
+    for file in result.files:
+        out.print(f"wrote {file}", soft_wrap=True)
+    if not report_available():
+        out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
 
 
 def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:

@@ -88,7 +88,7 @@ class _Demo:
             for done, (bag, fault) in enumerate(pairs):
                 copy = Path(folder) / f"{bag.name}, {fault}"
                 progress(f"sabotaging {copy.name}", done / len(pairs))
-                write_faulty_copy(bag, copy, self.config.signals.response.path, FAULTS[fault])
+                write_faulty_copy(bag, copy, self.config.signals.response[0].path, FAULTS[fault])
                 sabotaged += self._replay([copy])
             progress("drawing", 1.0)
             if report_available():

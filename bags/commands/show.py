@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 
+from rich.markup import escape
 from rich.table import Table
 
+from bags.chain.choosing import Compared
 from bags.chain.config import Config
-from bags.chain.steps import Compared
+from bags.chain.steps import Identified
 from bags.monitoring.replay import Replay
+from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign
-from nlsid_core.identification import AnyFit
+from nlsid_core.identification import Candidate, Fit, Model, Selection, describe
 from nlsid_core.monitor import Nominal, Status
 from nlsid_core.trajectory import Dataset
 
@@ -20,50 +23,92 @@ COLOURS = {
 }
 
 
-def methods_table(fit: AnyFit, test: Dataset) -> Table:
+def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
-    table = Table(title=f"{len(fit.model)} lags, {len(test)} test trials", title_justify="left")
-    table.add_column("method")
+    table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
+    table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
     table.add_column("stability")
     for candidate in fit.candidates:
-        chosen = candidate is fit.chosen
         table.add_row(
             candidate.method,
-            f"{candidate.error_percent(test):.2f} %",
+            f"{fit.errors['test'][candidate.method]:.2f} %",
             f"{candidate.seconds * 1e3:.0f} ms",
-            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
-            style="bold" if chosen else "",
+            stability(candidate),
+            style="bold" if candidate is fit.chosen else "",
         )
     return table
 
 
+def notes(result: Identified) -> list[str]:
+    """What a user should know beside the table: the search, the residuals, what was skipped."""
+    lines = [str(result.fit.history)]
+    try:
+        scores = result.fit.chosen.validate(result.test)
+    except DataError as reason:
+        lines.append(f"residuals not tested: {reason}")
+    else:
+        lines += str(scores).splitlines()
+    if result.trials.skipped:
+        lines.append(f"{result.trials.skipped} samples skipped in gaps")
+    if result.fit.chosen.proof is None:
+        lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
+    return lines
+
+
+def selection_table(selection: Selection[Model]) -> Table:
+    """Validation, training and test error of every class, the chosen one bold."""
+    table = Table(title="chosen by the validation error", title_justify="left")
+    table.add_column("model class")
+    for name in ("validation", "training", "test"):
+        table.add_column(name, justify="right")
+    table.add_column("stability")
+    for entry in selection.tried:
+        style = "bold" if entry.model_class is selection.best else ""
+        label = describe(entry.model_class)
+        if entry.fit is None:
+            table.add_row(label, "-", "-", "-", escape(entry.refusal))
+            continue
+        errors = [f"{entry.error(name):.2f} %" for name in ("validation", "train", "test")]
+        table.add_row(label, *errors, stability(entry.fit.chosen), style=style)
+    return table
+
+
 def comparison_table(compared: Compared) -> Table:
-    """Every method at every number of lags, scored on the same test trials."""
-    table = Table(title=f"{len(compared.test)} test trials", title_justify="left")
-    table.add_column("lags", justify="right")
+    """Every method of every class, scored on the same samples of the test trials."""
+    left_out = f" after their first {compared.skipped_at_start} samples"
+    table = Table(title=f"{len(compared.trials.test)} test trials{left_out}", title_justify="left")
+    table.add_column("model class")
     table.add_column("method")
     table.add_column("simulation", justify="right")
-    horizons = list(compared.rows[0][1].prediction_percent)
+    horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
     for name in ("residual", "stability"):
         table.add_column(name)
     table.add_column("time", justify="right")
-    for candidate, scores in compared.rows:
+    for row in compared.rows:
+        scores = row.scores
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            str(len(candidate.model)),
-            candidate.method,
+            row.label,
+            row.candidate.method,
             f"{scores.simulation_percent:.2f} %",
             *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),
             ", ".join(flaws) or "white, independent",
-            "[green]proved[/green]" if candidate.proof else "[dark_orange3]not proved",
-            f"{candidate.seconds * 1e3:.0f} ms",
+            stability(row.candidate),
+            f"{row.candidate.seconds * 1e3:.0f} ms",
         )
     return table
+
+
+def stability(candidate: Candidate[Model]) -> str:
+    """Proved with its rate, or not, in colour."""
+    if candidate.proof is None:
+        return "[dark_orange3]not proved"
+    return f"[green]proved[/green], {candidate.proof.rate:.4f}"
 
 
 def funnel_table(design: TubeDesign) -> Table:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from bags.monitoring.replay import Replay
 from nlsid_core import _json
-from nlsid_core.identification import FIRST, AnyCandidate, AnyFit, Candidate
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.errors import DataError
+from nlsid_core.identification import Candidate, Fit, Model
+from nlsid_core.models import DifferenceEquation, MonotoneEquation, StateAffineModel
 from nlsid_core.trajectory import Dataset
 
 STYLE = """
@@ -17,8 +18,10 @@ body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; marg
        padding: 0 1rem }
 h1 { font-size: 1.5rem } h2 { font-size: 1.1rem; margin-top: 2rem }
 table { border-collapse: collapse } th, td { padding: .3rem .8rem; text-align: right }
+th, td { white-space: nowrap } .left td { white-space: normal }
 th:first-child, td:first-child, .left th, .left td { text-align: left }
 thead { border-bottom: 2px solid #222 }
+ul { padding-left: 1.2rem }
 tbody tr { border-bottom: 1px solid #ddd } tr.chosen { background: #e8f1fa; font-weight: 600 }
 svg { max-width: 100%; height: auto } code { font-size: .85rem; overflow-wrap: anywhere }
 .note { color: #555 } .proved { color: #1a7f37 } .not { color: #b35900 }
@@ -30,9 +33,19 @@ def report_available() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def write_report(path: Path, fit: AnyFit, train: Dataset, test: Dataset, *, robot: str) -> None:
+def write_report(
+    path: Path,
+    fit: Fit[Model],
+    train: Dataset,
+    test: Dataset,
+    *,
+    validation: Dataset | None = None,
+    robot: str,
+) -> None:
     """Write the page; needs the extra `report`."""
-    _json.write_atomically(path, page(fit, train, test, robot=robot).encode())
+    _json.write_atomically(
+        path, page(fit, train, test, validation=validation, robot=robot).encode()
+    )
 
 
 def write_margins(path: Path, replays: Sequence[Replay]) -> None:
@@ -42,42 +55,70 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
     _json.write_atomically(path, plots.png(plots.margins(replays)))
 
 
-def page(fit: AnyFit, train: Dataset, test: Dataset, *, robot: str) -> str:
+def page(
+    fit: Fit[Model],
+    train: Dataset,
+    test: Dataset,
+    *,
+    validation: Dataset | None = None,
+    robot: str,
+) -> str:
     """The whole HTML page as text."""
-    from bags.pictures import plots  # matplotlib only where a report is drawn
+    from bags.pictures import model_plots, plots  # matplotlib only where a report is drawn
 
     chosen = fit.chosen
-    rows = "\n".join(_row(c, train, test, c is chosen) for c in fit.candidates)
-    simulated = plots.svg(plots.simulations(chosen, fit[FIRST], test))
+    outputs = range(test.trajectories[0].y.shape[1])
+    simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
+    columns = [name for name in ("test", "validation", "train") if name in fit.errors]
+    head = "".join(f"<th>{name} error</th>" for name in columns)
+    chosen_on = "" if validation is None else f"{len(validation)} validation, "
+    recordings = [(train, "training"), (validation, "validation"), (test, "test")]
+    listed = "".join(_recordings(data, use) for data, use in recordings if data is not None)
+    rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
 <style>{STYLE}</style>
 <h1>{escape(robot)}: identified model</h1>
-<p>{escape(_equation(chosen))}</p>
-<p class="proved">Incrementally stable for every input, decided exactly: two solutions with the same
-input approach each other at {fit.proof.rate:.4f} a sample or faster.</p>
+<p>{escape(_equation(chosen.model))}</p>
+{_stability(chosen)}
 <h2>How well it simulates</h2>
-<table><thead><tr><th>method</th><th>test error</th><th>training error</th><th>time</th>
+<table><thead><tr><th>method</th>{head}<th>time</th>
 <th>stability</th></tr></thead><tbody>{rows}</tbody></table>
-<p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first
-{len(chosen.model)} of each trial, ŷ simulated from those with the recorded input.
-{len(train)} training trials, {len(test)} test trials; test trials were only used for this
-table and the pictures below.</p>
+<p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
+simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
+Trials: {len(train)} training, {chosen_on}{len(test)} test; test trials were only used
+for this table and the pictures below.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
-<h2>Residuals, test trials</h2>{plots.svg(plots.residuals(chosen, test))}
-<p class="note">Shaded: where 99 % of a white residual's autocorrelation would lie. Outside it the
-model leaves something unexplained.</p>
-{_poles(chosen)}
+{_residuals(chosen, test)}
+{_inside(fit)}
 <h2>Recordings</h2>
 <table class="left">
-<thead><tr><th>trial</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
-<tbody>{_recordings(train, "training")}{_recordings(test, "test")}</tbody></table>
+<thead><tr><th>trial</th><th>samples</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
+<tbody>{listed}</tbody></table>
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """
 
 
-def _row(candidate: AnyCandidate, train: Dataset, test: Dataset, chosen: bool) -> str:
+def _stability(chosen: Candidate[Model]) -> str:
+    if chosen.proof is None:
+        return (
+            '<p class="not">Not proved stable: there is no certificate for this model, and nothing '
+            "built on it is certified.</p>"
+        )
+    inputs = "every input"
+    if isinstance(chosen.model, StateAffineModel):
+        low_high = ", ".join(f"[{low:g}, {high:g}]" for low, high in chosen.model.u_range)
+        inputs = f"every input in {low_high}"
+        clip = chosen.model.on_out_of_range == "clip"
+        inputs += " (others are clipped to it)" if clip else " (others are refused)"
+    return (
+        f'<p class="proved">Incrementally stable for {inputs}, decided exactly: two solutions with '
+        f"the same input approach each other at {chosen.proof.rate:.4f} a sample or faster.</p>"
+    )
+
+
+def _row(candidate: Candidate[Model], fit: Fit[Model], columns: Sequence[str]) -> str:
     proved = (
         '<span class="proved">proved</span>'
         if candidate.proof is not None
@@ -85,46 +126,78 @@ def _row(candidate: AnyCandidate, train: Dataset, test: Dataset, chosen: bool) -
     )
     cells = [
         escape(candidate.method),
-        f"{candidate.error_percent(test):.2f} %",
-        f"{candidate.error_percent(train):.2f} %",
+        *(f"{fit.errors[name][candidate.method]:.2f} %" for name in columns),
         f"{candidate.seconds * 1e3:.0f} ms",
         proved,
     ]
-    tag = '<tr class="chosen">' if chosen else "<tr>"
+    tag = '<tr class="chosen">' if candidate is fit.chosen else "<tr>"
     return tag + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 
 
-def _equation(candidate: AnyCandidate) -> str:
-    m = candidate.model
-    if not isinstance(m, DifferenceEquation):
+def _equation(m: Model) -> str:
+    outputs, inputs = (
+        ", ".join(f"{s.name} [{s.unit}]" for s in (part if isinstance(part, tuple) else (part,)))
+        for part in (m.y, m.u)
+    )
+    signals = f"y = {outputs}, u = {inputs}, one sample = {m.period:g} s"
+    if isinstance(m, DifferenceEquation):
+        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
+        drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
+        return f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, {signals}"
+    if isinstance(m, StateAffineModel):
         terms = sum(len(g.exponents) for g in m.G) + len(m.p.exponents)
-        outputs, inputs = (", ".join(f"{s.name} [{s.unit}]" for s in part) for part in (m.y, m.u))
         return (
             f"0 = sum G_k(w) y(t-k) + p(w), {len(m)} lags, {terms} terms in w = the last "
-            f"{len(m.window)} inputs; y = {outputs}, u = {inputs}, one sample = {m.period:g} s"
+            f"{len(m.window)} inputs; {signals}"
         )
-    past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
-    drive = " ".join(f"{b:+.4f} u(t-{j})" if j else f"{b:+.4f} u(t)" for j, b in enumerate(m.b))
-    return (
-        f"y(t) = {past.removeprefix('+')} {drive} {m.c:+.5f}, "
-        f"y = {m.y.name} [{m.y.unit}], u = {m.u.name} [{m.u.unit}], one sample = {m.period:g} s"
-    )
+    if isinstance(m, MonotoneEquation):
+        e = " ".join(f"{c:+.4g} y{power}" for c, power in zip(m.e, ("", "²", "³"), strict=True))
+        past = " ".join(f"{a:+.4f} y(t-{k})" for k, a in enumerate(m.a, 1))
+        return (
+            f"{e.removeprefix('+')} = {m.c:+.4g} {past} + {len(m.window)} inputs (y, u minus their "
+            f"offsets); {signals}"
+        )
+    return f"y = G₂ f(G₁ u): {m}; {signals}"
 
 
-def _poles(candidate: AnyCandidate) -> str:
-    """The pole plot of a linear model; a nonlinear one has none."""
-    from bags.pictures import plots
+def _left_out(chosen: Candidate[Model]) -> str:
+    return f" and the first {chosen.transient}" if chosen.transient else ""
 
-    model = candidate.model
-    if not isinstance(model, DifferenceEquation):
-        return ""
-    linear = Candidate(candidate.method, model, candidate.proof, candidate.seconds)
-    return f"<h2>Poles</h2>{plots.svg(plots.poles(linear))}"
+
+def _residuals(chosen: Candidate[Model], test: Dataset) -> str:
+    """The tests of the residuals in words and pictures."""
+    from bags.pictures import model_plots, plots
+
+    try:
+        scores = chosen.validate(test)
+    except DataError as reason:
+        return f'<h2>Residuals, test trials</h2><p class="note">{escape(str(reason))}</p>'
+    figure = plots.svg(model_plots.residuals(chosen, scores, test))
+    items = "".join(f"<li>{escape(line)}</li>" for line in str(scores).splitlines())
+    return f"""<h2>Residuals, test trials</h2>
+<ul>{items}</ul>{figure}
+<p class="note">Shaded: where 99 % of the values would lie if the one-step residual were white, or
+independent of the input. White noise on the measurement leaves the simulation residual white, white
+noise in the equation the one-step residual; if neither is white, the model leaves dynamics
+unexplained or the noise is coloured.</p>"""
+
+
+def _inside(fit: Fit[Model]) -> str:
+    """What the model looks like, and how the search went."""
+    from bags.pictures import model_plots, plots
+
+    figures = []
+    structure = model_plots.structure(fit.chosen)
+    if structure is not None:
+        figures.append(plots.svg(structure))
+    if len(fit.history.steps) > 1:
+        figures.append(plots.svg(model_plots.search_history(fit.history)))
+    return f"<h2>The model and the search</h2>{''.join(figures)}" if figures else ""
 
 
 def _recordings(dataset: Dataset, use: str) -> str:
     return "".join(
-        f"<tr><td>{escape(t.name)}</td><td>{use}</td><td>{escape(t.group)}</td>"
+        f"<tr><td>{escape(t.name)}</td><td>{len(t)}</td><td>{use}</td><td>{escape(t.group)}</td>"
         f"<td><code>{escape(t.digest[:19])}…</code></td></tr>"
         for t in dataset
     )

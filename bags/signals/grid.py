@@ -4,6 +4,7 @@ The rule, which `bags.signals.pairing` follows live: a response keeps its own st
 excitation of a sample is the latest command stamped at or before it (zero-order hold).
 """
 
+import json
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -140,8 +141,9 @@ def read_dataset(
     provenance is the bag's digest, files and custom data, the signals and the options. For the grid
     see `to_trajectory`, for clock, sort, drop_duplicates and unfinished `read_signals`.
 
-    split_gaps: a bag in which a response is missing for more than `max_gap` gives one trajectory
-    per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error. executor: reads
+    split_gaps: a bag in which a response is missing, or NaN, for more than `max_gap` gives one
+    trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
+    are no repeats, and `skipped_samples` counts what is in none of them. executor: reads
     bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)` is
     called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectory` and
     `Dataset` do.
@@ -182,6 +184,7 @@ def _read_trials(
         sort=options["sort"],
         drop_duplicates=options["drop_duplicates"],
         unfinished=options["unfinished"],
+        gaps_in=signals["responses"] if options["split_gaps"] else (),
     )
     origin = bag_origin(path, unfinished=options["unfinished"])
     responses = [read[response] for response in signals["responses"]]
@@ -189,20 +192,47 @@ def _read_trials(
     parts = [(responses, excitations)]
     if options["split_gaps"]:
         parts = list(_stretches(responses, excitations, options["max_gap"]))
+        if not parts:
+            raise DataError(f"{name}: no stretch of {MIN_STRETCH} samples without a gap")
     provenance = canonical({"bag": origin, "signals": signals, "options": options}).decode()
-    return [
+    trials = [
         to_trajectory(
             *part,
             period=options["period"],
             max_gap=options["max_gap"],
             tolerance=options["tolerance"],
             name=name if len(parts) == 1 else f"{name}.{k}",
-            group=origin["custom"].get(REPEAT_GROUP, ""),
+            group=origin["custom"].get(REPEAT_GROUP, "") if len(parts) == 1 else "",
             digest=origin["digest"],
             provenance=provenance,
         )
         for k, part in enumerate(parts, start=1)
     ]
+    if options["split_gaps"]:
+        return _with_skipped(trials, responses[0])
+    return trials
+
+
+def _with_skipped(trials: list[Trajectory], base: Samples) -> list[Trajectory]:
+    """The trials of one bag with the number of samples between its first and last not in them."""
+    span = seconds(int(base.stamp_ns[-1]), int(base.stamp_ns[0]))
+    skipped = 1 + round(span / trials[0].period) - sum(map(len, trials))
+    return [
+        replace(
+            trial,
+            provenance=canonical(json.loads(trial.provenance) | {"skipped": skipped}).decode(),
+        )
+        for trial in trials
+    ]
+
+
+def skipped_samples(dataset: Dataset) -> int:
+    """How many samples `split_gaps` left out of the bags of `dataset`."""
+    bags = {}
+    for trial in dataset:
+        origin = json.loads(trial.provenance or "{}")
+        bags[trial.digest] = int(origin.get("skipped", 0))
+    return sum(bags.values())
 
 
 def _stretches(

@@ -52,6 +52,7 @@ def read_signals(
     sort: bool = False,
     drop_duplicates: bool = False,
     unfinished: bool = False,
+    gaps_in: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> dict[str, Samples]:
     """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
@@ -60,6 +61,7 @@ def read_signals(
     sort: put messages in the order of their stamps instead of refusing stamps that go back.
     drop_duplicates: of messages with one stamp keep the first.
     unfinished: read what there is of a recording that was not closed.
+    gaps_in: those of `paths` whose messages without a finite number are left out, not refused.
     `[*]` gives one entry per element. Every path is checked against the types in the bag before a
     message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
     if a topic or field does not exist or is no number; if a topic has no messages; if a value is
@@ -88,7 +90,7 @@ def read_signals(
                 topics[topic].drop_duplicates()
         samples = {}
         for name, expression in wanted.items():
-            recorded = topics[expression.path.topic].samples(name)
+            recorded = topics[expression.path.topic].samples(name, gaps=name in gaps_in)
             samples[name] = _applied(source, expression, recorded, kinds[expression.path.topic])
     return samples
 
@@ -201,9 +203,12 @@ class _Topic:
             self._stamps = self._stamps[kept]
             self._values = {name: values[kept] for name, values in self._values.items()}
 
-    def samples(self, name: str) -> Samples:
+    def samples(self, name: str, *, gaps: bool) -> Samples:
         values = self._values[name]
-        if len(bad := np.flatnonzero(~np.isfinite(values))):
+        finite = np.isfinite(values)
+        if gaps and finite.any():
+            return Samples(name, self._stamps[finite], values[finite], self._clock)
+        if len(bad := np.flatnonzero(~finite)):
             i = int(bad[0])
             raise BagError(
                 f"{self._bag}: {name} is {values[i]} in message {i} at "

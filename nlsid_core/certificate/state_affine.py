@@ -6,6 +6,8 @@ For one output, constant G_1 … G_n and quadratic q = G_0 on the box of clipped
   2. x⁺ = A(1/q) x with A(s) = S - s e₁[G_1 … G_n]; r²P - A(s)'PA(s) ≻ 0 at s = 1/ℓ and s = 1/h,
      hence for every s between: it is concave in s.
 Two solutions with the same input differ by Δ⁺ = A(1/q(w))Δ, so V = Δ'PΔ shrinks by r² a sample.
+Where G_0 … G_n are all constant, of one output or of several, P alone proves it, with A of the
+block row -G_0⁻¹[G_1 … G_n].
 Source: thesis Definition 2.3, (4.1); S-procedure for the box.
 """
 
@@ -23,10 +25,11 @@ from nlsid_core.models.state_affine import StateAffineModel
 
 
 def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
-    """Decide `{rate}` for the bound model: one of two forms of proof.
+    """Decide `{rate}` for the bound model: one of three forms of proof.
 
-    `{P, lower, upper, lower_box, upper_box}` as above; `{P, T, gram, multipliers}` for any model of
-    the class, as in `state_affine_matrix`.
+    `{P}` where every coefficient of an output is constant; `{P, lower, upper, lower_box,
+    upper_box}` as above; `{P, T, gram, multipliers}` for any model of the class, as in
+    `state_affine_matrix`.
     """
     if set(about) != {"model"} or set(claim) != {"kind", "about", "rate"}:
         raise CertificateRejected("a state_affine_stability claim is about one file, the model")
@@ -34,13 +37,22 @@ def decide(claim: Json, proof: Json, about: Mapping[str, Json]) -> Decision:
     rate = _json.number(claim, "rate", source="claim")
     if "T" in proof:
         state_affine_matrix.decide(model, rate, proof)
+    elif set(proof) == {"P"}:
+        states = len(model) * len(model.y)
+        refusal = contracts_constant(
+            model, rate, P=_json.array(proof, "P", (states, states), source="proof")
+        )
+        if refusal is not None:
+            raise CertificateRejected(refusal)
     else:
         _decide_bounds(model, rate, proof)
+    inputs = "every input (inputs are clipped to the model's range)"
+    if model.on_out_of_range == "refuse":
+        inputs = "every input in the model's range (others are refused)"
     return Decision(
         statement=(
             f"incremental stability: solutions with the same input approach each other at "
-            f"{rate:.4f} a sample of {model.period:g} s or faster, for every input (inputs are "
-            "clipped to the model's range),"
+            f"{rate:.4f} a sample of {model.period:g} s or faster, for {inputs},"
         ),
         margin=1.0 - rate,
     )
@@ -102,6 +114,52 @@ def contracts(
         if not exact.is_positive_definite(decrease):
             return f"V = x'Px does not shrink by the stated rate {rate:.6g} at G_0 = {level}"
     return None
+
+
+def contracts_constant(model: StateAffineModel, rate: float, *, P: FloatArray) -> str | None:
+    """None if the claim holds exactly for constant G_0 … G_n of any number of outputs."""
+    r = Fraction(rate)
+    if not 0 < r < 1:
+        return f"rate is {rate:g}; stability needs 0 < rate < 1"
+    if any(g.exponents.any() for g in model.G):
+        return "coefficients of the outputs depend on the input; this proof is for constants"
+    A = block_matrix(model)
+    if A is None:
+        return "the leading coefficient G_0 is singular"
+    storage = exact.rational(P.tolist())
+    if not exact.is_positive_definite(storage):
+        return "P is not symmetric positive definite"
+    supply = [[r**2 * entry for entry in row] for row in storage]
+    decrease = exact.combine(supply, exact.congruence(A, storage), Fraction(-1))
+    if not exact.is_positive_definite(decrease):
+        return f"V = x'Px does not shrink by the stated rate {rate:.6g}"
+    return None
+
+
+def block_matrix(model: StateAffineModel) -> exact.Matrix | None:
+    """A of x = [ȳ(t-1); …; ȳ(t-n)] for constant coefficients; None if G_0 is singular.
+
+    Gauss-Jordan elimination on [G_0, G_1 … G_n] without rounding.
+    """
+    m, n = len(model.y), len(model)
+    constants = [
+        [[sum(map(Fraction, g.coefficients[:, a, b].tolist()), Fraction(0)) for b in range(m)]
+         for a in range(m)]
+        for g in model.G
+    ]  # fmt: skip
+    rows = [[entry for g in constants for entry in g[a]] for a in range(m)]
+    for k in range(m):
+        pivot = next((i for i in range(k, m) if rows[i][k] != 0), None)
+        if pivot is None:
+            return None
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [entry / rows[k][k] for entry in rows[k]]
+        for i in range(m):
+            if i != k:
+                factor = rows[i][k]
+                rows[i] = [a - factor * b for a, b in zip(rows[i], rows[k], strict=True)]
+    shifts = [[Fraction(int(j == i)) for j in range(n * m)] for i in range((n - 1) * m)]
+    return [[-entry for entry in row[m:]] for row in rows] + shifts
 
 
 def slack_matrix(

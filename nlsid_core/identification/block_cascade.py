@@ -5,8 +5,9 @@ smoothing are chosen by the simulation error on validation data.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -43,6 +44,41 @@ class CascadeChoice:
     validation_rms: float
     seconds: float
 
+    def __str__(self) -> str:
+        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
+        return f"{phases}, {self.intervals} intervals, smoothing {self.smoothing:.0e}"
+
+
+@dataclass(frozen=True)
+class BlockCascadeClass:
+    """Which block cascades, and from how many random starts.
+
+    orders: of the two filters; (n, 0) are Wiener, (0, n) Hammerstein models. phases, intervals
+    (ascending), smoothing: chosen on validation data; knots are refined while that helps. Several
+    phases presume an input without power near half the sampling frequency; validation decides.
+    start_samples: of each trial, for the starts.
+    """
+
+    orders: tuple[int, int] = (3, 3)
+    phases: tuple[int, ...] = (1, 2)
+    intervals: tuple[int, ...] = (24, 48, 96)
+    smoothing: tuple[float, ...] = (1e-8,)
+    starts: int = 12
+    start_samples: int = 10_000
+    kind: ClassVar[type[BlockCascade]] = BlockCascade
+
+    def __post_init__(self) -> None:
+        if min(self.orders) < 0 or max(self.orders) < 1:
+            raise DataError(f"orders {self.orders} should be two, not negative, not both zero")
+        if self.starts < 1 or self.start_samples < 1:
+            raise DataError(f"starts {self.starts} and start_samples should be at least 1")
+        if not self.phases or not all(1 <= M <= MAX_PHASES_TRIED for M in self.phases):
+            raise DataError(f"phases {self.phases} should be between 1 and {MAX_PHASES_TRIED}")
+        if not self.intervals or min(self.intervals) < 1:
+            raise DataError(f"intervals {self.intervals} should be at least 1 each")
+        if not self.smoothing or min(self.smoothing) < 0:
+            raise DataError(f"smoothing {self.smoothing} should not be negative")
+
 
 @dataclass(frozen=True, eq=False)
 class CascadeFit:
@@ -57,7 +93,7 @@ class CascadeFit:
     def __str__(self) -> str:
         unit = self.model.y.unit
         rows = [
-            f"  {c.phases} phases, {c.intervals:3d} intervals, smoothing {c.smoothing:.0e}: train "
+            f"  {c}: train "
             f"{c.train_rms:.4g} {unit}, validation {c.validation_rms:.4g} {unit}, {c.seconds:.1f} s"
             for c in self.choices
         ]
@@ -71,28 +107,22 @@ class CascadeFit:
 def identify_block_cascade(
     train: Dataset,
     validation: Dataset,
+    model_class: BlockCascadeClass,
     *,
-    orders: tuple[int, int] = (3, 3),
-    phases: Sequence[int] = (1, 2),
-    intervals: Sequence[int] = (24, 48, 96),
-    smoothing: Sequence[float] = (1e-8,),
-    starts: int = 12,
-    start_samples: int = 10_000,
-    transient: int = 200,
+    transient: int = 0,
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
 
-    orders: of the two filters. phases, intervals (ascending), smoothing: chosen on `validation`;
-    knots are refined while that helps. transient: samples at the start of each trajectory that are
-    simulated (from zero states) and not scored. Several phases presume an input without power near
-    half the sampling frequency; validation decides.
+    transient: samples at the start of each trajectory that are simulated (from zero states) and not
+    scored.
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
     Infeasible if the minimum found has no proof.
     """
     started = time.perf_counter()
-    _refuse_options(orders, phases, intervals, smoothing, starts)
+    orders, phases, intervals = model_class.orders, model_class.phases, model_class.intervals
+    smoothing, starts = model_class.smoothing, model_class.starts
     report = progress if progress is not None else _silent
     scales = _scales(train)
     fitted, judged = (_trials(data, scales, transient) for data in (train, validation))
@@ -100,7 +130,7 @@ def identify_block_cascade(
     if sum(len(trial.y) - transient for trial in fitted) < needed:
         raise DataError(f"fewer than {needed} scored samples for orders {orders}; give more data")
     first = best_start(
-        tuple(_shortened(trial, start_samples) for trial in fitted),
+        tuple(_shortened(trial, model_class.start_samples) for trial in fitted),
         orders,
         smoothing=smoothing[0],
         starts=starts,
@@ -226,23 +256,6 @@ def _model(parameters: Parameters, scales: tuple[float, float], train: Dataset) 
         u=signal("u"),
         bags=tuple((trial.name, trial.digest) for trial in train),
     )
-
-
-def _refuse_options(
-    orders: tuple[int, int],
-    phases: Sequence[int],
-    intervals: Sequence[int],
-    smoothing: Sequence[float],
-    starts: int,
-) -> None:
-    if min(orders) < 0 or starts < 1:
-        raise DataError(f"orders {orders} should not be negative, starts {starts} at least 1")
-    if not phases or not all(1 <= M <= MAX_PHASES_TRIED for M in phases):
-        raise DataError(f"phases {tuple(phases)} should be between 1 and {MAX_PHASES_TRIED}")
-    if not intervals or min(intervals) < 1 or not smoothing or min(smoothing) < 0:
-        raise DataError(
-            f"intervals {tuple(intervals)} or smoothing {tuple(smoothing)} is not valid"
-        )
 
 
 def _silent(_what: str, _fraction: float) -> None:

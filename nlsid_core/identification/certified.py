@@ -20,6 +20,7 @@ from nlsid_core.identification.contraction import (
     StateAffineProof,
     box_inequalities,
     companion,
+    leading_bounds,
     prove_state_affine,
     traceless,
 )
@@ -97,7 +98,13 @@ def descend_certified(
         raise ShapeError("the last step needs the proof by bounds of the leading coefficient")
     objective, best = SimulationError(problem.rows), model
     theta = np.concatenate([g.coefficients.ravel() for g in model.G])
-    P, extra = proof.P, np.concatenate([proof.bounds, *proof.multipliers])
+    bounds, multipliers = proof.bounds, proof.multipliers
+    if bounds is None or multipliers is None:  # a constant G_0 was proved without
+        found_bounds = leading_bounds(model)
+        if found_bounds is None:
+            raise ShapeError("the last step needs a positive leading coefficient")
+        bounds, multipliers = found_bounds
+    P, extra = proof.P, np.concatenate([bounds, *multipliers])
     n, J = len(model), objective.at(theta).J
     for _ in range(RENEWALS):
         inequalities = _inequalities(problem, P, extra[:2])

@@ -1,17 +1,21 @@
 """Search for the exact proof that a state-affine model is incrementally stable for every input.
 
 The bounds of G_0 on the input box are the tightest its S-procedure shows, and the storage function
-is common to both, at (nearly) the fastest rate there is one for.
+is common to both, at (nearly) the fastest rate there is one for. Where all coefficients of the
+outputs are constant, of one output or of several, the difference of two solutions is linear and P
+is found directly.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from nlsid_core import _json
 from nlsid_core._types import FloatArray, IntArray, Json
 from nlsid_core.certificate import proof_document
-from nlsid_core.certificate.state_affine import contracts
+from nlsid_core.certificate.state_affine import block_matrix, contracts, contracts_constant
 from nlsid_core.identification.inequalities import MatrixInequality, minimise_linear
 from nlsid_core.identification.matrix_proof import MatrixProof, prove_by_matrix
 from nlsid_core.models import StateAffineModel
@@ -30,31 +34,34 @@ class StateAffineProof:
 
     P: FloatArray
     rate: float
-    bounds: tuple[float, float]
-    multipliers: tuple[FloatArray, FloatArray]
+    bounds: tuple[float, float] | None = None  # None: every coefficient of an output is constant
+    multipliers: tuple[FloatArray, FloatArray] | None = None
 
     def document(self, model: StateAffineModel, file: str) -> Json:
         """The proof file's content for the model stored in `file` beside it."""
         about = {"model": {"file": file, "digest": _json.digest(model.document())}}
         claim = {"kind": "state_affine_stability", "rate": self.rate, "about": about}
-        proof = {
-            "P": self.P.tolist(),
-            "lower": self.bounds[0],
-            "upper": self.bounds[1],
-            "lower_box": self.multipliers[0].tolist(),
-            "upper_box": self.multipliers[1].tolist(),
-        }
+        proof: Json = {"P": self.P.tolist()}
+        if self.bounds is not None and self.multipliers is not None:
+            proof |= {"lower": self.bounds[0], "upper": self.bounds[1]}
+            proof |= {
+                "lower_box": self.multipliers[0].tolist(),
+                "upper_box": self.multipliers[1].tolist(),
+            }
         return proof_document(claim, proof)
 
 
 def prove_state_affine(model: StateAffineModel) -> StateAffineProof | MatrixProof | None:
     """An exact proof, or None if the search finds none.
 
-    By bounds of G_0 where the lagged coefficients are constant and G_0 is quadratic, one output;
-    else by a matrix inequality in the input.
+    By one Lyapunov equation where all coefficients of the outputs are constant; by bounds of G_0
+    where the lagged ones are and G_0 is quadratic, one output; else by a matrix inequality in the
+    input.
     """
+    if not any(g.exponents.any() for g in model.G):
+        return _prove_constant(model)
     if (
-        len(model.y) != 1
+        len(model.y) > 1
         or any(g.exponents.any() for g in model.G[1:])
         or (model.G[0].exponents.sum(axis=1) > 2).any()
     ):
@@ -76,6 +83,23 @@ def prove_state_affine(model: StateAffineModel) -> StateAffineProof | MatrixProo
     if contracts(model, rate, P=P, bounds=(low, high), multipliers=multipliers) is not None:
         return None
     return StateAffineProof(P, rate, (low, high), multipliers)
+
+
+def _prove_constant(model: StateAffineModel) -> StateAffineProof | None:
+    """The proof for constant G_0 … G_n: P solves (A/r)'P(A/r) - P + I = 0."""
+    exact = block_matrix(model)
+    if exact is None:
+        return None
+    A = np.array(exact, dtype=np.float64)
+    radius = float(np.max(abs(np.linalg.eigvals(A))))
+    rate = radius + FASTEST_ROOM * (1.0 - radius)
+    if not 0.0 < rate < 1.0 - SLOWEST:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of bad conditioning: the checker judges the result
+        P = solve_discrete_lyapunov(A.T / rate, np.eye(len(A)))
+    P = (P + P.T) / (2.0 * np.abs(P).max())
+    return StateAffineProof(P, rate) if contracts_constant(model, rate, P=P) is None else None
 
 
 def leading_bounds(

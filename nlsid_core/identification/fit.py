@@ -6,18 +6,31 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from nlsid_core._types import Json
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.validation import simulation_percent
-from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.identification.prediction import Model
+from nlsid_core.identification.validation import Validation, simulation_percent, validate
 from nlsid_core.trajectory import Dataset
 
 LEAST_SQUARES = "least squares"
 RIE = "robust identification error"
+UNBIASED_RIE = "robust identification error, bias of noise removed"
 FIRST = "robust simulation error, first iterate"
 FINAL = "robust simulation error, final iterate"
 CERTIFIED = "robust simulation error, stable for every input"
 SEM = "simulation error minimisation"
+CERTIFIED_SEM = "simulation error minimisation, stable for every input"
 
-M = TypeVar("M", DifferenceEquation, StateAffineModel)
+METHODS = {
+    "least_squares": LEAST_SQUARES,
+    "rie": RIE,
+    "moment_rie": UNBIASED_RIE,
+    "rse_first": FIRST,
+    "rse": FINAL,
+    "rse_certified": CERTIFIED,
+    "sem": SEM,
+    "sem_certified": CERTIFIED_SEM,
+}
+
+M = TypeVar("M", bound=Model, covariant=True)
 
 
 class Proof(Protocol):
@@ -35,33 +48,71 @@ class Proof(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Generic[M]):
-    """One method's model, its stability proof if there is one, and the seconds it took."""
+    """One method's model, its stability proof if there is one, and the seconds it took.
+
+    transient: samples at the start of each trial that its scores leave out.
+    """
 
     method: str
     model: M
     proof: Proof | None
     seconds: float
+    transient: int = 0
 
     def error_percent(self, dataset: Dataset) -> float:
         """100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation over `dataset`."""
-        return simulation_percent(self.model, dataset)
+        return simulation_percent(self.model, dataset, transient=self.transient)
+
+    def validate(self, dataset: Dataset, *, transient: int | None = None) -> Validation:
+        """Simulation and prediction errors and the tests of the residuals over `dataset`."""
+        skipped = self.transient if transient is None else transient
+        return validate(self.model, dataset, transient=skipped)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a search: an iterate or a choice that was tried, and the value it reached."""
+
+    what: str
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """The steps of the search that made a fit, and what their values are."""
+
+    value: str
+    steps: tuple[Step, ...] = ()
+
+    def __str__(self) -> str:
+        if not self.steps:
+            return "solved directly"
+        first, last = self.steps[0], self.steps[-1]
+        if len(self.steps) == 1:
+            return f"{self.value} {last.value:.4g}"
+        return f"{self.value} {first.value:.4g} -> {last.value:.4g} in {len(self.steps)} steps"
 
 
 @dataclass(frozen=True, eq=False)
 class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
-    bounds: J after each iterate of the robust simulation error, scaled. errors: simulation error
-    in % by dataset name ("train", "validation", "test", those given) and method.
+    errors: simulation error in % by dataset name ("train", "validation", "test", those given) and
+    method.
     """
 
     candidates: tuple[Candidate[M], ...]
     method: str
-    bounds: tuple[float, ...]
+    history: History
     errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> Candidate[M]:
         return next(c for c in self.candidates if c.method == method)
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods there is a candidate of."""
+        return tuple(candidate.method for candidate in self.candidates)
 
     @property
     def chosen(self) -> Candidate[M]:
@@ -82,19 +133,11 @@ class Fit(Generic[M]):
 
     def __str__(self) -> str:
         columns = list(self.errors)
-        header = f"  {'simulation error [%]':48s}" + "".join(f"{name:>12s}" for name in columns)
+        header = f"  {'simulation error [%]':52s}" + "".join(f"{name:>12s}" for name in columns)
         rows: list[str] = []
         for c in self.candidates:
             scores = "".join(f"{self.errors[name][c.method]:12.2f}" for name in columns)
             state = f"proved, {c.proof.rate:.4f} a sample" if c.proof else "not proved"
             mark = "*" if c.method == self.method else " "
-            rows.append(f"{mark} {c.method:48s}{scores}{c.seconds:9.3f} s  {state}")
-        title = (
-            f"{len(self.model)} lags, {self.model.period:g} s a sample; "
-            f"{len(self.bounds)} iterates, bound {self.bounds[0]:.4g} -> {self.bounds[-1]:.4g}"
-        )
-        return "\n".join([title, header, *rows])
-
-
-AnyFit = Fit[DifferenceEquation] | Fit[StateAffineModel]
-AnyCandidate = Candidate[DifferenceEquation] | Candidate[StateAffineModel]
+            rows.append(f"{mark} {c.method:52s}{scores}{c.seconds:9.3f} s  {state}")
+        return "\n".join([str(self.model), str(self.history), header, *rows])

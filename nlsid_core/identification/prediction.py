@@ -2,56 +2,87 @@
 over single predictions: all starts advance together.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.signal import lfilter
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
-from nlsid_core.models import DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
 from nlsid_core.trajectory import Trajectory
 
-Model = DifferenceEquation | StateAffineModel
-Simulated = Model | MonotoneEquation
+Model = DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation
+# [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
+Step = Callable[[list[FloatArray], slice], FloatArray]
+
+BISECTIONS = 80  # at most: from any bracket to rounding
+ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it is found
 
 
-def history(model: Simulated) -> int:
-    """How many measured outputs start a simulation."""
+def history(model: Model) -> int:
+    """How many measured samples start a simulation; none for a block cascade, which is at rest."""
+    if isinstance(model, BlockCascade):
+        return 0
     return model.history if isinstance(model, MonotoneEquation) else len(model)
 
 
-def simulate_trial(model: Simulated, trial: Trajectory) -> FloatArray:
+def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
     """(N, n_y) outputs, from the first measured outputs with the recorded inputs."""
     n = history(model)
-    if not isinstance(model, StateAffineModel):
-        return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
-    return model.simulate(trial.u, trial.y[:n])
+    if isinstance(model, StateAffineModel):
+        return model.simulate(trial.u, trial.y[:n])
+    if isinstance(model, BlockCascade):
+        return model.simulate(trial.u[:, 0])[:, None]
+    u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
+    return model.simulate(u, trial.y[:n, 0])[:, None]
 
 
 def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:
     """(N - n - horizon + 1, n_y): ŷ(t) from measurements up to t - horizon, t = n + horizon - 1 ….
 
+    n is the model's history. A block cascade's noise is that of the measurement, so past outputs
+    tell it nothing: its predictions are its simulation.
     Raises DataError if the horizon is not positive or the trial is too short.
     """
-    n, N = len(model), len(trial)
+    n, N = history(model), len(trial)
     if horizon < 1 or n + horizon > N:
         raise DataError(f"{trial.name}: a horizon of {horizon} needs 1 to {N - n} samples")
-    gains, forcing = _explicit(model, trial)
+    if isinstance(model, BlockCascade):
+        return simulate_trial(model, trial)[horizon - 1 :]
+    step, lags = _step(model, trial)
     starts = N - n - horizon + 1
-    lags = [trial.y[n - k : n - k + starts] for k in range(1, n + 1)]
-    for step in range(horizon):
-        rows = slice(step, step + starts)
-        past = np.concatenate(lags, axis=1)
-        predicted: FloatArray = np.einsum("tij,tj->ti", gains[rows], past) + forcing[rows]
-        lags = [predicted, *lags[:-1]]
+    past = [trial.y[n - k : n - k + starts] for k in range(1, lags + 1)]
+    predicted = past[0]
+    for ahead in range(horizon):
+        predicted = step(past, slice(ahead, ahead + starts))
+        past = [predicted, *past[:-1]]
     return predicted
 
 
 def one_step_residual(model: Model, trial: Trajectory) -> FloatArray:
     """(N - n, n_y): y(t) minus its prediction one sample ahead."""
-    return np.asarray(trial.y[len(model) :] - predict(model, trial, 1))
+    return np.asarray(trial.y[history(model) :] - predict(model, trial, 1))
 
 
-def _explicit(model: Model, trial: Trajectory) -> tuple[FloatArray, FloatArray]:
+def _step(
+    model: DifferenceEquation | StateAffineModel | MonotoneEquation, trial: Trajectory
+) -> tuple[Step, int]:
+    """One step of the model at rows t = n …, in the outputs' units, and its number of lags."""
+    if isinstance(model, MonotoneEquation):
+        return _monotone_step(model, trial), len(model)
+    gains, forcing = _explicit(model, trial)
+
+    def step(past: list[FloatArray], rows: slice) -> FloatArray:
+        stacked = np.concatenate(past, axis=1)
+        return np.asarray(np.einsum("tij,tj->ti", gains[rows], stacked) + forcing[rows])
+
+    return step, len(model)
+
+
+def _explicit(
+    model: DifferenceEquation | StateAffineModel, trial: Trajectory
+) -> tuple[FloatArray, FloatArray]:
     """y(t) = gains(t) [y(t-1); …; y(t-n)] + forcing(t) in the outputs' units, t = n …."""
     n, N = len(model), len(trial)
     if isinstance(model, DifferenceEquation):
@@ -62,3 +93,32 @@ def _explicit(model: Model, trial: Trajectory) -> tuple[FloatArray, FloatArray]:
     scale, offset = model.y_scale, model.y_offset
     gains = gains * scale[:, None] / np.tile(scale, n)
     return gains, forcing * scale + offset - gains @ np.tile(offset, n)
+
+
+def _monotone_step(model: MonotoneEquation, trial: Trajectory) -> Step:
+    forcing = model.forcing(trial.u)
+
+    def step(past: list[FloatArray], rows: slice) -> FloatArray:
+        target = forcing[rows] + sum(
+            a * (y[:, 0] - model.y_offset) for a, y in zip(model.a, past, strict=True)
+        )
+        return solve_increasing_at(model.e, target)[:, None] + model.y_offset
+
+    return step
+
+
+def solve_increasing_at(e: FloatArray, targets: FloatArray) -> FloatArray:
+    """The v (T,) with e₁v + e₂v² + e₃v³ = targets, e increasing: Newton's method in a bracket."""
+    first, second, third = e.tolist()
+    least = first - second**2 / (3.0 * third) if third else first  # e' is nowhere smaller
+    high = np.abs(targets) / least * (1.0 + ROUNDING)
+    low, v = -high, targets / max(first, least)
+    for _ in range(BISECTIONS):
+        residual = ((third * v + second) * v + first) * v - targets
+        high, low = np.where(residual > 0, v, high), np.where(residual < 0, v, low)
+        moved = v - residual / ((3.0 * third * v + 2.0 * second) * v + first)
+        moved = np.where((low <= moved) & (moved <= high), moved, 0.5 * (low + high))
+        step, v = np.abs(moved - v), moved
+        if (step <= ROUNDING * np.abs(v)).all():
+            break
+    return np.asarray(v)

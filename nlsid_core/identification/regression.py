@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ class LinearClass:
     """Linear difference equations with `lags` n lags of one output and of one input."""
 
     lags: int
+    kind: ClassVar[type[DifferenceEquation]] = DifferenceEquation
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +88,8 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
     first = dataset.trajectories[0]
     if first.y.shape[1] != 1 or first.u.shape[1] != 1:
         raise ShapeError(
-            f"one output and one input are identified; there are {first.y.shape[1]} and "
-            f"{first.u.shape[1]}"
+            f"a LinearClass has one output and one input; there are {first.y.shape[1]} and "
+            f"{first.u.shape[1]}; StateAffineClass is for several"
         )
     if lags < 1:
         raise DataError(f"lags is {lags}; a difference equation has at least 1")

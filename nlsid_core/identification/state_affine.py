@@ -4,6 +4,7 @@ Source: thesis (4.1)-(4.3).
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.rows import Rows
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.state_affine import OutOfRange
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.trajectory import Dataset, Trajectory
@@ -26,7 +28,8 @@ class StateAffineClass:
     """Which state-affine models: n lags, the input's delays, polynomial degrees in w.
 
     leading_degree: of G_0, lagged_degree: of G_1 … G_n, right_degree: of p. delays: None is 0 … n.
-    u_range: (low, high) of each input, to which the model clips it; None is the range in the data.
+    u_range: (low, high) of each input, where the model is proved; None is the range in the data.
+    on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
     """
 
     lags: int
@@ -35,6 +38,8 @@ class StateAffineClass:
     lagged_degree: int = 0
     right_degree: int = 1
     u_range: tuple[tuple[float, float], ...] | None = None
+    on_out_of_range: OutOfRange = "clip"
+    kind: ClassVar[type[StateAffineModel]] = StateAffineModel
 
     def __post_init__(self) -> None:
         if self.lags < 1:
@@ -64,6 +69,7 @@ class StateAffineRows:
     y_scale: tuple[FloatArray, FloatArray]
     u_scale: tuple[FloatArray, FloatArray]
     u_range: FloatArray
+    on_out_of_range: OutOfRange = "clip"
 
     @property
     def has_constant_lags(self) -> bool:
@@ -95,6 +101,7 @@ class StateAffineRows:
             u_offset=self.u_scale[0],
             u_scale=self.u_scale[1],
             u_range=self.u_range,
+            on_out_of_range=self.on_out_of_range,
             period=self.dataset.period,
             y=_signals(first, "y"),
             u=_signals(first, "u"),
@@ -117,7 +124,9 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
     n_y, n_u = len(y_scale[0]), len(u_scale[0])
     window = model_class.window(n_u)
     Y = np.concatenate([_lagged((t.y - y_scale[0]) / y_scale[1], n) for t in dataset])
-    U = np.concatenate([_lagged((t.u - u_scale[0]) / u_scale[1], n) for t in dataset])
+    declared = _declared_range(u_all, model_class)
+    clipped = [np.clip(t.u, declared[:, 0], declared[:, 1]) for t in dataset]
+    U = np.concatenate([_lagged((u - u_scale[0]) / u_scale[1], n) for u in clipped])
     row = np.concatenate([np.arange(len(trial) - n) for trial in dataset])
     w = np.stack([U[:, d, i] for i, d in window], axis=1)
     left = tuple(
@@ -148,12 +157,29 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
         Q=np.asfortranarray(np.kron(Q, np.eye(n_y)) if n_y > 1 else Q),
         identity=identity,
     )
-    declared = np.column_stack([u_all.min(axis=0), u_all.max(axis=0)])
-    if model_class.u_range is not None:
-        if len(model_class.u_range) != n_u:
-            raise DataError(f"u_range has {len(model_class.u_range)} inputs, the data {n_u}")
-        declared = np.array(model_class.u_range, dtype=np.float64)
-    return StateAffineRows(rows, w, dataset, left, right, R, window, y_scale, u_scale, declared)
+    return StateAffineRows(
+        rows, w, dataset, left, right, R, window, y_scale, u_scale, declared,
+        model_class.on_out_of_range,
+    )  # fmt: skip
+
+
+def _declared_range(u: FloatArray, model_class: StateAffineClass) -> FloatArray:
+    """(n_u, 2) the class's range of inputs, or that of the data u (N, n_u)."""
+    measured = np.column_stack([u.min(axis=0), u.max(axis=0)])
+    if model_class.u_range is None:
+        return measured
+    declared = np.array(model_class.u_range, dtype=np.float64)
+    if declared.shape != measured.shape:
+        raise DataError(f"u_range has {len(declared)} inputs, the data {len(measured)}")
+    beyond = (measured[:, 0] < declared[:, 0]) | (measured[:, 1] > declared[:, 1])
+    if model_class.on_out_of_range == "refuse" and beyond.any():
+        i = int(np.argmax(beyond))
+        raise DataError(
+            f"input {i} of the training data is in [{measured[i, 0]:g}, {measured[i, 1]:g}], "
+            f"beyond [{declared[i, 0]:g}, {declared[i, 1]:g}], which the model refuses; "
+            "declare a wider range, or on_out_of_range: clip"
+        )
+    return declared
 
 
 def _basis(degree: int, variables: int) -> IntArray:

@@ -1,21 +1,23 @@
 """How good a model is on trials it has not seen: the numbers and tests users know.
 
-Residual tests are on one-step residuals. Under a model that explains everything the normalised
-autocorrelations r_1 … r_L are independent and normal with variance 1/N, so N Σ r² is χ² with L
-degrees; a correlation with the input has variance Σ_k ρ_e(k) ρ_u(k)/N instead (Bartlett).
+Where a residual is white its normalised autocorrelations r_1 … r_L are independent and normal with
+variance 1/N, so N Σ r² is χ² with L degrees. A correlation with the input has variance
+Σ_k ρ_e(k) ρ_u(k)/N, and those of neighbouring lags go together: the largest of the L + 1 causal
+ones, in standard deviations, is held against the quantile that all of them exceed in 1 % of cases.
+Source: Bartlett 1946; Ljung, System Identification, Section 16.6.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.signal import correlate
+from scipy.stats import chi2, norm
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import (
     Model,
-    Simulated,
     history,
     one_step_residual,
     predict,
@@ -27,28 +29,46 @@ NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
 LAGS = 20
 HORIZONS = (1, 5, 20)
+DIVERGED = 1e100  # a residual whose square no sum of squares should meet
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
-    """Scores of one model on one dataset; per output where an array has an output axis.
+class Residual:
+    """What is left over, tested: autocorrelation (n_y, L) at lags 1 … L, within ± band if white.
 
-    simulation_percent: 100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation; fit_percent: 100 minus it.
-    prediction_percent: the same of the k-step predictions, by horizon k.
-    autocorrelation: (n_y, L) of one-step residuals at lags 1 … L, within ± band if white.
     cross_correlation: (n_y, n_u, 2L+1) of residual and input at lags -L … L, each within
     ± cross_band (n_y, n_u) if independent. white, independent: the joint tests at 99 %.
-    samples: how many were scored.
     """
 
-    simulation_percent: float
-    prediction_percent: dict[int, float]
     autocorrelation: FloatArray
     band: float
     cross_correlation: FloatArray
     cross_band: FloatArray
     white: bool
     independent: bool
+
+    def __str__(self) -> str:
+        white = "white" if self.white else "NOT white (99 %): dynamics or coloured noise are left"
+        if self.independent:
+            return f"{white}, independent of the input"
+        return f"{white}, NOT independent of the input (99 %): it explains more than the model uses"
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Scores of one model on one dataset.
+
+    simulation_percent: 100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation, output_percent of each output
+    alone; fit_percent: 100 minus it. prediction_percent: of the k-step predictions, by horizon k.
+    one_step is white where noise enters the equation, simulation where it enters the measurement:
+    under a model that explains everything one of them is. samples: how many were scored.
+    """
+
+    simulation_percent: float
+    output_percent: tuple[float, ...]
+    prediction_percent: dict[int, float]
+    one_step: Residual
+    simulation: Residual
     samples: int
 
     @property
@@ -56,69 +76,127 @@ class Validation:
         """100·(1 - ‖y - ŷ‖/‖y - mean(y)‖)."""
         return 100.0 - self.simulation_percent
 
+    @property
+    def white(self) -> bool:
+        """Whether one of the two residuals is white."""
+        return self.one_step.white or self.simulation.white
+
+    @property
+    def independent(self) -> bool:
+        """Whether neither residual follows the input."""
+        return self.one_step.independent and self.simulation.independent
+
     def __str__(self) -> str:
         ahead = ", ".join(f"{k}: {p:.2f} %" for k, p in self.prediction_percent.items())
         lines = [
             f"simulation error {self.simulation_percent:.2f} % (fit {self.fit_percent:.2f} %) "
             f"over {self.samples} samples",
             f"prediction error, steps ahead: {ahead}",
-            "one-step residual is " + ("white" if self.white else "NOT white (99 %): the model "
-            "leaves dynamics or coloured noise unexplained"),
-            "one-step residual is " + ("independent of the input" if self.independent else
-            "NOT independent of the input (99 %): the input explains more than the model uses"),
-        ]  # fmt: skip
+            f"one-step residual is {self.one_step}",
+            f"simulation residual is {self.simulation}",
+        ]
+        if len(self.output_percent) > 1:
+            each = ", ".join(f"{percent:.2f} %" for percent in self.output_percent)
+            lines.insert(1, f"simulation error of each output: {each}")
         return "\n".join(lines)
 
 
 def validate(
-    model: Model, dataset: Dataset, *, horizons: Sequence[int] = HORIZONS, lags: int = LAGS
+    model: Model,
+    dataset: Dataset,
+    *,
+    horizons: Sequence[int] | None = None,
+    lags: int | None = None,
+    transient: int = 0,
 ) -> Validation:
-    """Score `model` on every trial of `dataset`; DataError if a trial is too short for it."""
+    """Score `model` on every trial of `dataset`, all but its first `transient` samples.
+
+    horizons, lags: None is HORIZONS and LAGS as far as the shortest trial allows.
+    Raises DataError if a trial is too short.
+    """
+    first = max(history(model), transient)
     shortest = min(dataset, key=len)
-    longest = max(max(horizons, default=1), 2 * lags)
-    if len(shortest) <= len(model) + longest:
+    room = len(shortest) - first - 1
+    lags = min(LAGS, room // 2) if lags is None else lags
+    horizons = [k for k in HORIZONS if k <= room] if horizons is None else horizons
+    longest = max(1, 2 * lags, *horizons)
+    if room < longest or lags < 1:
         raise DataError(
             f"{shortest.name}: {len(shortest)} samples; horizons {tuple(horizons)} and {lags} "
-            f"correlation lags need more than {len(model) + longest}"
+            f"correlation lags need more than {first + longest}"
         )
-    residuals = [one_step_residual(model, trial) for trial in dataset]
-    inputs = [trial.u[len(model) :] for trial in dataset]
+    inputs = [trial.u[first:] for trial in dataset]
+    simulated = _simulated(model, dataset, first)
+    late = first - history(model)
+    one_step = [one_step_residual(model, trial)[late:] for trial in dataset]
+    with np.errstate(over="ignore", invalid="ignore"):
+        left = [measured - outputs for measured, outputs in simulated]
+    return Validation(
+        simulation_percent=_percent(simulated),
+        output_percent=tuple(
+            _percent([(y[:, [i]], x[:, [i]]) for y, x in simulated])
+            for i in range(simulated[0][0].shape[1])
+        ),
+        prediction_percent={
+            k: prediction_percent(model, dataset, k, transient=transient) for k in horizons
+        },
+        one_step=residual_tests(one_step, inputs, lags),
+        simulation=residual_tests(left, inputs, lags),
+        samples=sum(len(trial) - first for trial in dataset),
+    )
+
+
+def residual_tests(
+    residuals: Sequence[FloatArray], inputs: Sequence[FloatArray], lags: int
+) -> Residual:
+    """Whiteness and independence of residuals [(N, n_y)] with inputs [(N, n_u)], trials pooled."""
+    n_y, n_u = residuals[0].shape[1], inputs[0].shape[1]
+    N = sum(map(len, residuals))
+    if not all((np.abs(part) < DIVERGED).all() for part in residuals):
+        nowhere = np.full((n_y, n_u), np.inf)
+        return Residual(
+            np.full((n_y, lags), np.nan), NORMAL_99 / float(np.sqrt(N)),
+            np.full((n_y, n_u, 2 * lags + 1), np.nan), nowhere, False, False,
+        )  # fmt: skip
     autocorrelation = np.stack(
         [_correlation(_columns(residuals, i), _columns(residuals, i), lags)[lags + 1 :]
-         for i in range(residuals[0].shape[1])]
+         for i in range(n_y)]
     )  # fmt: skip
-    N = sum(map(len, residuals))
-    limit = chi2.ppf(CONFIDENCE, lags)
-    cross, variances = _cross(residuals, inputs, lags)
-    statistics = N * np.sum(cross[:, :, lags:] ** 2, axis=2) / variances
-    return Validation(
-        simulation_percent=simulation_percent(model, dataset),
-        prediction_percent={k: prediction_percent(model, dataset, k) for k in horizons},
+    cross, deviation = _cross(residuals, inputs, lags)
+    largest = np.max(np.abs(cross[:, :, lags:]), axis=2) / deviation
+    chance = (1.0 - CONFIDENCE) / (lags + 1)
+    return Residual(
         autocorrelation=autocorrelation,
         band=NORMAL_99 / float(np.sqrt(N)),
         cross_correlation=cross,
-        cross_band=NORMAL_99 * np.sqrt(variances / N),
-        white=bool((N * np.sum(autocorrelation**2, axis=1) <= limit).all()),
-        independent=bool((statistics <= chi2.ppf(CONFIDENCE, lags + 1)).all()),
-        samples=sum(len(trial) - len(model) for trial in dataset),
+        cross_band=NORMAL_99 * deviation,
+        white=bool((N * np.sum(autocorrelation**2, axis=1) <= chi2.ppf(CONFIDENCE, lags)).all()),
+        independent=bool((largest <= norm.isf(chance / 2.0)).all()),
     )
 
 
-def simulation_percent(model: Simulated, dataset: Dataset) -> float:
+def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
-    of their spread; ŷ is simulated from those first n.
+    of their spread; ŷ is simulated from the model's history, n is that or `transient` if longer.
     """
-    n = history(model)
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
-        pairs = [(trial.y[n:], simulate_trial(model, trial)[n:]) for trial in dataset]
+    return _percent(_simulated(model, dataset, max(history(model), transient)))
+
+
+def prediction_percent(
+    model: Model, dataset: Dataset, horizon: int, *, transient: int = 0
+) -> float:
+    """The same error, over the same samples, of predictions `horizon` samples ahead.
+
+    The first samples are predicted from the start of the trial, which is less than that ahead.
+    """
+    n, first = history(model), max(history(model), transient)
+    pairs = []
+    with np.errstate(over="ignore", invalid="ignore"):
+        for trial in dataset:
+            start = simulate_trial(model, trial)[: n + horizon - 1]
+            predicted = np.concatenate([start, predict(model, trial, horizon)])
+            pairs.append((trial.y[first:], predicted[first:]))
     return _percent(pairs)
-
-
-def prediction_percent(model: Model, dataset: Dataset, horizon: int) -> float:
-    """The same error of predictions `horizon` samples ahead."""
-    return _percent(
-        [(trial.y[len(model) + horizon - 1 :], predict(model, trial, horizon)) for trial in dataset]
-    )
 
 
 def without_missing(trial: Trajectory, missing: FloatArray, *, shortest: int) -> tuple[
@@ -161,6 +239,12 @@ def _cut(trial: Trajectory, begin: int, end: int, number: int) -> Trajectory:
     )
 
 
+def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
+    """(measured, simulated) of every trial from sample `first` on."""
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
+        return [(trial.y[first:], simulate_trial(model, trial)[first:]) for trial in dataset]
+
+
 def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
@@ -170,7 +254,7 @@ def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
     return float(100.0 * ratio) if np.isfinite(ratio) else np.inf
 
 
-def _columns(arrays: list[FloatArray], i: int) -> list[FloatArray]:
+def _columns(arrays: Sequence[FloatArray], i: int) -> list[FloatArray]:
     return [array[:, i] for array in arrays]
 
 
@@ -181,24 +265,24 @@ def _correlation(first: list[FloatArray], second: list[FloatArray], lags: int) -
     power = np.zeros(2)
     for a, b in zip(first, second, strict=True):
         x, y = a - a_mean, b - b_mean
-        full = np.correlate(x, y, mode="full")
         middle = len(y) - 1
-        total += full[middle - lags : middle + lags + 1]
+        total += correlate(x, y)[middle - lags : middle + lags + 1]
         power += x @ x, y @ y
     scale = float(np.sqrt(power[0] * power[1]))
     return total / scale if scale > 0.0 else total
 
 
 def _cross(
-    residuals: list[FloatArray], inputs: list[FloatArray], lags: int
+    residuals: Sequence[FloatArray], inputs: Sequence[FloatArray], lags: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Correlations (n_y, n_u, 2·lags + 1) and N times their variances (n_y, n_u)."""
-    n_y, n_u = residuals[0].shape[1], inputs[0].shape[1]
+    """Correlations (n_y, n_u, 2·lags + 1) and their standard deviations (n_y, n_u)."""
+    n_y, n_u, N = residuals[0].shape[1], inputs[0].shape[1], sum(map(len, residuals))
+    horizon = max(lags, min(map(len, residuals)) // 4)  # beyond, too few products
     cross, variances = np.zeros((n_y, n_u, 2 * lags + 1)), np.ones((n_y, n_u))
     for i in range(n_y):
         for j in range(n_u):
             e, u = _columns(residuals, i), _columns(inputs, j)
             cross[i, j] = _correlation(e, u, lags)
-            product = _correlation(e, e, lags) * _correlation(u, u, lags)
+            product = _correlation(e, e, horizon) * _correlation(u, u, horizon)
             variances[i, j] = max(float(product.sum()), 1.0)
-    return cross, variances
+    return cross, np.sqrt(variances / N)

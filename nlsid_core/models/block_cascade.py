@@ -60,6 +60,13 @@ class BlockCascade:
         if not (np.isfinite(self.period) and self.period > 0):
             raise DataError(f"period {self.period} s is not positive")
 
+    def __str__(self) -> str:
+        phases = "1 phase" if self.phases == 1 else f"{self.phases} phases"
+        return (
+            f"block cascade: filters of orders {len(self.a1)} and {len(self.a2)}, "
+            f"{self.f.intervals} knot intervals, {phases}, {self.period:g} s a sample"
+        )
+
     @property
     def phases(self) -> int:
         """M, the instants a sample at which f is evaluated."""

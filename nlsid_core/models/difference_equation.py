@@ -52,6 +52,9 @@ class DifferenceEquation:
         """The number of lags n."""
         return len(self.a)
 
+    def __str__(self) -> str:
+        return f"linear difference equation: {len(self)} lags, {self.period:g} s a sample"
+
     @property
     def poles(self) -> NDArray[np.complex128]:
         """Roots of zⁿ - a₁zⁿ⁻¹ - … - a_n."""

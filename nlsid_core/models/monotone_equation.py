@@ -66,6 +66,12 @@ class MonotoneEquation:
         """The number of lags n."""
         return len(self.a)
 
+    def __str__(self) -> str:
+        return (
+            f"monotone equation: {len(self)} lags, {len(self.window)} inputs in its window, "
+            f"{self.period:g} s a sample"
+        )
+
     @property
     def history(self) -> int:
         """How many past samples a step looks back: the larger of n and the longest delay."""

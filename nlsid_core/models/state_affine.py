@@ -3,12 +3,13 @@
     0 = Σ_{k=0..n} G_k(w(t)) y(t-k) + p(w(t))
 
 w(t) stacks delayed inputs. Outputs and inputs are normalised, (y - offset)/scale, inside the
-equation; the inputs are clipped to a declared range first, so what is proved on the range holds
-for every input.
+equation. What is proved, is proved for inputs in a declared range: the model clips its inputs to
+it, so that it holds for every input, or refuses inputs beyond it, as declared.
 Source: thesis (4.1).
 """
 
 from dataclasses import dataclass
+from typing import Literal, cast, get_args
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import FORMAT, VERSION, Signal
 
 KIND = "state_affine"
+OutOfRange = Literal["clip", "refuse"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +28,9 @@ class StateAffineModel:
     """0 = Σ_k G_k(w) ȳ(t-k) + p(w), ȳ = (y - y_offset)/y_scale, the same for u.
 
     G: n+1 polynomials with (n_y, n_y) coefficients; p: polynomials with (n_y,) coefficients.
-    window: (input, delay) of each entry of w, delays in 0 … n. u_range: (n_u, 2), inputs are
-    clipped to it. bags, training: as in `DifferenceEquation`.
+    window: (input, delay) of each entry of w, delays in 0 … n. u_range: (n_u, 2), to which inputs
+    are clipped, or beyond which they are refused (`on_out_of_range`). bags, training: as in
+    `DifferenceEquation`.
 
     Raises ShapeError or DataError on parts that do not fit.
     """
@@ -45,8 +48,11 @@ class StateAffineModel:
     u: tuple[Signal, ...]
     bags: tuple[tuple[str, str], ...] = ()
     training: str = ""
+    on_out_of_range: OutOfRange = "clip"
 
     def __post_init__(self) -> None:
+        if self.on_out_of_range not in get_args(OutOfRange):
+            raise DataError(f"on_out_of_range is '{self.on_out_of_range}'; known: clip, refuse")
         n_y, n_u = len(self.y), len(self.u)
         for key, shape in (
             ("y_offset", (n_y,)),
@@ -78,12 +84,35 @@ class StateAffineModel:
         """The number of lags n."""
         return len(self.G) - 1
 
+    def __str__(self) -> str:
+        terms = sum(len(g.exponents) for g in self.G) + len(self.p.exponents)
+        return (
+            f"state-affine model: {len(self)} lags, {len(self.y)} outputs, {len(self.u)} inputs, "
+            f"{terms} terms, {self.period:g} s a sample"
+        )
+
     def windows(self, u: FloatArray) -> FloatArray:
-        """(..., N - n, n_w): normalised, clipped windows w(t), t = n …, of inputs (..., N, n_u)."""
-        n = len(self)
-        scaled = (np.clip(u, self.u_range[:, 0], self.u_range[:, 1]) - self.u_offset) / self.u_scale
+        """(..., N - n, n_w): normalised windows w(t), t = n …, of inputs (..., N, n_u).
+
+        Raises DataError on an input beyond its range if the model refuses them.
+        """
+        n, (low, high) = len(self), self.u_range.T
+        if self.on_out_of_range == "refuse":
+            self._refuse_out_of_range(u)
+        scaled = (np.clip(u, low, high) - self.u_offset) / self.u_scale
         N = scaled.shape[-2]
         return np.stack([scaled[..., n - d : N - d, i] for i, d in self.window], axis=-1)
+
+    def _refuse_out_of_range(self, u: FloatArray) -> None:
+        low, high = self.u_range.T
+        beyond = np.argwhere(~((low <= u) & (u <= high)))
+        if len(beyond):
+            *_, t, i = where = tuple(beyond[0])
+            raise DataError(
+                f"input {self.u[i].name or i} is {u[where]:g} at sample {t}, outside "
+                f"[{low[i]:g}, {high[i]:g}] where this model is proved; it refuses such inputs "
+                f"({len(beyond)} here). Keep to the range, or declare on_out_of_range: clip"
+            )
 
     def window_range(self) -> FloatArray:
         """(n_w, 2): the box that every window lies in."""
@@ -149,6 +178,7 @@ class StateAffineModel:
             "u_offset": self.u_offset.tolist(),
             "u_scale": self.u_scale.tolist(),
             "u_range": self.u_range.tolist(),
+            "on_out_of_range": self.on_out_of_range,
             "training": self.training,
             "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
         }
@@ -182,6 +212,9 @@ class StateAffineModel:
             period=_json.number(document, "period", source=source),
             y=y,
             u=u,
+            on_out_of_range=cast(
+                OutOfRange, _json.member(document, "on_out_of_range", str, source=source)
+            ),
             training=_json.member(document, "training", str, source=source),
             bags=tuple(_json.named_digests(bags, source=source)),
         )

@@ -110,6 +110,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
         }
         assert lengths == {117}
 
+        assert config.funnel is not None
         wider = config.model_copy(
             update={"funnel": config.funnel.model_copy(update={"safety_factor": 2.0})}
         )

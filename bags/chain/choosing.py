@@ -1,0 +1,144 @@
+"""Which model to take: orders and bases tried on validation bags, methods scored on test bags."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from bags.chain.config import Config
+from bags.chain.identification_config import IdentificationConfig
+from bags.chain.steps import Identified, Progress, Trials, part, read_trials, write_identified
+from bags.monitoring import documents
+from bags.pictures.choices import Scored, draw_comparison, draw_selection
+from bags.pictures.report import report_available
+from nlsid_core._json import write_atomically
+from nlsid_core.errors import DataError, Infeasible, NlsidError
+from nlsid_core.identification import Fit, Model, Selection, describe, methods_of, select
+from nlsid_core.identification.prediction import history
+
+
+@dataclass(frozen=True, eq=False)
+class Selected:
+    """What was tried and chosen, and the files written of it."""
+
+    selection: Selection[Model]
+    identified: Identified
+
+
+def select_bags(
+    bags: Sequence[Path],
+    config: Config,
+    out: Path,
+    *,
+    options: Mapping[str, Sequence[object]] | None = None,
+    progress: Progress,
+) -> Selected:
+    """Every combination of the options; the files of the best by validation error, and select.png.
+
+    options: values by name (None: the configuration's `select`). Raises DataError (BagError for
+    bags) before anything is written, Infeasible if no combination has a model.
+    """
+    options = config.select if options is None else options
+    if not options:
+        raise DataError(
+            "nothing to select from: give the configuration a section `select`, such as "
+            "`select: {lags: [1, 2, 3, 4]}`"
+        )
+    sections = config.identification.each(options)
+    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
+    if trials.validation is None:
+        raise DataError(
+            "a selection needs validation trials: name bags in split.validation that are neither "
+            "trained on nor tests"
+        )
+    base = config.identification
+    selection = select(
+        trials.train,
+        trials.validation,
+        [section.model_class for section in sections],
+        method=base.method,
+        test=trials.test,
+        iterations=base.iterations,
+        transient=base.transient,
+        allow_unproved=base.allow_unproved,
+        accept_untested_repeats=base.accept_untested_repeats,
+        seed=base.seed,
+        progress=part(progress, 0.3, 0.9),
+    )
+    identified = write_identified(selection.fit, trials, config, out, progress=progress)
+    if report_available():
+        picture = out / documents.SELECTION_PLOT
+        write_atomically(picture, draw_selection(selection, options))
+        identified = Identified(identified.fit, trials, (*identified.files, picture))
+    return Selected(selection, identified)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Every method's candidate with its scores, all on the same samples; and what failed, why."""
+
+    rows: tuple[Scored, ...]
+    refusals: tuple[str, ...]
+    trials: Trials
+    skipped_at_start: int
+
+    def draw(self, path: Path) -> None:
+        """Test errors as a picture; needs the extra `report`."""
+        write_atomically(path, draw_comparison(self.rows))
+
+
+def compare_bags(
+    bags: Sequence[Path],
+    config: Config,
+    *,
+    lags: Sequence[int] = (),
+    progress: Progress,
+) -> Compared:
+    """Every method of every configured model class, scored on the same samples of the test trials.
+
+    lags: instead of the configured ones. Writes nothing. Raises DataError as `identify_bags` does.
+    """
+    sections: list[IdentificationConfig] = list(config.compare or (config.identification,))
+    if lags:
+        sections = [one for section in sections for one in section.each({"lags": lags})]
+    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
+    found, refusals = [], []
+    for number, section in enumerate(sections):
+        label = describe(section.model_class)
+        done = 0.3 + 0.7 * number / len(sections)
+        fit, refusal = _every_method(
+            section, trials, part(progress, done, done + 0.7 / len(sections))
+        )
+        if refusal:
+            refusals.append(f"{label}: {refusal}")
+        if fit is not None:
+            found += [(label, candidate) for candidate in fit.candidates]
+    if not found:
+        raise Infeasible("no class has a model: " + "; ".join(refusals))
+    start = max(max(history(c.model), c.transient) for _, c in found)
+    rows = tuple(
+        Scored(label, candidate, candidate.validate(trials.test, transient=start))
+        for label, candidate in found
+    )
+    return Compared(rows, tuple(refusals), trials, start)
+
+
+def _every_method(
+    section: IdentificationConfig, trials: Trials, progress: Progress
+) -> tuple[Fit[Model] | None, str]:
+    """A fit with a candidate of every method there is one of, and why the configured has none."""
+    known = methods_of(section.model_class)
+    refusal = ""
+    for method in (section.method, *(m for m in known if m != section.method)):
+        try:
+            fit = section.model_copy(update={"method": method}).identify(
+                trials.train,
+                validation=trials.validation,
+                comparators=known,
+                allow_unproved=True,
+                progress=progress,
+            )
+        except NlsidError as reason:
+            refusal = refusal or str(reason)
+        else:
+            return fit, refusal
+    return None, refusal

@@ -1,0 +1,105 @@
+"""Sections of YAML configurations: strict, and explained when they are wrong."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from nlsid_core.errors import DataError
+from nlsid_core.models import Signal
+
+MAX_CONFIG_BYTES = 2**20  # a configuration is a page of text
+UNKNOWN_KEY = "unknown_key"
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Corner = Annotated[tuple[float, float], Field(strict=False)]
+Names = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+class Section(BaseModel):
+    """A part of the file: unknown keys are errors, values are not coerced across types.
+
+    tag: what pydantic calls the section in a choice of several; never shown. hidden: fields that a
+    section inherits and does not take.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    tag: ClassVar[str] = ""
+    hidden: ClassVar[frozenset[str]] = frozenset()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, content: Any) -> Any:
+        if isinstance(content, dict):
+            known = [key for key in cls.model_fields if key not in cls.hidden]
+            for key in content:
+                if key not in known:
+                    raise PydanticCustomError(
+                        UNKNOWN_KEY,
+                        "there is no such key; there are: {known}",
+                        {"key": str(key), "known": ", ".join(known)},
+                    )
+        return content
+
+
+class SignalConfig(Section):
+    """A signal: its name and unit for people, and `topic:field.path[index]`."""
+
+    name: str
+    unit: str = ""
+    path: str
+
+    def signal(self) -> Signal:
+        """The same as the core's noun."""
+        return Signal(self.name, self.unit, self.path)
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def read_yaml(path: Path | str, kind: type[AnySection]) -> AnySection:
+    """A YAML file as a section of `kind`; DataError lists every wrong key with where it stands.
+
+    OS errors pass through.
+    """
+    path = Path(path)
+    if path.stat().st_size > MAX_CONFIG_BYTES:
+        raise DataError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: not valid YAML: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: expected sections (robot, signals, grid, ...), found none")
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        raise DataError(f"{path}: not a valid configuration:\n{problems(error)}") from error
+
+
+def problems(error: ValidationError, *, prefix: Sequence[str] = ()) -> str:
+    """A line for each wrong key: where it stands, what is allowed there, what was found."""
+    return "\n".join(f"  {_problem(details, prefix)}" for details in error.errors())
+
+
+def _problem(details: ErrorDetails, prefix: Sequence[str]) -> str:
+    tags = {section.tag for section in _all_sections(Section)}
+    where = [str(part) for part in (*prefix, *details["loc"]) if part not in tags]
+    found = details["input"]
+    if details["type"] == UNKNOWN_KEY:
+        key = details["ctx"]["key"]
+        where.append(key)
+        found = found[key]
+    message = details["msg"].removeprefix("Value error, ")
+    return f"{'.'.join(where)}: {message} (found {found!r:.60})"
+
+
+def _all_sections(root: type[Section]) -> list[type[Section]]:
+    found = [root]
+    for child in root.__subclasses__():
+        found += _all_sections(child)
+    return found

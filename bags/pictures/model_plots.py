@@ -1,0 +1,218 @@
+"""Pictures of an identified model (extra `report`: matplotlib). Each function returns a Figure."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
+
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
+from nlsid_core._types import FloatArray
+from nlsid_core.identification import Candidate, Fit, History, Model, Validation, simulate_trial
+from nlsid_core.identification.prediction import history
+from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation
+from nlsid_core.models.monotone_equation import solve_increasing
+from nlsid_core.trajectory import Dataset, Trajectory
+
+MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
+LONGEST = 400  # samples drawn of a trial: around its largest error
+DRAWN = 800  # points of a residual over time
+COLUMNS = 4
+LOGARITHMIC = 30.0  # largest over smallest value from which on an axis is logarithmic
+
+
+def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
+    """Measured against simulated on the test trials, with an input of the same unit."""
+    chosen = fit.chosen
+    beside = next((c for c in fit.candidates if c is not chosen), None)
+    simulated = {trial.name: simulate_trial(chosen.model, trial)[:, output] for trial in test}
+    trials = sorted(test, key=lambda t: -_size(t.y[:, output] - simulated[t.name]))[:MOST_TRIALS]
+    trials.sort(key=lambda t: test.names.index(t.name))
+    columns = min(len(trials), COLUMNS)
+    rows = -(-len(trials) // columns)
+    width = 3.1 * columns if columns > 1 else 9.5
+    figure = Figure(figsize=(width, 2.1 * rows + 0.5), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    panels = list(grid.flat)
+    for axes, trial in zip(panels, trials, strict=False):
+        y = trial.y[:, output]
+        rows_drawn = _excerpt(y - simulated[trial.name])
+        t = trial.t[rows_drawn] - trial.t[0]
+        for name, unit, u in zip(trial.u_names, trial.u_units, trial.u.T, strict=True):
+            if unit == trial.y_units[output]:
+                axes.step(t, u[rows_drawn], where="post", color=GREY, lw=LINE, label=name)
+        axes.plot(t, y[rows_drawn], color=INK, lw=LINE, label="measured")
+        if beside is not None:
+            other = _bounded(simulate_trial(beside.model, trial)[rows_drawn, output], y)
+            axes.plot(t, other, color=ORANGE, lw=LINE, ls="--", label=beside.method)
+        axes.plot(t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=chosen.method)
+        drawn = "" if len(t) == len(trial) else f", {len(t)} of {len(trial)} samples"
+        axes.set_title(f"{trial.name}{drawn}", fontsize=9, loc="left")
+    for axes in panels[len(trials) :]:
+        axes.set_visible(False)
+    tidy(panels[: len(trials)])
+    figure.supxlabel("time [s]", fontsize=9)
+    figure.supylabel(axis_name(test.trajectories[0], output), fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside upper left", ncols=min(len(labels), 3), fontsize=8,
+        frameon=False,
+    )  # fmt: skip
+    return figure
+
+
+def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Figure:
+    """For each output: simulation residual over time, its correlations, and their 99 % bands."""
+    first = test.trajectories[0]
+    n_y, n_u = first.y.shape[1], first.u.shape[1]
+    figure = Figure(figsize=(3.3 * (2 + n_u), 2.7 * n_y + 0.4), layout="constrained")
+    grid = figure.subplots(n_y, 2 + n_u, squeeze=False)
+    start = max(history(chosen.model), chosen.transient)
+    for i in range(n_y):
+        over_time, auto, *crossed = grid[i]
+        for trial in test:
+            left = trial.y[start:, i] - simulate_trial(chosen.model, trial)[start:, i]
+            t, e = _thinned(trial.t[start:] - trial.t[0], left)
+            over_time.plot(t, e, lw=0.8)
+        over_time.set_title(f"residual of {axis_name(first, i)}", fontsize=8, loc="left")
+        over_time.set_xlabel("time [s]", fontsize=8)
+        lags = np.arange(1, scores.one_step.autocorrelation.shape[1] + 1)
+        _correlations(
+            auto, lags, scores.one_step.autocorrelation[i], scores.simulation.autocorrelation[i],
+            scores.one_step.band,
+        )  # fmt: skip
+        auto.set_title("autocorrelation", fontsize=8, loc="left")
+        both = np.arange(-len(lags), len(lags) + 1)
+        for j, axes in enumerate(crossed):
+            _correlations(
+                axes, both, scores.one_step.cross_correlation[i, j],
+                scores.simulation.cross_correlation[i, j], scores.one_step.cross_band[i, j],
+            )  # fmt: skip
+            axes.set_title(f"with {first.u_names[j]}", fontsize=8, loc="left")
+        for axes in grid[i, 1:]:
+            axes.set_xlabel("lag [samples]", fontsize=8)
+    handles, labels = grid[0, 1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8, frameon=False)
+    tidy(list(grid.flat))
+    return figure
+
+
+def search_history(history: History) -> Figure:
+    """The value each step of the search reached; choices by name, iterates as a line."""
+    values = [step.value for step in history.steps]
+    if all(step.what.rpartition(" ")[2].isdigit() for step in history.steps):
+        figure = Figure(figsize=(4.6, 3.0), layout="constrained")
+        axes = figure.subplots()
+        axes.plot(np.arange(1, len(values) + 1), values, ".-", color=BLUE, lw=LINE, ms=5)
+        if min(values) > 0 and max(values) > LOGARITHMIC * min(values):
+            axes.set_yscale("log")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_xlabel("iterate", fontsize=8)
+    else:
+        figure = Figure(figsize=(6.2, 0.25 * len(values) + 0.8), layout="constrained")
+        axes = figure.subplots()
+        places = np.arange(len(values))[::-1]
+        colors = [BLUE if value == min(values) else GREY for value in values]
+        axes.barh(places, values, color=colors, height=0.6)
+        axes.set_yticks(places, [step.what for step in history.steps])
+    axes.set_title(history.value, fontsize=8, loc="left")
+    tidy([axes])
+    return figure
+
+
+def structure(chosen: Candidate[Model]) -> Figure | None:
+    """What can be drawn of the model itself: poles, the static nonlinearity; None: nothing."""
+    model = chosen.model
+    if isinstance(model, DifferenceEquation):
+        figure = Figure(figsize=(3.4, 3.4), layout="constrained")
+        _poles(figure.subplots(), [("poles", model.poles)], chosen)
+    elif isinstance(model, BlockCascade):
+        figure = Figure(figsize=(7.2, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        names = ("first filter", "second filter")
+        _poles(left, list(zip(names, model.poles, strict=True)), chosen)
+        x = np.linspace(model.f.low, model.f.high, 400)
+        right.plot(x, model.f(x), color=BLUE, lw=LINE)
+        right.set_xlabel("between the filters", fontsize=8)
+        right.set_title("static nonlinearity f, linear beyond", fontsize=8, loc="left")
+        tidy([right])
+    elif isinstance(model, MonotoneEquation):
+        figure = Figure(figsize=(3.8, 3.2), layout="constrained")
+        axes = figure.subplots()
+        drive = np.linspace(-3.0, 3.0, 300) * float(model.e[0])
+        e = tuple(model.e.tolist())
+        axes.plot(drive, [model.y_offset + solve_increasing(e, v, 0.0) for v in drive.tolist()],
+                  color=BLUE, lw=LINE)  # fmt: skip
+        axes.set_xlabel("past and inputs, combined", fontsize=8)
+        axes.set_ylabel(f"{model.y.name} [{model.y.unit}]", fontsize=8)
+        axes.set_title("static nonlinearity e⁻¹", fontsize=8, loc="left")
+        tidy([axes])
+    else:
+        return None
+    return figure
+
+
+def axis_name(trial: Trajectory, output: int) -> str:
+    """The output with its unit."""
+    return f"{trial.y_names[output]} [{trial.y_units[output]}]"
+
+
+def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candidate[Model]) -> None:
+    title = "poles"
+    axes.add_patch(Circle((0, 0), 1.0, fill=False, color=INK, lw=LINE))
+    if chosen.proof is not None:
+        rate = chosen.proof.rate
+        title += f", dashed: proved rate {rate:.4f}"
+        axes.add_patch(Circle((0, 0), rate, fill=False, color=BLUE, ls="--", lw=LINE))
+    for (name, z), (marker, color) in zip(groups, (("x", RED), ("+", ORANGE)), strict=False):
+        axes.plot(z.real, z.imag, marker, color=color, ms=7, label=name)
+    if len(groups) > 1:
+        axes.legend(fontsize=7, frameon=False, loc="upper center", ncols=len(groups))
+    axes.set_aspect("equal")
+    axes.set_xlim(-1.1, 1.1)
+    axes.set_ylim(-1.1, 1.1 if len(groups) == 1 else 1.4)
+    axes.set_title(title, fontsize=8, loc="left")
+    tidy([axes])
+
+
+def _correlations(
+    axes: Axes, lags: np.ndarray, one_step: FloatArray, simulated: FloatArray, band: float
+) -> None:
+    axes.axhspan(-band, band, color=GREY, alpha=0.3, lw=0, label="99 % of one-step values")
+    axes.vlines(lags, 0.0, one_step, color=BLUE, lw=LINE, label="one step ahead")
+    axes.plot(lags, one_step, ".", color=BLUE, ms=4)
+    axes.plot(lags, simulated, color=ORANGE, lw=LINE, label="simulated")
+    axes.axhline(0.0, color=INK, lw=0.5)
+
+
+def _size(error: FloatArray) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.nan_to_num(np.mean(error**2), nan=np.inf))
+
+
+def _excerpt(error: FloatArray) -> slice:
+    """All rows, or LONGEST of them around the largest error."""
+    if len(error) <= LONGEST:
+        return slice(0, len(error))
+    worst = int(np.argmax(np.abs(error)))
+    start = min(max(worst - LONGEST // 2, 0), len(error) - LONGEST)
+    return slice(start, start + LONGEST)
+
+
+def _thinned(t: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """At most DRAWN points: of each block of samples the largest."""
+    block = -(-len(t) // DRAWN)
+    if block <= 1:
+        return t, e
+    rows = np.arange(len(t) // block * block).reshape(-1, block)
+    largest = rows[np.arange(len(rows)), np.argmax(np.abs(e[rows]), axis=1)]
+    return t[largest], e[largest]
+
+
+def _bounded(simulated: FloatArray, measured: FloatArray) -> FloatArray:
+    """A comparator that diverges is drawn as far as it stays near the data."""
+    room = 2.0 * float(np.ptp(measured))
+    low, high = float(np.min(measured)) - room, float(np.max(measured)) + room
+    return np.where((simulated >= low) & (simulated <= high), simulated, np.nan)

@@ -1,0 +1,252 @@
+"""How the models of each class are found: which methods there are, and the search itself."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nlsid_core._types import FloatArray
+from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.certified import certified_simulation_error, descend_certified
+from nlsid_core.identification.contraction import prove_state_affine
+from nlsid_core.identification.fit import (
+    CERTIFIED,
+    CERTIFIED_SEM,
+    FINAL,
+    FIRST,
+    LEAST_SQUARES,
+    METHODS,
+    RIE,
+    SEM,
+    UNBIASED_RIE,
+    History,
+    Proof,
+    Step,
+)
+from nlsid_core.identification.from_repeats import identify_from_repeats
+from nlsid_core.identification.least_squares import least_squares
+from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
+from nlsid_core.identification.moments import (
+    MonotoneClass,
+    offsets_of,
+    plain_moments,
+    refuse_unexcited,
+)
+from nlsid_core.identification.monotone_comparators import (
+    least_squares_equation,
+    minimise_monotone_simulation_error,
+)
+from nlsid_core.identification.regression import LinearClass, build_regression
+from nlsid_core.identification.rie import robust_identification_error
+from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.simulation_error import minimise_simulation_error
+from nlsid_core.identification.stability import prove_stability
+from nlsid_core.identification.state_affine import (
+    StateAffineClass,
+    StateAffineRows,
+    build_state_affine_rows,
+)
+from nlsid_core.identification.trail import Task, Trail
+from nlsid_core.identification.validation import simulation_percent
+from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.trajectory import Dataset
+
+BOUND = "bound on the simulation error"
+CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
+
+
+def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
+    """Difference equations of one input and one output."""
+    regression = build_regression(train, model_class.lags)
+    trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
+    trail.add(LEAST_SQUARES, lambda: least_squares(regression))
+    trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p))
+    trail.add(SEM, lambda: minimise_simulation_error(regression, least_squares(regression)))
+
+    def last_step() -> DifferenceEquation:
+        *_, last = robust_simulation_error(regression.rows, iterations=task.iterations)
+        start = regression.model(last.theta, last.p)
+        if prove_stability(start) is None:
+            raise Infeasible("the robust simulation error found no stable model to start from")
+        return minimise_simulation_error(regression, start, stable=True)
+
+    trail.add(CERTIFIED_SEM, last_step)
+    return trail
+
+
+def state_affine(
+    train: Dataset, model_class: StateAffineClass, task: Task
+) -> Trail[StateAffineModel]:
+    """State-affine models, of several inputs and outputs."""
+    problem = build_state_affine_rows(train, model_class)
+    trail: Trail[StateAffineModel] = Trail(task, prove_state_affine, BOUND)
+    trail.add(LEAST_SQUARES, lambda: state_affine_equation_error(problem))
+    trail.add(RIE, lambda: robust_identification_error(problem)[0])
+    trail.follow(problem.rows, lambda i: problem.model(i.theta, i.p))
+    trail.add(CERTIFIED, lambda: _certified(problem, trail))
+
+    def last_step() -> StateAffineModel:
+        start = _certified(problem, trail)
+        proof = prove_state_affine(start)
+        if proof is None:
+            raise Infeasible("no proof for the last certified iterate, where the last step starts")
+        return descend_certified(problem, start, proof)
+
+    trail.add(CERTIFIED_SEM, last_step)
+    return trail
+
+
+def block_cascade(
+    train: Dataset, model_class: BlockCascadeClass, task: Task
+) -> Trail[BlockCascade]:
+    """Wiener, Hammerstein and Wiener-Hammerstein models of one input and one output."""
+    if task.validation is None:
+        raise DataError(
+            "a block cascade's phases and knots are chosen by the simulation error on validation "
+            "trials: give some that are not trained on"
+        )
+    validation = task.validation
+    trail: Trail[BlockCascade] = Trail(
+        task, lambda _: None, f"validation error, rms [{_unit(train)}]"
+    )
+
+    def search() -> tuple[BlockCascade, Proof]:
+        found = identify_block_cascade(
+            train, validation, model_class,
+            transient=task.transient, rng=task.rng, progress=task.progress,
+        )  # fmt: skip
+        *choices, last = found.choices
+        steps = [Step(str(choice), choice.validation_rms) for choice in choices]
+        steps.append(Step(f"{last}, minimised further", last.validation_rms))
+        trail.history = History(trail.history.value, tuple(steps))
+        return found.model, found.proof
+
+    trail.add_proved(SEM, search)
+    return trail
+
+
+def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[MonotoneEquation]:
+    """Monotone equations through moments, of repeated experiments if there are any."""
+    offsets = offsets_of(train.trajectories)
+    plain = plain_moments(train.trajectories, model_class, offsets)
+    template = train.trajectories[0]
+    refuse_unexcited(plain, model_class, template, offsets)
+    trail: Trail[MonotoneEquation] = Trail(
+        task,
+        lambda _: None,
+        f"mean squared simulation error by the moments, at most [{_unit(train)}²]",
+    )
+
+    def solved(method: str, fit: MomentFit) -> tuple[MonotoneEquation, Proof]:
+        if method == task.method:
+            trail.history = History(trail.history.value, (Step(method, fit.bound),))
+        return fit.model, fit.proof
+
+    def without_bias() -> MomentFit:
+        return identify_from_repeats(
+            train, model_class, transient=task.transient, executor=task.executor,
+            accept_untested_repeats=task.accept_untested_repeats,
+        )  # fmt: skip
+
+    def biased() -> MomentFit:
+        return minimise_moment_rie(plain, model_class, template, offsets)
+
+    def equation_error() -> MonotoneEquation:
+        return least_squares_equation(plain, model_class, template, offsets)
+
+    trail.add(LEAST_SQUARES, equation_error)
+    trail.add_proved(RIE, lambda: solved(RIE, biased()))
+    if train.repeats() or task.method == UNBIASED_RIE:
+        trail.add_proved(UNBIASED_RIE, lambda: solved(UNBIASED_RIE, without_bias()))
+    starts = (equation_error, lambda: biased().model)
+    trail.add(SEM, lambda: _best_minimum(starts, train))
+    return trail
+
+
+def _best_minimum(
+    starts: Sequence[Callable[[], MonotoneEquation]], train: Dataset
+) -> MonotoneEquation:
+    """The better of the local minima of the simulation error; DataError if every start diverges."""
+    found, reason = [], DataError("no start")
+    for start in starts:
+        try:
+            found.append(minimise_monotone_simulation_error(start(), train.trajectories))
+        except (DataError, SolverError) as refusal:
+            reason = DataError(str(refusal))
+    if not found:
+        raise reason
+    return min(found, key=lambda model: simulation_percent(model, train))
+
+
+@dataclass(frozen=True)
+class Offer:
+    """The methods of a class, the default first, and those that run beside what is asked for."""
+
+    search: Callable[[Dataset, Any, Task], Trail[Any]]
+    methods: tuple[str, ...]
+    comparators: tuple[str, ...]
+
+
+OFFERS: dict[type, Offer] = {
+    LinearClass: Offer(
+        linear, ("rse", "least_squares", "rse_first", "sem", "sem_certified"),
+        (LEAST_SQUARES, FIRST, FINAL, SEM),
+    ),
+    StateAffineClass: Offer(
+        state_affine,
+        ("rse", "least_squares", "rie", "rse_first", "rse_certified", "sem_certified"),
+        (LEAST_SQUARES, RIE, FIRST, FINAL),
+    ),
+    BlockCascadeClass: Offer(block_cascade, ("sem",), ()),
+    MonotoneClass: Offer(
+        monotone, ("moment_rie", "rie", "least_squares", "sem"), (LEAST_SQUARES, RIE, UNBIASED_RIE)
+    ),
+}  # fmt: skip
+
+
+def methods_of(model_class: object) -> tuple[str, ...]:
+    """The methods (keys of METHODS) for models of this class, the default first.
+
+    Raises DataError if it is no model class.
+    """
+    offer = OFFERS.get(type(model_class))
+    if offer is None:
+        names = ", ".join(known.__name__ for known in OFFERS)
+        raise DataError(f"{model_class!r} is no model class; there are: {names}")
+    refused: set[str] = set()
+    if isinstance(model_class, StateAffineClass) and (
+        model_class.lagged_degree or model_class.leading_degree > CERTIFIABLE_DEGREE
+    ):
+        refused = {"rse_certified", "sem_certified"}
+    return tuple(method for method in offer.methods if method not in refused)
+
+
+def state_affine_equation_error(problem: StateAffineRows) -> StateAffineModel:
+    """Least squares on the equation error with G_0 normalised to 1 at its constant term."""
+    rows = problem.rows
+    fixed = rows.identity != 0.0
+    free = np.array([not f and D != 0 for f, D in zip(fixed, rows.offsets, strict=True)])
+    columns = np.column_stack([rows.errors[:, free], -rows.Q])
+    found = np.linalg.lstsq(columns, -(rows.errors @ rows.identity), rcond=None)[0]
+    theta: FloatArray = rows.identity.copy()
+    theta[free] = found[: int(free.sum())]
+    return problem.model(theta, found[int(free.sum()) :])
+
+
+def _certified(problem: StateAffineRows, trail: Trail[StateAffineModel]) -> StateAffineModel:
+    steps: list[Step] = []
+    for iterate in certified_simulation_error(problem, iterations=trail.task.iterations):
+        steps.append(Step(f"certified iterate {len(steps) + 1}", iterate.J))
+        last = iterate
+    if trail.task.method in (CERTIFIED, CERTIFIED_SEM):
+        trail.history = History(trail.history.value, tuple(steps))
+    return problem.model(last.point.theta, last.point.p)
+
+
+def _unit(train: Dataset) -> str:
+    return train.trajectories[0].y_units[0]
+
+
+assert {method for offer in OFFERS.values() for method in offer.methods} == set(METHODS)
