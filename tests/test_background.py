@@ -97,7 +97,7 @@ def test_trials_to_choose_by_are_left_whole() -> None:
     trials = cut(data, 0.25, validation=[name])
     assert trials.validation is not None
     assert trials.validation.names == (name,)
-    assert len(trials.validation[0]) == 80
+    assert [len(trial) for trial in trials.validation] == [80]
     assert trials.train.names == trials.test.names == data.names[1:]
     with pytest.raises(DataError, match="all of the bags are validation trials"):
         cut(data, 0.25, validation=data.names)
