@@ -122,7 +122,7 @@ def test_selection_takes_the_class_with_the_least_validation_error(train: Datase
     assert chosen.errors[0] > chosen.errors[1]
     assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
     assert seen == [*map(describe, classes), "done"]
-    assert "LinearClass(lags=2)" in str(chosen)
+    assert "linear, lags 2" in str(chosen)
     with pytest.raises(Infeasible, match="no class has a proved model"):
         select(train, validation, [LinearClass(60)])
 

@@ -302,9 +302,7 @@ def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None
         select(train, validation, [MonotoneClass(1), MonotoneClass(2)])
     with pytest.raises(DataError, match="no model class to select from"):
         select(train, validation, [])
-    assert (
-        describe(StateAffineClass(2, right_degree=3)) == "StateAffineClass(lags=2, right_degree=3)"
-    )
+    assert describe(StateAffineClass(2, right_degree=3)) == "state affine, lags 2, right degree 3"
 
 
 # -- documents ---------------------------------------------------------------------------------

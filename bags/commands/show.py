@@ -77,10 +77,13 @@ def selection_table(selection: Selection[Model]) -> Table:
 
 def comparison_table(compared: Compared) -> Table:
     """Every method of every class, scored on the same samples of the test trials."""
-    left_out = f" after their first {compared.skipped_at_start} samples"
-    table = Table(title=f"{len(compared.trials.test)} test trials{left_out}", title_justify="left")
-    table.add_column("model class")
-    table.add_column("method")
+    labels = list(dict.fromkeys(row.label for row in compared.rows))
+    left_out = f"after their first {compared.skipped_at_start} samples"
+    title = [f"{len(compared.trials.test)} test trials {left_out}"]
+    if len(labels) == 1:
+        title = [*labels, *title]
+    table = Table(title=": ".join(title), title_justify="left")
+    table.add_column("method" if len(labels) == 1 else "model class, method")
     table.add_column("simulation", justify="right")
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
@@ -88,12 +91,16 @@ def comparison_table(compared: Compared) -> Table:
     for name in ("residual", "stability"):
         table.add_column(name)
     table.add_column("time", justify="right")
+    label = ""
     for row in compared.rows:
+        if len(labels) > 1 and row.label != label:
+            label = row.label
+            table.add_section()
+            table.add_row(f"[bold]{escape(label)}[/bold]")
         scores = row.scores
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            row.label,
             row.candidate.method,
             f"{scores.simulation_percent:.2f} %",
             *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),

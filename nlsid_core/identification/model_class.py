@@ -1,5 +1,6 @@
 """`ModelClass`: what `identify` searches, a noun that says which models and nothing of how."""
 
+import re
 from dataclasses import MISSING, fields
 from typing import Any, Protocol, TypeVar
 
@@ -18,10 +19,11 @@ class ModelClass(Protocol[M]):
 
 
 def describe(model_class: Any) -> str:
-    """The class with the options that are not the default: `StateAffineClass(lags=2)`."""
+    """The class in words, with the options that are not the default: `state affine, lags 2`."""
+    name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(model_class).__name__.removesuffix("Class"))
     options = [
-        f"{option.name}={getattr(model_class, option.name)}"
+        f"{option.name.replace('_', ' ')} {getattr(model_class, option.name)}"
         for option in fields(model_class)
         if option.default is MISSING or getattr(model_class, option.name) != option.default
     ]
-    return f"{type(model_class).__name__}({', '.join(options)})"
+    return ", ".join([name.lower(), *options])
