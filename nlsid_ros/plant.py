@@ -119,7 +119,7 @@ class PlantNode(ManagedNode):
         self._period_ns = round(self._plant.period * 1e9)
         self._last_ns: int | None = None
         self._next_ns = self.get_clock().now().nanoseconds
-        self._pushed_until_ns = 0
+        self._push_from_ns = self._push_until_ns = 0
         self._sent: list[tuple[int, Any]] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(min(self._plant.period, 0.005) / 2, self._on_tick, clock=steady)
@@ -146,7 +146,7 @@ class PlantNode(ManagedNode):
         """Simulate the period that ends at this stamp, and measure."""
         if self._last_ns is not None:
             push = np.zeros(self._inputs)
-            if self._last_ns < self._pushed_until_ns:
+            if self._push_from_ns <= self._last_ns < self._push_until_ns:
                 push[self._pushed] = self._push
             self._plant.step(self._in_force(self._last_ns), push)
         noise = self._spread * self._rng.standard_normal(len(self._spread))
@@ -162,7 +162,8 @@ class PlantNode(ManagedNode):
         return self._commands[0][1]
 
     def _on_push(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
-        self._pushed_until_ns = self._next_ns + round(self._push_duration * 1e9)
+        self._push_from_ns = self._next_ns
+        self._push_until_ns = self._next_ns + round(self._push_duration * 1e9)
         answer.success, answer.message = True, f"{self._push:g} for {self._push_duration:g} s"
         return answer
 
