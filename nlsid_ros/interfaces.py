@@ -140,6 +140,8 @@ def _page(node: ManagedNode, before: set[int], activated: set[int]) -> str:
             continue
         given = id(entity) not in activated or row[0] in SIGNALS
         shown = row[0].replace(f"/{name}/", "~/")
+        if row[2] == "calls" and shown.startswith("~/"):
+            continue  # a node that asks itself needs nobody
         rows.append((f"*`{shown}`*" if given else f"`{shown}`", _type_name(row[1]), *row[2:]))
     lines += [f"| {row[0]} | {row[1]} | {row[2]} | {row[3]} |" for row in sorted(rows)]
     lines += ["\n| parameter | default | range | what |", "|---|---|---|---|"]

@@ -18,9 +18,10 @@ from tests.ros.processes import node_here, process, ros_test, stop, use_domain_o
 
 pytestmark = ros_test
 
-COMMAND, RESPONSE = "/cmd_vel:twist.linear.x", "/odom:twist.twist.linear.x"
+COMMAND, RESPONSE = "/joint_commands:effort[0]", "/joint_states:position[0]"
 LIMITS: dict[str, object] = {"lowest": -0.3, "highest": 0.3, "slew": 5.0, "fade": 0.2}
 SIGNAL: dict[str, object] = {"period": 0.01, "duration": 2.0, "pause": 0.8, "highest_hz": 4.0}
+SIGNAL |= {"command": COMMAND, "command_type": "sensor_msgs/msg/JointState"}
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +40,7 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         said.extend(s.message for s in message.status if s.name == "excitation")
 
     recorded: dict[str, object] = {
-        "topics": "[/odom, /cmd_vel]",
+        "topics": "[/joint_states, /joint_commands]",
         "bag": bags / "trial",
         "at_once": False,
     }
@@ -54,8 +55,8 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         start = node.create_client(Trigger, "/excitation/start")
         bag = node.create_client(Trigger, "/trajectory_recorder/start")
         spin_until(lambda: start.service_is_ready() and bag.service_is_ready())
-        spin_until(lambda: node.count_subscribers("/odom") == 1)
-        spin_until(lambda: node.count_subscribers("/cmd_vel") == 2)
+        spin_until(lambda: node.count_subscribers("/joint_states") == 1)
+        spin_until(lambda: node.count_subscribers("/joint_commands") == 2)
         spin_until(lambda: "idle" in said)
         answer = start.call_async(Trigger.Request())
         spin_until(answer.done)
@@ -69,13 +70,13 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
     for number, trial in enumerate(trials, start=1):
         custom = bag_metadata(trial)
         assert json.loads(custom["experiment"])["repeat"] == number
-        assert int(custom["/cmd_vel received"]) >= 230
-        assert custom["/cmd_vel lost"] == "0"
+        assert int(custom["/joint_commands received"]) >= 230
+        assert custom["/joint_commands lost"] == "0"
     data = read_dataset(
         trials, responses=[RESPONSE], excitations=[COMMAND], period=0.01, max_gap=0.5, tolerance=0.5
     )
     [(group, members)] = data.repeats().items()
-    assert group.startswith("/cmd_vel:twist.linear.x, multisine, sha256:")
+    assert group.startswith("/joint_commands:effort[0], multisine, sha256:")
     assert len(members) == 3
     assert all(np.ptp(member.u) > 0.3 and np.ptp(member.y) > 0.01 for member in members)
     first = members[0].u[:, 0]
@@ -110,7 +111,7 @@ def test_a_recorder_that_is_busy_stops_the_experiment_before_it_moves(tmp_path: 
     with (
         node_here("test_operator") as (node, spin_until),
         process(
-            "nlsid_ros.trajectory_recorder", topics="[/odom]", bag=tmp_path / "own"
+            "nlsid_ros.trajectory_recorder", topics="[/joint_states]", bag=tmp_path / "own"
         ) as recorder,
         process("nlsid_ros.excitation", **excitation) as exciting,
     ):

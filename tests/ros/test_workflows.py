@@ -162,7 +162,7 @@ def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
     with Bag(trials / "trial_new") as recorded:
         assert recorded.count("/odom") > 100
         assert recorded.count("/cmd_vel") > 80
-        assert recorded.count("/excitation/experiment") == 1
+        assert recorded.count("/excitation/experiment") == 2  # its start and its end
 
     models: list[String] = []
     operator.node.create_subscription(
