@@ -54,7 +54,7 @@ $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report)
 
 $(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
-	$(call install,report$(COMMA)export$(COMMA)test)
+	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)test)
 
 COMMA := ,
 
