@@ -1,6 +1,6 @@
 """Search for the proof that an implicit model is well posed and incrementally stable."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +41,11 @@ class ImplicitProof:
     box: tuple[tuple[float, float], ...]
     storage: Storage
     identities: dict[str, Identity]
+
+    @property
+    def rate(self) -> float:
+        """1: the difference of two solutions is square summable, and no rate is claimed."""
+        return 1.0
 
     def document(self, model: ImplicitModel, file: str) -> Json:
         """The proof file's content for the model stored in `file` beside it."""
@@ -84,34 +89,38 @@ def prove_well_posed(
 def prove_implicit(
     model: ImplicitModel, *, delta: float, set: str = "2.13",
     ends: Sequence[tuple[float, float]] = (), storage_degree: int = 0,
+    scale: Mapping[str, float] | None = None,
 ) -> ImplicitProof | None:  # fmt: skip
     """A proof at the stated δ that the model is in the set, or None if the search finds none.
 
     set: of thesis Chapter 2; "2.10" and "2.11" for any model, "2.12" and "2.13" for separable ones,
     "2.19" for linear ones. ends: (low, high) of every state and input for a claim on that box; none
-    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ).
+    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ). scale: the sizes of
+    the variables of `Names`, for the search (default 1).
     Raises DataError for an unknown set or a negative δ.
     """
     if set not in SETS or not delta > 0.0:
         raise DataError(f"set '{set}' (known: {', '.join(SETS)}), delta {delta:g} (positive)")
     names, box = Names.of(model), [list(pair) for pair in ends]
-    unknown = _template(set, names, 0 if ends and set == "2.11" else storage_degree)
+    unknown = storage_template(set, names, 0 if ends and set == "2.11" else storage_degree)
     try:
         wanted = inequalities(model, set, unknown, delta=delta, ends=box)
         of_storage = {key: part for key, part in wanted.items() if key in ("stable", "storage")}
-        storage = _valued(unknown, _solved(of_storage, names)) if set in STORAGE else None
+        storage = _valued(unknown, _solved(of_storage, names, scale)) if set in STORAGE else None
         parts = inequalities(model, set, storage, delta=delta, ends=box)
-        identities = _identities(parts, names)
+        identities = _identities(parts, names, scale)
     except (Infeasible, SolverError, CertificateRejected, Undecided):
         return None
     return ImplicitProof(set, delta, tuple((a, b) for a, b in ends), storage, identities)
 
 
-def _identities(parts: dict[str, Inequality], names: Names) -> dict[str, Identity]:
+def _identities(
+    parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None = None
+) -> dict[str, Identity]:
     """Gram matrices for each inequality; raises CertificateRejected if the checker refuses one."""
     identities: dict[str, Identity] = {}
     for key, part in parts.items():
-        found = _solved({key: part}, names)[key]
+        found = _solved({key: part}, names, scale)[key]
         multipliers = [positive_semidefinite(gram) for gram in found.multipliers]
         prove(part, found.gram, multipliers, names)
         identities[key] = (found.gram, multipliers)
@@ -131,8 +140,8 @@ def _proof(identities: dict[str, Identity]) -> Json:
     return {"inequalities": written}
 
 
-def _template(kind: str, names: Names, degree: int) -> Storage:
-    """The storage with an unknown at every coefficient."""
+def storage_template(kind: str, names: Names, degree: int) -> Storage:
+    """The storage of a set with an unknown at every coefficient; None for linear models."""
     if kind not in STORAGE:
         return None
     n, key = len(names.x), STORAGE[kind]
@@ -160,14 +169,17 @@ def _valued(storage: Storage, solution: Solution) -> Storage:
     return result
 
 
-def _solved(parts: dict[str, Inequality], names: Names) -> Solution:
+def _solved(
+    parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None
+) -> Solution:
     """Gram matrices (and unknowns) for inequalities in the variables that occur, in order."""
     constraints = tuple(constraint(part, name=key) for key, part in parts.items())
     sizes = [len(part.matrix) for part in parts.values()]
     forms = forms_of(max(sizes)) if max(sizes) > 1 else ()
     everything = {name for part in parts.values() for name in part.variables(names.all)}
     used = tuple(name for name in names.all if name in everything)
-    return solve(Program((*used, *forms), constraints))
+    sizes_used = {name: size for name, size in (scale or {}).items() if name in used}
+    return solve(Program((*used, *forms), constraints, scale=sizes_used))
 
 
 def _written(storage: Storage, kind: str, names: Names) -> Json | list[list[Any]]:
