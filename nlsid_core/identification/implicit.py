@@ -1,7 +1,8 @@
 """Search for the proof that an implicit model is well posed and incrementally stable."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Gram, Polynomial, monomials, variables
 from nlsid_core.polynomial.algebra import as_polynomial
 from nlsid_core.sos import Program, Solution, forms_of, solve, template
+from nlsid_core.sos.program import round_to_power_of_two
 from nlsid_core.sos.search import positive_semidefinite
 
 Identity = tuple[Gram, list[Gram]]
@@ -121,9 +123,11 @@ def _identities(
     identities: dict[str, Identity] = {}
     for key, part in parts.items():
         found = _solved({key: part}, names, scale)[key]
-        multipliers = [positive_semidefinite(gram) for gram in found.multipliers]
-        prove(part, found.gram, multipliers, names)
-        identities[key] = (found.gram, multipliers)
+        undone = _gap(part, scale) ** 2 if len(part.matrix) == 1 else 1.0
+        gram, *others = (replace(g, Q=undone * g.Q) for g in (found.gram, *found.multipliers))
+        multipliers = [positive_semidefinite(other) for other in others]
+        prove(part, gram, multipliers, names)
+        identities[key] = (gram, multipliers)
     return identities
 
 
@@ -172,14 +176,31 @@ def _valued(storage: Storage, solution: Solution) -> Storage:
 def _solved(
     parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None
 ) -> Solution:
-    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order."""
-    constraints = tuple(constraint(part, name=key) for key, part in parts.items())
-    sizes = [len(part.matrix) for part in parts.values()]
-    forms = forms_of(max(sizes)) if max(sizes) > 1 else ()
+    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order.
+
+    The first row of a matrix that vanishes with a gap is taken in units of the gap; `_identities`
+    undoes it for a single polynomial, the program where the row has an indeterminate.
+    """
+    constraints, sizes = [], dict(scale or {})
+    for key, part in parts.items():
+        gap = _gap(part, scale)
+        if len(part.matrix) == 1:
+            part = replace(part, matrix=part.matrix * Fraction(1.0 / gap**2))
+        elif part.vanishing:
+            sizes[forms_of(1)[0]] = 1.0 / gap
+        constraints.append(constraint(part, name=key))
+    largest = max(len(part.matrix) for part in parts.values())
+    forms = forms_of(largest) if largest > 1 else ()
     everything = {name for part in parts.values() for name in part.variables(names.all)}
-    used = tuple(name for name in names.all if name in everything)
-    sizes_used = {name: size for name, size in (scale or {}).items() if name in used}
-    return solve(Program((*used, *forms), constraints, scale=sizes_used))
+    used = (*(name for name in names.all if name in everything), *forms)
+    kept = {name: size for name, size in sizes.items() if name in used}
+    return solve(Program(used, tuple(constraints), scale=kept))
+
+
+def _gap(part: Inequality, scale: Mapping[str, float] | None) -> float:
+    """The size of the gaps with which an inequality vanishes, a power of two; 1 if with none."""
+    sizes = [(scale or {}).get(name, 1.0) for name in part.vanishing]
+    return round_to_power_of_two(max(sizes, default=1.0))
 
 
 def _written(storage: Storage, kind: str, names: Names) -> Json | list[list[Any]]:

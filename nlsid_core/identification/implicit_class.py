@@ -75,14 +75,21 @@ class ImplicitClass:
         """Without a box f must not grow faster than the set allows."""
         if self.coupled:
             raise DataError("a product of states and inputs is stable on a box only: give one")
-        needed = 2 * self.right_degree - 1
-        if self.set in ("2.12", "2.13") and self.left_degree < needed:
+        if self.storage_degree >= self.left_degree:
             raise DataError(
-                f"right_degree {self.right_degree} needs left_degree {needed} or a box "
-                f"in set {self.set}; left_degree is {self.left_degree}"
+                f"storage_degree {self.storage_degree} needs left_degree "
+                f"{self.storage_degree + 1} or a box, not {self.left_degree}"
             )
-        if self.set in DELAYED and self.right_degree > 1 and not self.storage_degree:
-            raise DataError(f"right_degree above 1 needs a box in set {self.set}")
+        if self.right_degree == 1:
+            return
+        growth = 2 * (self.right_degree - 1)  # of |f - f̂|² for one gap
+        what, where = f"right_degree {self.right_degree} needs", f"a box in set {self.set}"
+        if self.set == "2.11":
+            raise DataError(f"{what} {where}")
+        if self.left_degree < growth + 1:
+            raise DataError(f"{what} left_degree {growth + 1} or {where}, not {self.left_degree}")
+        if self.set == "2.10" and self.storage_degree < growth:
+            raise DataError(f"{what} storage_degree {growth} or {where}, not {self.storage_degree}")
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""
@@ -163,8 +170,10 @@ class ImplicitRows:
     def model(self, e: FloatArray, f: FloatArray, monotonicity: float) -> ImplicitModel:
         """e(v) = f(x, w) in the signals' units, of scaled e (m_e, n_v), f (m_f, n_v).
 
-        monotonicity: of the scaled e.
+        monotonicity: of the scaled e, and of the model: both sides are multiplied by the square of
+        the largest spread, so that every condition on the scaled model holds with the same δ.
         """
+        largest = float(np.max(self.y_scale[1]))
         n_v, n, names = len(self.y_scale[0]), self.states, self.names
         mean, spread = self.units
         mean, spread = (np.concatenate([part[:n_v], part]) for part in (mean, spread))
@@ -182,7 +191,8 @@ class ImplicitRows:
             p = Polynomial(exponents, column, everything)
             used = p.exponents.any(axis=0)
             inside = {k: v for (k, v), occurs in zip(scaled.items(), used, strict=True) if occurs}
-            parts.append((p.substitute(inside) / float(self.y_scale[1][i])).over(everything))
+            weight = largest**2 / float(self.y_scale[1][i])
+            parts.append((p.substitute(inside) * weight).over(everything))
         h = _stacked(parts)
         if self.model_class.set == "2.19":
             h = _with_symmetric_left(h, n_v)
@@ -191,7 +201,7 @@ class ImplicitRows:
         model = ImplicitModel(
             h=h,
             shift=_shift(n - n_v, n + len(names.w)),
-            monotonicity=monotonicity / float(np.max(self.y_scale[1])) ** 2,
+            monotonicity=monotonicity,
             period=self.dataset.period,
             states=tuple(f"{name}(t-{k})" for k in lags for name in first.y_names),
             inputs=tuple(

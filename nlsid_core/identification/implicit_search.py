@@ -104,7 +104,7 @@ def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitP
     gaps = dict(zip((*rows.names.v, *known), (*spread[:n_v], *spread), strict=True))
     scale |= {name + GAP: gaps[name] for name in (*rows.names.v, *rows.names.x)}
     return prove_implicit(
-        model, delta=delta / float(np.max(rows.y_scale[1])) ** 2, set=made.set, ends=rows.ends,
+        model, delta=delta, set=made.set, ends=rows.ends,
         storage_degree=made.storage_degree, scale=scale,
     )  # fmt: skip
 
