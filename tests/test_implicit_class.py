@@ -114,6 +114,21 @@ def test_the_linear_bound_is_the_best_there_is_of_first_order() -> None:
     assert min(values) * (1.0 - 1e-6) <= bound <= 1.011 * min(values)
 
 
+def test_the_linear_bound_is_above_the_lower_bound_of_proposition_2_19() -> None:
+    """sup |(zI - A)⁻¹(x̃⁺ - Ax̃ - Bw)|²_Q over |z| = 1, sample by sample, two states."""
+    trial = coupled(300, 0)
+    rows = build_implicit_rows(Dataset((trial,)), CLASSES[4])
+    fit, spread = minimise_implicit_rie(rows), rows.y_scale[1]
+    x, w = trial.y[:-1], trial.u[:-1]
+    after = fit.model.step(x, w)
+    A = fit.model.jacobian(after, x, w)[0, :, :2] * spread / spread[:, None]
+    errors = (trial.y[1:] - after) / spread
+    z = np.exp(1j * np.linspace(0.0, np.pi, 181))
+    reached = np.linalg.inv(z[:, None, None] * np.eye(2) - A) @ errors.T  # (z, state, sample)
+    lower = float(np.mean(np.max(np.sum(np.abs(reached) ** 2, axis=1), axis=0)))
+    assert 0.5 * fit.bound < lower <= fit.bound
+
+
 @pytest.mark.parametrize("name", ["2.10", "2.11", "2.12", "2.13"])
 def test_a_cubic_spring_without_noise_is_found(name: str) -> None:
     data = Dataset((spring(300, 0, noise=0.0),))

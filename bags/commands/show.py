@@ -108,7 +108,8 @@ def stability(candidate: Candidate[Model]) -> str:
     """Proved with its rate, or not, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    return f"[green]proved[/green], {stated_rate(candidate.proof)}"
+    rate = stated_rate(candidate.proof).removesuffix(" a sample")  # the table is narrow
+    return f"[green]proved[/green], {rate}"
 
 
 def funnel_table(design: TubeDesign) -> Table:

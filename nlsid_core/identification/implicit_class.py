@@ -189,7 +189,7 @@ class ImplicitRows:
         parts = []
         for i, column in enumerate(np.concatenate([e, -f]).T):
             p = Polynomial(exponents, column, everything)
-            used = p.exponents.any(axis=0)
+            used = np.asarray(p.exponents.any(axis=0)).tolist()
             inside = {k: v for (k, v), occurs in zip(scaled.items(), used, strict=True) if occurs}
             weight = largest**2 / float(self.y_scale[1][i])
             parts.append((p.substitute(inside) * weight).over(everything))
