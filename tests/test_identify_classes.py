@@ -19,7 +19,9 @@ from nlsid_core.identification import (
     UNBIASED_RIE,
     BlockCascadeClass,
     Fit,
+    ImplicitClass,
     LinearClass,
+    LinearStateClass,
     MonotoneClass,
     StateAffineClass,
     describe,
@@ -73,6 +75,8 @@ def affine(train: Dataset) -> Fit[StateAffineModel]:
 
 def test_every_class_has_its_methods_and_together_they_are_all() -> None:
     classes = (LinearClass(2), StateAffineClass(2), CASCADE, MonotoneClass(2))
+    assert methods_of(ImplicitClass())[0] == "rie"
+    assert methods_of(LinearStateClass()) == ("least_squares",)
     assert {m for c in classes for m in methods_of(c)} == set(METHODS)
     assert methods_of(StateAffineClass(2, lagged_degree=1))[0] == "rse"
     assert "rse_certified" not in methods_of(StateAffineClass(2, leading_degree=3))

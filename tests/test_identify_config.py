@@ -9,7 +9,9 @@ from bags.chain.config import load_config
 from nlsid_core.errors import DataError
 from nlsid_core.identification import (
     BlockCascadeClass,
+    ImplicitClass,
     LinearClass,
+    LinearStateClass,
     MonotoneClass,
     StateAffineClass,
 )
@@ -28,6 +30,9 @@ from tests.identified_bags import write_config
         ({"model": "block_cascade", "orders": [2, 0], "intervals": [8]},
          BlockCascadeClass((2, 0), intervals=(8,))),
         ({"model": "monotone", "lags": 3, "degree": 1}, MonotoneClass(3, degree=1)),
+        ({"model": "implicit", "set": "2.13", "delays": [1], "box": [[-1, 1], [0, 2]]},
+         ImplicitClass(1, (1,), "2.13", box=((-1.0, 1.0), (0.0, 2.0)))),
+        ({"model": "linear_states"}, LinearStateClass()),
     ],
 )  # fmt: skip
 def test_each_section_says_a_model_class(
@@ -56,6 +61,11 @@ def test_each_section_says_a_model_class(
         ({"model": "block_cascade", "orders": [0, 0]}, "not both zero"),
         ({"model": "block_cascade", "phases": [9]}, "phases .* should be between 1 and"),
         ({"model": "monotone", "lags": 2, "degree": 2}, r"degree: Input should be 1 or 3"),
+        ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.10', .* \(found 2.13\)"),
+        ({"model": "implicit", "set": "2.13", "lags": 2}, "set 2.13 is for 1 lag"),
+        ({"model": "implicit", "right_degree": 3}, "needs a box in set 2.11"),
+        ({"model": "implicit", "coupled": True}, "stable on a box only"),
+        ({"model": "linear_states", "lags": 1}, "identification.lags: there is no such key"),
     ],
 )  # fmt: skip
 def test_a_wrong_identification_names_key_value_and_what_is_allowed(

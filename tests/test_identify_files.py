@@ -20,7 +20,13 @@ from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import _json
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.identification import METHODS
-from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.models import (
+    BlockCascade,
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StateAffineModel,
+)
 from nlsid_core.trajectory import Dataset, Trajectory
 from tests.bag_messages import COMMAND, SPEED, speed_bag
 from tests.identified_bags import (
@@ -44,10 +50,20 @@ CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
     ),
     "block_cascade": (CASCADE, BlockCascade),
     "monotone": ({"model": "monotone", "lags": 2, "delays": [0, 1]}, MonotoneEquation),
+    "implicit": ({"model": "implicit", "lags": 2, "delays": [0, 1]}, ImplicitModel),
+    "linear_states": ({"model": "linear_states"}, ImplicitModel),
 }  # fmt: skip
 COEFFICIENTS = {
     "linear": "a", "state_affine": "coefficients", "block_cascade": "a1", "monotone": "a",
+    "implicit": "coefficients", "linear_states": "coefficients",
 }  # fmt: skip
+STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
+REASONS = {"rate": ("shrink", "positive definite"), "delta": ("the identity does not hold",)}
+
+
+def claimed(name: str) -> str:
+    """What the claim of a class quantifies."""
+    return "delta" if CLASSES[name][1] is ImplicitModel else "rate"
 
 
 def nlsid(*arguments: object) -> Any:
@@ -106,11 +122,14 @@ def test_each_class_is_identified_to_files_that_check_proves(made: tuple[str, Pa
     assert "simulation residual is" in page
 
 
-def test_a_digit_of_a_coefficient_or_of_the_rate_undoes_the_proof(
+def test_a_digit_of_a_coefficient_or_of_the_claim_undoes_the_proof(
     made: tuple[str, Path, str], tmp_path: Path
 ) -> None:
     name, out, _ = made
-    for file, key in ((documents.MODEL, COEFFICIENTS[name]), (documents.MODEL_PROOF, "rate")):
+    for file, key in (
+        (documents.MODEL, COEFFICIENTS[name]),
+        (documents.MODEL_PROOF, claimed(name)),
+    ):
         for each in (documents.MODEL, documents.MODEL_PROOF):
             shutil.copy(out / each, tmp_path)
         genuine = (out / file).read_text()
@@ -122,19 +141,19 @@ def test_a_digit_of_a_coefficient_or_of_the_rate_undoes_the_proof(
         assert refused.output.startswith("REJECTED")
 
 
-def test_a_forger_who_fixes_the_digests_still_has_to_prove_a_faster_rate(
+def test_a_forger_who_fixes_the_digests_still_has_to_prove_the_stronger_claim(
     made: tuple[str, Path, str], tmp_path: Path
 ) -> None:
-    _, out, _ = made
+    name, out, _ = made
     shutil.copy(out / documents.MODEL, tmp_path)
     document = json.loads((out / documents.MODEL_PROOF).read_text())
-    document["claim"]["rate"] *= 0.2
+    document["claim"][claimed(name)] *= STRONGER[claimed(name)]
     del document["digest"]
     path = tmp_path / documents.MODEL_PROOF
     path.write_text(json.dumps(document | {"digest": _json.digest(document)}))
     refused = nlsid("check", path)
     assert refused.exit_code == 1
-    assert "shrink" in refused.output or "positive definite" in refused.output
+    assert any(reason in refused.output for reason in REASONS[claimed(name)])
 
 
 def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(

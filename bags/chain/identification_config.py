@@ -20,7 +20,9 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification import (
     BlockCascadeClass,
     Fit,
+    ImplicitClass,
     LinearClass,
+    LinearStateClass,
     Model,
     ModelClass,
     MonotoneClass,
@@ -221,6 +223,56 @@ class MonotoneConfig(_Identification):
         return MonotoneClass(self.lags, self.delays, self.degree)
 
 
+class ImplicitConfig(_Identification):
+    """e(y(t)) = f(past outputs, inputs), in a set of stable models; see `ImplicitClass`.
+
+    box: [low, high] of every response, then every excitation (default: stable everywhere).
+    """
+
+    tag: ClassVar[str] = "implicit"
+    hidden: ClassVar[frozenset[str]] = frozenset({"iterations", "seed", "accept_untested_repeats"})
+    model: Literal["implicit"]
+    lags: Lags = 1
+    delays: Delays | None = None
+    set: Literal["2.10", "2.11", "2.12", "2.13", "2.19"] = "2.11"
+    left_degree: int = Field(default=3, ge=1, le=9)
+    right_degree: int = Field(default=1, ge=1, le=5)
+    input_degree: int = Field(default=1, ge=1, le=5)
+    coupled: bool = False
+    box: Ranges | None = None
+    storage_degree: int = Field(default=0, ge=0, le=4)
+    method: Literal["rie", "least_squares"] = "rie"
+
+    @property
+    def model_class(self) -> ImplicitClass:
+        """The same as the core's noun."""
+        return ImplicitClass(
+            self.lags,
+            delays=self.delays,
+            set=self.set,
+            left_degree=self.left_degree,
+            right_degree=self.right_degree,
+            input_degree=self.input_degree,
+            coupled=self.coupled,
+            box=self.box,
+            storage_degree=self.storage_degree,
+        )
+
+
+class LinearStatesConfig(_Identification):
+    """Linear models whose state is the measured responses; see `LinearStateClass`."""
+
+    tag: ClassVar[str] = "linear_states"
+    hidden: ClassVar[frozenset[str]] = frozenset({"iterations", "seed", "accept_untested_repeats"})
+    model: Literal["linear_states"]
+    method: Literal["least_squares"] = "least_squares"
+
+    @property
+    def model_class(self) -> LinearStateClass:
+        """The same as the core's noun."""
+        return LinearStateClass()
+
+
 def _tag(section: Any) -> Any:
     return section.get("model", "linear") if isinstance(section, dict) else section.model
 
@@ -229,12 +281,14 @@ IdentificationConfig = Annotated[
     Annotated[LinearConfig, Tag("linear")]
     | Annotated[StateAffineConfig, Tag("state_affine")]
     | Annotated[BlockCascadeConfig, Tag("block_cascade")]
-    | Annotated[MonotoneConfig, Tag("monotone")],
+    | Annotated[MonotoneConfig, Tag("monotone")]
+    | Annotated[ImplicitConfig, Tag("implicit")]
+    | Annotated[LinearStatesConfig, Tag("linear_states")],
     Discriminator(
         _tag,
         custom_error_type="unknown_model",
         custom_error_message="there is no such model; there are: linear, state_affine, "
-        "block_cascade, monotone",
+        "block_cascade, monotone, implicit, linear_states",
     ),
 ]
 _ADAPTER: TypeAdapter[IdentificationConfig] = TypeAdapter(IdentificationConfig)

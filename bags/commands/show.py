@@ -11,7 +11,7 @@ from bags.chain.steps import Identified
 from bags.monitoring.replay import Replay
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import TubeDesign
-from nlsid_core.identification import Candidate, Fit, Model, Selection, describe
+from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.monitor import Nominal, Status
 from nlsid_core.trajectory import Dataset
 
@@ -115,7 +115,8 @@ def stability(candidate: Candidate[Model]) -> str:
     """Proved with its rate, or not, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    return f"[green]proved[/green], {candidate.proof.rate:.4f}"
+    rate = stated_rate(candidate.proof).removesuffix(" a sample")  # the table is narrow
+    return f"[green]proved[/green], {rate}"
 
 
 def funnel_table(design: TubeDesign) -> Table:

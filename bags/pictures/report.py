@@ -9,8 +9,13 @@ from pathlib import Path
 from bags.monitoring.replay import Replay
 from nlsid_core import _json
 from nlsid_core.errors import DataError
-from nlsid_core.identification import Candidate, Fit, Model
-from nlsid_core.models import DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model
+from nlsid_core.models import (
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StateAffineModel,
+)
 from nlsid_core.trajectory import Dataset
 
 STYLE = """
@@ -112,9 +117,15 @@ def _stability(chosen: Candidate[Model]) -> str:
         inputs = f"every input in {low_high}"
         clip = chosen.model.on_out_of_range == "clip"
         inputs += " (others are clipped to it)" if clip else " (others are refused)"
+    if chosen.proof.rate < 1.0:
+        approach = f"approach each other at {chosen.proof.rate:.4f} a sample or faster"
+    else:
+        approach = "differ by a square summable sequence; no rate is claimed"
+        if isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
+            inputs = "every input that keeps them in the box of the proof"
     return (
         f'<p class="proved">Incrementally stable for {inputs}, decided exactly: two solutions with '
-        f"the same input approach each other at {chosen.proof.rate:.4f} a sample or faster.</p>"
+        f"the same input {approach}.</p>"
     )
 
 
@@ -157,6 +168,8 @@ def _equation(m: Model) -> str:
             f"{e.removeprefix('+')} = {m.c:+.4g} {past} + {len(m.window)} inputs (y, u minus their "
             f"offsets); {signals}"
         )
+    if isinstance(m, ImplicitModel):
+        return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
     return f"y = G₂ f(G₁ u): {m}; {signals}"
 
 

@@ -22,9 +22,13 @@ from nlsid_core.identification.fit import (
     History,
     Proof,
     Step,
+    stated_rate,
 )
 from nlsid_core.identification.from_repeats import identify_from_repeats
 from nlsid_core.identification.identify import identify
+from nlsid_core.identification.implicit import ImplicitProof, prove_implicit
+from nlsid_core.identification.implicit_class import ImplicitClass
+from nlsid_core.identification.linear_states import LinearStateClass
 from nlsid_core.identification.model_class import ModelClass, describe
 from nlsid_core.identification.moment_rie import MomentFit
 from nlsid_core.identification.moments import MonotoneClass
@@ -60,7 +64,10 @@ __all__ = [
     "CascadeProof",
     "Fit",
     "History",
+    "ImplicitClass",
+    "ImplicitProof",
     "LinearClass",
+    "LinearStateClass",
     "Model",
     "ModelClass",
     "MomentFit",
@@ -84,12 +91,14 @@ __all__ = [
     "methods_of",
     "predict",
     "prove_block_cascade",
+    "prove_implicit",
     "prove_monotone_equation",
     "prove_stability",
     "prove_state_affine",
     "select",
     "simulate_trial",
     "simulation_percent",
+    "stated_rate",
     "validate",
     "without_missing",
 ]

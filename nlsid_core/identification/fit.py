@@ -38,12 +38,20 @@ class Proof(Protocol):
 
     @property
     def rate(self) -> float:
-        """Two solutions with the same input approach each other by it, or faster, a sample."""
+        """Two solutions with the same input approach each other by it, or faster, a sample.
+
+        1 where their difference is proved square summable and no rate is.
+        """
         ...
 
     def document(self, model: Any, file: str) -> Json:
         """The proof file's content for the model it was made for, stored in `file` beside it."""
         ...
+
+
+def stated_rate(proof: Proof) -> str:
+    """The rate in words: `0.9500 a sample`."""
+    return f"{proof.rate:.4f} a sample" if proof.rate < 1.0 else "no rate"
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +145,7 @@ class Fit(Generic[M]):
         rows: list[str] = []
         for c in self.candidates:
             scores = "".join(f"{self.errors[name][c.method]:12.2f}" for name in columns)
-            state = f"proved, {c.proof.rate:.4f} a sample" if c.proof else "not proved"
+            state = f"proved, {stated_rate(c.proof)}" if c.proof else "not proved"
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method:52s}{scores}{c.seconds:9.3f} s  {state}")
         return "\n".join([str(self.model), str(self.history), header, *rows])

@@ -1,7 +1,8 @@
 """Search for the proof that an implicit model is well posed and incrementally stable."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Gram, Polynomial, monomials, variables
 from nlsid_core.polynomial.algebra import as_polynomial
 from nlsid_core.sos import Program, Solution, forms_of, solve, template
+from nlsid_core.sos.program import round_to_power_of_two
 from nlsid_core.sos.search import positive_semidefinite
 
 Identity = tuple[Gram, list[Gram]]
@@ -41,6 +43,11 @@ class ImplicitProof:
     box: tuple[tuple[float, float], ...]
     storage: Storage
     identities: dict[str, Identity]
+
+    @property
+    def rate(self) -> float:
+        """1: the difference of two solutions is square summable, and no rate is claimed."""
+        return 1.0
 
     def document(self, model: ImplicitModel, file: str) -> Json:
         """The proof file's content for the model stored in `file` beside it."""
@@ -84,37 +91,43 @@ def prove_well_posed(
 def prove_implicit(
     model: ImplicitModel, *, delta: float, set: str = "2.13",
     ends: Sequence[tuple[float, float]] = (), storage_degree: int = 0,
+    scale: Mapping[str, float] | None = None,
 ) -> ImplicitProof | None:  # fmt: skip
     """A proof at the stated δ that the model is in the set, or None if the search finds none.
 
     set: of thesis Chapter 2; "2.10" and "2.11" for any model, "2.12" and "2.13" for separable ones,
     "2.19" for linear ones. ends: (low, high) of every state and input for a claim on that box; none
-    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ).
+    is global. storage_degree: of M in x ("2.11"; "2.10" takes V = Δ'M(x, Δ)Δ). scale: the sizes of
+    the variables of `Names`, for the search (default 1).
     Raises DataError for an unknown set or a negative δ.
     """
     if set not in SETS or not delta > 0.0:
         raise DataError(f"set '{set}' (known: {', '.join(SETS)}), delta {delta:g} (positive)")
     names, box = Names.of(model), [list(pair) for pair in ends]
-    unknown = _template(set, names, 0 if ends and set == "2.11" else storage_degree)
+    unknown = storage_template(set, names, 0 if ends and set == "2.11" else storage_degree)
     try:
         wanted = inequalities(model, set, unknown, delta=delta, ends=box)
         of_storage = {key: part for key, part in wanted.items() if key in ("stable", "storage")}
-        storage = _valued(unknown, _solved(of_storage, names)) if set in STORAGE else None
+        storage = _valued(unknown, _solved(of_storage, names, scale)) if set in STORAGE else None
         parts = inequalities(model, set, storage, delta=delta, ends=box)
-        identities = _identities(parts, names)
+        identities = _identities(parts, names, scale)
     except (Infeasible, SolverError, CertificateRejected, Undecided):
         return None
     return ImplicitProof(set, delta, tuple((a, b) for a, b in ends), storage, identities)
 
 
-def _identities(parts: dict[str, Inequality], names: Names) -> dict[str, Identity]:
+def _identities(
+    parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None = None
+) -> dict[str, Identity]:
     """Gram matrices for each inequality; raises CertificateRejected if the checker refuses one."""
     identities: dict[str, Identity] = {}
     for key, part in parts.items():
-        found = _solved({key: part}, names)[key]
-        multipliers = [positive_semidefinite(gram) for gram in found.multipliers]
-        prove(part, found.gram, multipliers, names)
-        identities[key] = (found.gram, multipliers)
+        found = _solved({key: part}, names, scale)[key]
+        undone = _gap(part, scale) ** 2 if len(part.matrix) == 1 else 1.0
+        gram, *others = (replace(g, Q=undone * g.Q) for g in (found.gram, *found.multipliers))
+        multipliers = [positive_semidefinite(other) for other in others]
+        prove(part, gram, multipliers, names)
+        identities[key] = (gram, multipliers)
     return identities
 
 
@@ -131,8 +144,8 @@ def _proof(identities: dict[str, Identity]) -> Json:
     return {"inequalities": written}
 
 
-def _template(kind: str, names: Names, degree: int) -> Storage:
-    """The storage with an unknown at every coefficient."""
+def storage_template(kind: str, names: Names, degree: int) -> Storage:
+    """The storage of a set with an unknown at every coefficient; None for linear models."""
     if kind not in STORAGE:
         return None
     n, key = len(names.x), STORAGE[kind]
@@ -160,14 +173,34 @@ def _valued(storage: Storage, solution: Solution) -> Storage:
     return result
 
 
-def _solved(parts: dict[str, Inequality], names: Names) -> Solution:
-    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order."""
-    constraints = tuple(constraint(part, name=key) for key, part in parts.items())
-    sizes = [len(part.matrix) for part in parts.values()]
-    forms = forms_of(max(sizes)) if max(sizes) > 1 else ()
+def _solved(
+    parts: dict[str, Inequality], names: Names, scale: Mapping[str, float] | None
+) -> Solution:
+    """Gram matrices (and unknowns) for inequalities in the variables that occur, in order.
+
+    The first row of a matrix that vanishes with a gap is taken in units of the gap; `_identities`
+    undoes it for a single polynomial, the program where the row has an indeterminate.
+    """
+    constraints, sizes = [], dict(scale or {})
+    for key, part in parts.items():
+        gap = _gap(part, scale)
+        if len(part.matrix) == 1:
+            part = replace(part, matrix=part.matrix * Fraction(1.0 / gap**2))
+        elif part.vanishing:
+            sizes[forms_of(1)[0]] = 1.0 / gap
+        constraints.append(constraint(part, name=key))
+    largest = max(len(part.matrix) for part in parts.values())
+    forms = forms_of(largest) if largest > 1 else ()
     everything = {name for part in parts.values() for name in part.variables(names.all)}
-    used = tuple(name for name in names.all if name in everything)
-    return solve(Program((*used, *forms), constraints))
+    used = (*(name for name in names.all if name in everything), *forms)
+    kept = {name: size for name, size in sizes.items() if name in used}
+    return solve(Program(used, tuple(constraints), scale=kept))
+
+
+def _gap(part: Inequality, scale: Mapping[str, float] | None) -> float:
+    """The size of the gaps with which an inequality vanishes, a power of two; 1 if with none."""
+    sizes = [(scale or {}).get(name, 1.0) for name in part.vanishing]
+    return round_to_power_of_two(max(sizes, default=1.0))
 
 
 def _written(storage: Storage, kind: str, names: Names) -> Json | list[list[Any]]:

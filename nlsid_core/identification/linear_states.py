@@ -7,12 +7,15 @@ Source: thesis (2.19), [70].
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from nlsid_core._types import FloatArray
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import Infeasible
 from nlsid_core.identification.implicit import ImplicitProof, prove_implicit
+from nlsid_core.identification.implicit_class import with_signals
+from nlsid_core.identification.signal_scale import refuse_poor, signal_scale
 from nlsid_core.identification.stable_sets import linear_models
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
@@ -21,8 +24,13 @@ from nlsid_core.sos import NormBound, Program, Solution, forms_of, solve, symmet
 from nlsid_core.trajectory import Dataset
 
 DECREASE = 0.5  # δ that is proved, of the one the search asks for
-CONSTANT = 1e-10  # relative spread below which a signal is constant
-RANK_TOLERANCE = 1e-10  # relative singular value at which states and inputs repeat each other
+
+
+@dataclass(frozen=True)
+class LinearStateClass:
+    """Stable linear models whose state is the measured outputs: x⁺ = A x + B u + c."""
+
+    kind: ClassVar[type[ImplicitModel]] = ImplicitModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,7 @@ def identify_linear_states(dataset: Dataset) -> LinearStateFit:
     proof, SolverError as the solver does.
     """
     x_scale, u_scale = (
-        _scale(np.concatenate([getattr(trial, letter) for trial in dataset]), name)
+        signal_scale(np.concatenate([getattr(trial, letter) for trial in dataset]), name)
         for letter, name in (("y", "state"), ("u", "input"))
     )
     steps = [
@@ -57,7 +65,7 @@ def identify_linear_states(dataset: Dataset) -> LinearStateFit:
     ]  # fmt: skip
     after, now, w, ones = (np.concatenate(parts) for parts in zip(*steps, strict=True))
     data = np.hstack([after, now, w, ones])
-    _refuse_poor(data[:, after.shape[1] :])
+    refuse_poor(data[:, after.shape[1] :])
     n = after.shape[1]
     R = np.linalg.qr(data, mode="r") / np.sqrt(len(data))
     E, found = _solved(R, n)
@@ -77,6 +85,8 @@ def identify_linear_states(dataset: Dataset) -> LinearStateFit:
         states=tuple(first.y_names),
         inputs=tuple(first.u_names),
     )
+    window = tuple((i, 1) for i in range(len(u_scale[0])))
+    model = with_signals(model, dataset, window)
     delta = DECREASE / float(np.max(x_scale[1])) ** 2
     proof = prove_implicit(model, delta=delta, set="2.19")
     if proof is None:
@@ -108,20 +118,3 @@ def _unknown(name: str, rows: int, columns: int) -> np.ndarray:
 def _values(found: Solution, name: str, rows: int, columns: int) -> FloatArray:
     entries = [[found.values[f"{name}[{i},{j}]"] for j in range(columns)] for i in range(rows)]
     return np.array(entries)
-
-
-def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
-    mean, spread = values.mean(axis=0), values.std(axis=0)
-    for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
-        raise DataError(f"{role} {i} is constant ({mean[i]:g}): nothing can be identified from it")
-    return mean, spread
-
-
-def _refuse_poor(regressors: FloatArray) -> None:
-    if len(regressors) <= regressors.shape[1]:
-        raise DataError(
-            f"{len(regressors)} steps for {regressors.shape[1]} regressors; give more data"
-        )
-    singular = np.linalg.svd(regressors, compute_uv=False)
-    if singular[-1] < RANK_TOLERANCE * singular[0]:
-        raise DataError("states and inputs are not independent: excite them more, or drop some")

@@ -9,10 +9,16 @@ from scipy.signal import lfilter
 
 from nlsid_core._types import FloatArray
 from nlsid_core.errors import DataError
-from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.models import (
+    BlockCascade,
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StateAffineModel,
+)
 from nlsid_core.trajectory import Trajectory
 
-Model = DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation
+Model = DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation | ImplicitModel
 # [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
 Step = Callable[[list[FloatArray], slice], FloatArray]
 
@@ -24,7 +30,7 @@ def history(model: Model) -> int:
     """How many measured samples start a simulation; none for a block cascade, which is at rest."""
     if isinstance(model, BlockCascade):
         return 0
-    return model.history if isinstance(model, MonotoneEquation) else len(model)
+    return model.history if isinstance(model, MonotoneEquation | ImplicitModel) else len(model)
 
 
 def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
@@ -34,6 +40,8 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
         return model.simulate(trial.u, trial.y[:n])
     if isinstance(model, BlockCascade):
         return model.simulate(trial.u[:, 0])[:, None]
+    if isinstance(model, ImplicitModel):
+        return model.simulate_outputs(trial.u, trial.y[:n])
     u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
     return model.simulate(u, trial.y[:n, 0])[:, None]
 
@@ -66,11 +74,14 @@ def one_step_residual(model: Model, trial: Trajectory) -> FloatArray:
 
 
 def _step(
-    model: DifferenceEquation | StateAffineModel | MonotoneEquation, trial: Trajectory
+    model: DifferenceEquation | StateAffineModel | MonotoneEquation | ImplicitModel,
+    trial: Trajectory,
 ) -> tuple[Step, int]:
     """One step of the model at rows t = n …, in the outputs' units, and its number of lags."""
     if isinstance(model, MonotoneEquation):
         return _monotone_step(model, trial), len(model)
+    if isinstance(model, ImplicitModel):
+        return _implicit_step(model, trial), model.lags
     gains, forcing = _explicit(model, trial)
 
     def step(past: list[FloatArray], rows: slice) -> FloatArray:
@@ -103,6 +114,15 @@ def _monotone_step(model: MonotoneEquation, trial: Trajectory) -> Step:
             a * (y[:, 0] - model.y_offset) for a, y in zip(model.a, past, strict=True)
         )
         return solve_increasing_at(model.e, target)[:, None] + model.y_offset
+
+    return step
+
+
+def _implicit_step(model: ImplicitModel, trial: Trajectory) -> Step:
+    w = model.windows(trial.u)
+
+    def step(past: list[FloatArray], rows: slice) -> FloatArray:
+        return model.step(np.concatenate(past, axis=1), w[rows])[:, : model.unknowns]
 
     return step
 

@@ -26,7 +26,14 @@ from nlsid_core.identification.fit import (
     Step,
 )
 from nlsid_core.identification.from_repeats import identify_from_repeats
+from nlsid_core.identification.implicit_class import ImplicitClass, build_implicit_rows
+from nlsid_core.identification.implicit_search import (
+    implicit_equation_error,
+    minimise_implicit_rie,
+    prove_in_set,
+)
 from nlsid_core.identification.least_squares import least_squares
+from nlsid_core.identification.linear_states import LinearStateClass, identify_linear_states
 from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
 from nlsid_core.identification.moments import (
     MonotoneClass,
@@ -50,7 +57,13 @@ from nlsid_core.identification.state_affine import (
 )
 from nlsid_core.identification.trail import Task, Trail
 from nlsid_core.identification.validation import simulation_percent
-from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.models import (
+    BlockCascade,
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StateAffineModel,
+)
 from nlsid_core.trajectory import Dataset
 
 BOUND = "bound on the simulation error"
@@ -180,6 +193,38 @@ def _best_minimum(
     return min(found, key=lambda model: simulation_percent(model, train))
 
 
+def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[ImplicitModel]:
+    """Implicit models in a stable set of thesis Chapter 2."""
+    rows = build_implicit_rows(train, model_class)
+    trail: Trail[ImplicitModel] = Trail(
+        task,
+        lambda model: prove_in_set(model, rows),
+        "mean squared simulation error in squared spreads of the outputs, at most",
+    )
+
+    def search() -> tuple[ImplicitModel, Proof]:
+        found = minimise_implicit_rie(rows)
+        if task.method == RIE:
+            trail.history = History(trail.history.value, (Step(RIE, found.bound),))
+        return found.model, found.proof
+
+    trail.add(LEAST_SQUARES, lambda: implicit_equation_error(rows))
+    trail.add_proved(RIE, search)
+    return trail
+
+
+def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[ImplicitModel]:
+    """Linear models of measured states, least squares over all stable ones."""
+    trail: Trail[ImplicitModel] = Trail(task, lambda _: None, "equation error")
+
+    def search() -> tuple[ImplicitModel, Proof]:
+        found = identify_linear_states(train)
+        return found.model, found.proof
+
+    trail.add_proved(LEAST_SQUARES, search)
+    return trail
+
+
 @dataclass(frozen=True)
 class Offer:
     """The methods of a class, the default first, and those that run beside what is asked for."""
@@ -203,6 +248,8 @@ OFFERS: dict[type, Offer] = {
     MonotoneClass: Offer(
         monotone, ("moment_rie", "rie", "least_squares", "sem"), (LEAST_SQUARES, RIE, UNBIASED_RIE)
     ),
+    ImplicitClass: Offer(implicit, ("rie", "least_squares"), (LEAST_SQUARES, RIE)),
+    LinearStateClass: Offer(linear_states, ("least_squares",), ()),
 }  # fmt: skip
 
 

@@ -6,17 +6,19 @@ Source: thesis (2.4), (2.7), (2.11)-(2.15).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from nlsid_core import _json
 from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
 from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, VERSION
+from nlsid_core.models.signal import FORMAT, VERSION, Signal
 
 KIND = "implicit"
+DIVERGED = 1e30  # a state whose powers would overflow
 CENTRED = 0.5  # h is so monotone in e₀(v): Proposition 2.7
 
 
@@ -29,6 +31,9 @@ class ImplicitModel:
     e₀ that is so monotone, or linear with |e₀ - ê₀| ≥ δ|v - v̂|, and 2(e₀ - ê₀)'(h - ĥ) ≥
     |e₀ - ê₀|². Both make v unique; `certificate` decides them.
 
+    y, u, window, bags, training: of a model of recorded signals, whose v is y(t), whose x stacks
+    y(t-1) … y(t-k), and whose w_j is u_i(t-d) for (i, d) = window[j].
+
     Raises ShapeError or DataError on parts that do not fit.
     """
 
@@ -39,6 +44,11 @@ class ImplicitModel:
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     centre: Polynomials | None = None
+    y: tuple[Signal, ...] = ()
+    u: tuple[Signal, ...] = ()
+    window: tuple[tuple[int, int], ...] = ()
+    bags: tuple[tuple[str, str], ...] = ()
+    training: str = ""
 
     def __post_init__(self) -> None:
         n, m, n_v = len(self.states), len(self.inputs), self.unknowns
@@ -55,6 +65,13 @@ class ImplicitModel:
                 )
         if not 0.0 < self.monotonicity < np.inf or not 0.0 < self.period < np.inf:
             raise DataError("monotonicity and period should be positive")
+        if self.y and (len(self.y) != n_v or n % n_v or len(self.window) != m):
+            raise ShapeError(
+                f"{len(self.y)} outputs and a window of {len(self.window)} inputs for {n} states, "
+                f"{n_v} of them unknown, and {m} inputs"
+            )
+        if any(not (0 <= i < len(self.u) and d >= 0) for i, d in self.window):
+            raise DataError(f"window {self.window} names inputs or delays that are not there")
 
     @classmethod
     def separable(
@@ -90,6 +107,23 @@ class ImplicitModel:
     def __len__(self) -> int:
         """The number of states n."""
         return len(self.states)
+
+    def __str__(self) -> str:
+        degree = int(np.max(self.h.exponents[:, : self.unknowns].sum(axis=1), initial=0))
+        return (
+            f"implicit model: {len(self)} states, {self.unknowns} equations of degree {degree} in "
+            f"the next ones, {len(self.inputs)} inputs, {self.period:g} s a sample"
+        )
+
+    @property
+    def lags(self) -> int:
+        """Of recorded signals: how many past samples of y the state stacks."""
+        return len(self) // self.unknowns
+
+    @property
+    def history(self) -> int:
+        """Of recorded signals: how many past samples a step looks back."""
+        return max(self.lags, *(d for _, d in self.window), 0)
 
     @property
     def unknowns(self) -> int:
@@ -178,6 +212,30 @@ class ImplicitModel:
             states.append(self.step(states[-1], inputs[:, t]))
         return np.stack(states, axis=1)
 
+    def windows(self, u: FloatArray) -> FloatArray:
+        """w(t), (N - history, m), for t = history … of recorded inputs u (N, n_u)."""
+        h, N = self.history, len(u)
+        columns = [u[h - d : N - d, i] for i, d in self.window]
+        return np.column_stack(columns) if columns else np.zeros((N - h, 0))
+
+    def simulate_outputs(self, u: FloatArray, y_start: FloatArray) -> FloatArray:
+        """Outputs (N, n_y) for recorded inputs u (N, n_u), the first `history` being y_start.
+
+        Infinite from where a model without proof diverges.
+        """
+        outputs = np.full((len(u), self.unknowns), np.inf)
+        outputs[: self.history] = y_start
+        x = y_start[: -self.lags - 1 : -1].reshape(1, -1)
+        for t, w in enumerate(self.windows(u), self.history):
+            try:
+                x = self.step(x, w[None])
+            except SolverError:
+                break
+            if not np.abs(x).max() < DIVERGED:
+                break
+            outputs[t] = x[0, : self.unknowns]
+        return outputs
+
     def jacobian(self, after: ArrayLike, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """(B, n, n + m): ∂x⁺/∂[x; w] = [-H₁⁻¹[H₂, H₃]; ∂ã] along a step that has been made."""
         known = np.concatenate([np.asarray(x, float), np.asarray(w, float)], axis=1)
@@ -208,6 +266,14 @@ class ImplicitModel:
             document["shift"] = self.shift.document()
         if self.centre is not None:
             document["centre"] = self.centre.document()
+        if self.y:
+            document |= {
+                "y": [signal.document() for signal in self.y],
+                "u": [signal.document() for signal in self.u],
+                "window": [list(entry) for entry in self.window],
+                "training": self.training,
+                "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            }
         return document
 
     @classmethod
@@ -240,7 +306,28 @@ class ImplicitModel:
             states=tuple(states),
             inputs=tuple(inputs),
             centre=part("centre", n_v, n_v) if "centre" in document else None,
+            **(_recorded(document, source) if "y" in document else {}),
         )
+
+
+def _recorded(document: Json, source: str) -> dict[str, Any]:
+    """The members of a model of recorded signals."""
+    signals = {key: _json.member(document, key, list, source=source) for key in ("y", "u")}
+    window = _json.array(document, "window", (None, 2), source=source)
+    if (
+        not all(isinstance(s, dict) for part in signals.values() for s in part)
+        or (window % 1.0).any()
+    ):
+        raise DocumentError(f"{source}: 'y', 'u' should hold objects, 'window' integers")
+    bags = _json.member(document, "bags", list, source=source)
+    return {
+        key: tuple(Signal.from_document(s, source=source) for s in part)
+        for key, part in signals.items()
+    } | {
+        "window": tuple((int(i), int(d)) for i, d in window),
+        "training": _json.member(document, "training", str, source=source),
+        "bags": tuple(_json.named_digests(bags, source=source)),
+    }
 
 
 def _nothing(variables: int) -> Polynomials:

@@ -1,0 +1,296 @@
+"""`ImplicitClass`: implicit models of recorded signals, and a dataset as rows of their equation.
+
+    e(y(t)) = f(x(t), w(t)),   x = [y(t-1); …; y(t-n)],   w stacks delayed inputs
+Signals are scaled to zero mean and unit spread, undone once in `ImplicitRows.model`. The equation
+errors of all samples enter the searches by the triangular factor of their monomials alone, so a
+search costs the same for any number of samples.
+Source: thesis (2.4), (2.7).
+"""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.certificate.implicit import SETS, Names
+from nlsid_core.errors import DataError
+from nlsid_core.identification.signal_scale import refuse_poor, signal_scale
+from nlsid_core.models import ImplicitModel, Signal
+from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.polynomial import Polynomial, monomials, variables
+from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.trajectory import Dataset
+
+DELAYED = ("2.10", "2.11")  # the sets for more than one lag; the others have no known structure ã
+FARTHEST = 0.01  # weight of the outputs before the newest in the error that is bounded
+Box = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class ImplicitClass:
+    """Which models, and the set of stable ones to search.
+
+    lags: n; delays: of the inputs in w (None: 0 … n). Measured states, x⁺ one sample ahead, are
+    lags 1 and delays (1,). set: of thesis Chapter 2, "2.10" to "2.13", "2.19" for linear models;
+    more than one lag needs "2.10" or "2.11". left_degree: of e, odd; right_degree: of f in x;
+    input_degree: of f in w, which is added, or with `coupled` multiplied to total degree
+    right_degree. box: (low, high) of every output, then every input, for stability on it; None:
+    everywhere. storage_degree: of the storage's metric in "2.10".
+    Raises DataError for a combination no model can satisfy.
+    """
+
+    lags: int = 1
+    delays: tuple[int, ...] | None = None
+    set: str = "2.11"
+    left_degree: int = 3
+    right_degree: int = 1
+    input_degree: int = 1
+    coupled: bool = False
+    box: Box | None = None
+    storage_degree: int = 0
+    kind: ClassVar[type[ImplicitModel]] = ImplicitModel
+
+    def __post_init__(self) -> None:
+        if self.set not in SETS:
+            raise DataError(f"set '{self.set}' is unknown; there are: {', '.join(SETS)}")
+        if self.lags < 1 or any(d < 0 for d in self.delays or ()):
+            raise DataError(f"lags {self.lags} should be at least 1, delays {self.delays} not < 0")
+        if self.lags > 1 and self.set not in DELAYED:
+            raise DataError(f"set {self.set} is for 1 lag; {' and '.join(DELAYED)} are for more")
+        if self.left_degree < 1 or self.left_degree % 2 == 0:
+            raise DataError(f"left_degree {self.left_degree} should be odd: e is increasing")
+        if self.right_degree < 1 or self.input_degree < 1 or self.storage_degree < 0:
+            raise DataError("right_degree and input_degree should be at least 1, storage_degree 0")
+        if self.storage_degree and self.set != "2.10":
+            raise DataError(f"storage_degree is for set 2.10, not {self.set}")
+        if self.set == "2.19" and (self.left_degree, self.right_degree, self.box) != (1, 1, None):
+            raise DataError("set 2.19 is linear: left_degree 1, right_degree 1, no box")
+        if self.box is None:
+            self._refuse_growth()
+        elif any(not low < high for low, high in self.box):
+            raise DataError(f"the box {self.box} should hold (low, high) with low < high")
+
+    def _refuse_growth(self) -> None:
+        """Without a box f must not grow faster than the set allows."""
+        if self.coupled:
+            raise DataError("a product of states and inputs is stable on a box only: give one")
+        if self.storage_degree >= self.left_degree:
+            raise DataError(
+                f"storage_degree {self.storage_degree} needs left_degree "
+                f"{self.storage_degree + 1} or a box, not {self.left_degree}"
+            )
+        if self.right_degree == 1:
+            return
+        growth = 2 * (self.right_degree - 1)  # of |f - f̂|² for one gap
+        what, where = f"right_degree {self.right_degree} needs", f"a box in set {self.set}"
+        if self.set == "2.11":
+            raise DataError(f"{what} {where}")
+        if self.left_degree < growth + 1:
+            raise DataError(f"{what} left_degree {growth + 1} or {where}, not {self.left_degree}")
+        if self.set == "2.10" and self.storage_degree < growth:
+            raise DataError(f"{what} storage_degree {growth} or {where}, not {self.storage_degree}")
+
+    def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
+        """(input, delay) of each entry of w."""
+        delays = tuple(range(self.lags + 1)) if self.delays is None else self.delays
+        return tuple((i, d) for d in delays for i in range(inputs))
+
+    def right(self, states: int, inputs: int) -> IntArray:
+        """(m, states + inputs) exponents of f, the constant among them."""
+        if self.coupled:
+            return monomials(states + inputs, range(self.right_degree + 1))
+        of_x = monomials(states, range(self.right_degree + 1))
+        of_w = monomials(inputs, range(1, self.input_degree + 1))
+        return np.vstack([
+            np.hstack([of_x, np.zeros((len(of_x), inputs), dtype=np.int64)]),
+            np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
+        ])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitRows:
+    """The scaled rows. R: triangular factor of the monomials [φ_e(y(t)), φ_f(x, w)], over √N.
+
+    left, right: their exponents. y_scale, u_scale: (mean, spread) of the signals.
+    """
+
+    R: FloatArray
+    left: IntArray
+    right: IntArray
+    y_scale: tuple[FloatArray, FloatArray]
+    u_scale: tuple[FloatArray, FloatArray]
+    model_class: ImplicitClass
+    dataset: Dataset
+
+    @property
+    def names(self) -> Names:
+        """The variables v, x, w."""
+        n_v, m = len(self.y_scale[0]), self.right.shape[1] - self.states
+        return Names(*(tuple(f"{c}{i}" for i in range(k))
+                       for c, k in (("v", n_v), ("x", self.states), ("w", m))))  # fmt: skip
+
+    @property
+    def states(self) -> int:
+        """The number of states."""
+        return len(self.y_scale[0]) * self.model_class.lags
+
+    @property
+    def weight(self) -> FloatArray:
+        """(n, n) Q: |x - x̂|²_Q, the newest outputs' squared errors in units of their spread."""
+        n_v = len(self.y_scale[0])
+        return np.diag(np.where(np.arange(self.states) < n_v, 1.0, FARTHEST))
+
+    @property
+    def units(self) -> tuple[FloatArray, FloatArray]:
+        """(mean, spread) of every entry of [x; w]."""
+        window = self.model_class.window(len(self.u_scale[0]))
+        of_u = [i for i, _ in window]
+        lags = self.model_class.lags
+        mean, spread = (
+            np.concatenate([np.tile(y, lags), u[of_u]])
+            for y, u in zip(self.y_scale, self.u_scale, strict=True)
+        )
+        return mean, spread
+
+    @property
+    def ends(self) -> list[tuple[float, float]]:
+        """The box of every state and input, in the signals' units; empty: everywhere."""
+        box, n_v = self.model_class.box, len(self.y_scale[0])
+        if box is None:
+            return []
+        if len(box) != n_v + len(self.u_scale[0]):
+            raise DataError(
+                f"the box has {len(box)} intervals for {n_v} outputs and "
+                f"{len(self.u_scale[0])} inputs"
+            )
+        of_u = [i for i, _ in self.model_class.window(len(self.u_scale[0]))]
+        return [*(list(box[:n_v]) * self.model_class.lags), *(box[n_v + i] for i in of_u)]
+
+    def model(self, e: FloatArray, f: FloatArray, monotonicity: float) -> ImplicitModel:
+        """e(v) = f(x, w) in the signals' units, of scaled e (m_e, n_v), f (m_f, n_v).
+
+        monotonicity: of the scaled e, and of the model: both sides are multiplied by the square of
+        the largest spread, so that every condition on the scaled model holds with the same δ.
+        """
+        largest = float(np.max(self.y_scale[1]))
+        n_v, n, names = len(self.y_scale[0]), self.states, self.names
+        mean, spread = self.units
+        mean, spread = (np.concatenate([part[:n_v], part]) for part in (mean, spread))
+        everything = (*names.v, *names.x, *names.w)
+        exponents = np.vstack([
+            np.hstack([self.left, np.zeros((len(self.left), n + len(names.w)), dtype=np.int64)]),
+            np.hstack([np.zeros((len(self.right), n_v), dtype=np.int64), self.right]),
+        ])  # fmt: skip
+        scaled = {
+            name: (x - float(m)) / float(s)
+            for name, x, m, s in zip(everything, variables(everything), mean, spread, strict=True)
+        }
+        parts = []
+        for i, column in enumerate(np.concatenate([e, -f]).T):
+            p = Polynomial(exponents, column, everything)
+            used = np.asarray(p.exponents.any(axis=0)).tolist()
+            inside = {k: v for (k, v), occurs in zip(scaled.items(), used, strict=True) if occurs}
+            weight = largest**2 / float(self.y_scale[1][i])
+            parts.append((p.substitute(inside) * weight).over(everything))
+        h = _stacked(parts)
+        if self.model_class.set == "2.19":
+            h = _with_symmetric_left(h, n_v)
+        first, window = self.dataset.trajectories[0], self.model_class.window(len(self.u_scale[0]))
+        lags = range(1, self.model_class.lags + 1)
+        model = ImplicitModel(
+            h=h,
+            shift=_shift(n - n_v, n + len(names.w)),
+            monotonicity=monotonicity,
+            period=self.dataset.period,
+            states=tuple(f"{name}(t-{k})" for k in lags for name in first.y_names),
+            inputs=tuple(
+                f"{first.u_names[i]}(t-{d})" if d else f"{first.u_names[i]}(t)" for i, d in window
+            ),
+        )
+        return with_signals(model, self.dataset, window)
+
+
+def build_implicit_rows(dataset: Dataset, model_class: ImplicitClass) -> ImplicitRows:
+    """The rows t = h … of every trial. Raises DataError on too little or too poor data."""
+    y_scale, u_scale = (
+        signal_scale(np.concatenate([getattr(trial, letter) for trial in dataset]), role)
+        for letter, role in (("y", "response"), ("u", "excitation"))
+    )
+    n_v, window = len(y_scale[0]), model_class.window(len(u_scale[0]))
+    n = n_v * model_class.lags
+    history = max(model_class.lags, *(d for _, d in window))
+    left = monomials(n_v, range(1, model_class.left_degree + 1))
+    right = model_class.right(n, len(window))
+    rows = []
+    for trial in dataset:
+        N = len(trial)
+        if history >= N:
+            raise DataError(f"{trial.name}: {N} samples, a history of {history} needs more")
+        y, u = (trial.y - y_scale[0]) / y_scale[1], (trial.u - u_scale[0]) / u_scale[1]
+        past = [y[history - k : N - k] for k in range(1, model_class.lags + 1)]
+        known = np.hstack([*past, *(u[history - d : N - d, [i]] for i, d in window)])
+        rows.append(np.hstack([monomial_values(left, y[history:]), monomial_values(right, known)]))
+    stacked = np.concatenate(rows)
+    refuse_poor(stacked[:, len(left) :])
+    R = np.linalg.qr(stacked, mode="r") / np.sqrt(len(stacked))
+    made = ImplicitRows(R, left, right, y_scale, u_scale, model_class, dataset)
+    _refuse_data_outside(made)
+    return made
+
+
+def with_signals(
+    model: ImplicitModel, dataset: Dataset, window: tuple[tuple[int, int], ...]
+) -> ImplicitModel:
+    """The model with the signals and recordings it was made from."""
+    first = dataset.trajectories[0]
+    y, u = (
+        tuple(Signal(*labels) for labels in zip(names, units, paths, strict=True))
+        for names, units, paths in (
+            (first.y_names, first.y_units, first.y_paths),
+            (first.u_names, first.u_units, first.u_paths),
+        )
+    )
+    bags = tuple((trial.name, trial.digest) for trial in dataset)
+    return replace(model, y=y, u=u, window=window, bags=bags)
+
+
+def _refuse_data_outside(rows: ImplicitRows) -> None:
+    """The equation error of a sample outside the box is bounded by nothing."""
+    n_v = len(rows.y_scale[0])
+    if not rows.ends:
+        return
+    for i, (low, high) in enumerate(rows.model_class.box or ()):
+        letter, j, names = ("y", i, "y_names") if i < n_v else ("u", i - n_v, "u_names")
+        for trial in rows.dataset:
+            values = getattr(trial, letter)[:, j]
+            if values.min() < low or values.max() > high:
+                raise DataError(
+                    f"{trial.name}: {getattr(trial, names)[j]} reaches "
+                    f"[{values.min():g}, {values.max():g}], outside the box [{low:g}, {high:g}]"
+                )
+
+
+def _shift(size: int, variables_: int) -> Polynomials:
+    """ã(x, w): the first `size` states."""
+    return Polynomials(np.eye(variables_, dtype=np.int64)[:size], np.eye(size))
+
+
+def _stacked(parts: list[Polynomial]) -> Polynomials:
+    """Polynomials in the same variables on common exponents."""
+    rows = np.vstack([p.exponents for p in parts])
+    exponents, place = np.unique(rows, axis=0, return_inverse=True)
+    column = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+    coefficients = np.zeros((len(exponents), len(parts)))
+    values = np.concatenate([p.coefficients for p in parts]).astype(np.float64)
+    np.add.at(coefficients, (place.ravel(), column), values)
+    return Polynomials(exponents, coefficients)
+
+
+def _with_symmetric_left(h: Polynomials, n_v: int) -> Polynomials:
+    """E = E' to the last digit."""
+    rows = [int(np.flatnonzero((h.exponents == unit).all(axis=1))[0])
+            for unit in np.eye(h.exponents.shape[1], dtype=np.int64)[:n_v]]  # fmt: skip
+    coefficients = h.coefficients.copy()
+    coefficients[rows] = (coefficients[rows] + coefficients[rows].T) / 2.0
+    return replace(h, coefficients=coefficients)

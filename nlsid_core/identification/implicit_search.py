@@ -1,0 +1,274 @@
+"""Robust identification error of implicit models, with a stable set of thesis Chapter 2.
+
+In signals of unit spread, with ε = e(ỹ(t)) - f(x̃, w̃) the equation error of a sample, the search is
+    minimise (1/N) Σ |ε|²_{S⁻¹}   over e, f, the set's storage and S ≻ 0,
+the set's inequality keeping |x - x̂|²_Q in place of δ|x - x̂|², and S:
+    2.10, 2.11        … - |x - x̂|²_Q ≥ |v - v̂|²_S
+    2.12, 2.13, 2.19  P - S (E - S) in place of the block P (E)
+Each term bounds the robust identification error of its sample, (2.28):
+    2.10, 2.11: -|ν|²_S - 2ν'ε ≤ |ε|²_{S⁻¹};  else: |a + ε|²_{P⁻¹} ≤ |a|²_{(P-S)⁻¹} + |ε|²_{S⁻¹}.
+With linear models it is equal to it (Claim 2.18: a weighted equation error). S is one for all
+samples, so what the data say is the triangular factor of their monomials, however many there are.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core._types import FloatArray
+from nlsid_core.certificate import conditions
+from nlsid_core.certificate.conditions import GAP, Inequality
+from nlsid_core.certificate.implicit import Names
+from nlsid_core.errors import Infeasible
+from nlsid_core.identification.implicit import ImplicitProof, prove_implicit, storage_template
+from nlsid_core.identification.implicit_class import DELAYED, FARTHEST, ImplicitRows
+from nlsid_core.identification.stable_sets import constraint
+from nlsid_core.models import ImplicitModel
+from nlsid_core.polynomial import Polynomial, variables
+from nlsid_core.polynomial.algebra import as_polynomial
+from nlsid_core.sos import (
+    NonNegative,
+    NormBound,
+    Program,
+    Solution,
+    forms_of,
+    matrix_sum_of_squares,
+    solve,
+    symmetric_template,
+    template,
+)
+from nlsid_core.sos.program import Constraint
+
+ROOM = 0.01  # of the least bound, given back to step from the boundary into the interior
+NOISE_FREE = 1e-8  # the same where the bound is zero: 0.01 % of the spread
+HALF = 0.5  # of what the search keeps: what is left for the exact proof
+SMALL_DELTA = 1e-3  # δ that is tried for a model no set was kept for, e being 1-monotone
+
+Objects = NDArray[np.object_]
+
+
+@dataclass(frozen=True, eq=False)
+class ImplicitFit:
+    """The model, its exact proof, and the bound: the mean of |x - x̂|²_Q, in squared spreads."""
+
+    model: ImplicitModel
+    proof: ImplicitProof
+    bound: float
+
+
+def minimise_implicit_rie(rows: ImplicitRows) -> ImplicitFit:
+    """The stable model with the least bound on its simulation error, and its proof.
+
+    Raises Infeasible if there is none in the set or it has no exact proof, SolverError as the
+    solver does.
+    """
+    n_v, names = len(rows.y_scale[0]), rows.names
+    e, f = _unknowns(rows)
+    S = symmetric_template("S", n_v)
+    parts = _conditions(rows, e, f, S)
+    found, bound = _interior([*parts, *_weighted(rows, S)], names)
+    lowest = float(np.linalg.eigvalsh(_values(found, S))[0])
+    model = rows.model(*_coefficients(found, rows), HALF * lowest / 2.0)
+    delta = HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0)
+    proof = _proved(model, rows, delta)
+    if proof is None:
+        raise Infeasible(
+            f"no exact proof in set {rows.model_class.set} for the minimiser; try lower degrees, "
+            "a box, or more data"
+        )
+    return ImplicitFit(model, proof, bound)
+
+
+def implicit_equation_error(rows: ImplicitRows) -> ImplicitModel:
+    """Least squares on the equation error with a 1-monotone e: well posed, perhaps unstable."""
+    e, _ = _unknowns(rows)
+    one = np.eye(len(e), dtype=np.int64).astype(object)
+    entries, bound = _residual(rows), variables("bound")[0]
+    parts = [_monotone(e, one, rows.names), NormBound(tuple(entries.ravel()), bound)]
+    found, _ = _interior(parts, rows.names)
+    return rows.model(*_coefficients(found, rows), HALF / 2.0)
+
+
+def prove_in_set(model: ImplicitModel, rows: ImplicitRows) -> ImplicitProof | None:
+    """A proof that a model of these rows is in their class's set, if the search finds one."""
+    return _proved(model, rows, SMALL_DELTA)
+
+
+def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitProof | None:
+    made, mean, spread = rows.model_class, *rows.units
+    n_v = len(rows.y_scale[0])
+    sizes = np.abs(mean) + spread
+    known = (*rows.names.x, *rows.names.w)
+    scale = dict(zip((*rows.names.v, *known), (*sizes[:n_v], *sizes), strict=True))
+    gaps = dict(zip((*rows.names.v, *known), (*spread[:n_v], *spread), strict=True))
+    scale |= {name + GAP: gaps[name] for name in (*rows.names.v, *rows.names.x)}
+    return prove_implicit(
+        model, delta=delta, set=made.set, ends=rows.ends,
+        storage_degree=made.storage_degree, scale=scale,
+    )  # fmt: skip
+
+
+def _unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
+    """e in v and f in (x, w), a decision at every coefficient."""
+    names = rows.names
+    known = (*names.x, *names.w)
+    e, f = (np.empty(len(rows.y_scale[0]), dtype=object) for _ in range(2))
+    symmetric = symmetric_template("E", len(e)) if rows.model_class.set == "2.19" else None
+    for i in range(len(e)):
+        if symmetric is None:
+            e[i] = template(f"e{i}", rows.left, names.v)
+        else:
+            e[i] = sum(entry * v for entry, v in zip(symmetric[i], variables(names.v), strict=True))
+        f[i] = template(f"f{i}", rows.right, known)
+    return e, f
+
+
+def _conditions(rows: ImplicitRows, e: Objects, f: Objects, S: Objects) -> list[Constraint]:
+    """The set's inequalities with Q and S kept, and e monotone wherever v is."""
+    names, made, Q = rows.names, rows.model_class, rows.weight
+    domain = _domain(rows, (*names.x, *names.w))
+    of_set: list[Inequality] = []
+    if made.set in DELAYED:
+        storage = storage_template(made.set, names, made.storage_degree)
+        h, n_v = e - f, len(e)
+        shift = np.array(variables(names.x)[: len(names.x) - n_v], dtype=object)
+        inside = domain + _domain(rows, names.v)
+        if made.set == "2.10":
+            assert isinstance(storage, Polynomial)
+            kept = _form(S, names.gaps(names.v)) + _form(Q, names.gaps(names.x))
+            part = conditions.implicit_increments(
+                h, shift, storage, names.v, names.x, delta=0, domain=inside
+            )
+            of_set = [
+                _minus(part, [[kept]]),
+                conditions.storage(storage, names.x, domain=_domain(rows, names.x)),
+            ]
+        else:
+            assert isinstance(storage, np.ndarray)
+            part = conditions.implicit_derivatives(
+                h, shift, storage, names.v, names.x, delta=0, domain=inside
+            )
+            of_set = [_minus(part, _diagonal(S, Q)), Inequality(storage)]
+    else:
+        e_of_x = np.array([_renamed(p, names) for p in e], dtype=object)
+        if made.set == "2.19":
+            E, F = (
+                np.array([[p.derivative(x) for x in names.x] for p in part], dtype=object)
+                for part in (e_of_x, f)
+            )
+            part = conditions.linear(E, F, 0)
+        else:
+            P = storage_template(made.set, names, 0)
+            assert isinstance(P, np.ndarray)
+            of = conditions.increments if made.set == "2.12" else conditions.derivatives
+            part = of(e_of_x, f, P, names.x, delta=0, domain=domain)
+        corner = Q
+        if made.set == "2.12":
+            corner = np.array([[_form(Q, names.gaps(names.x))]], dtype=object)
+        of_set = [_minus(part, _diagonal(corner, S))]
+    found: list[Constraint] = [
+        constraint(part.relevant(), name=f"set {made.set}, {k}") for k, part in enumerate(of_set)
+    ]
+    return [*found, _monotone(e, S, names)]
+
+
+def _monotone(e: Objects, S: Objects, names: Names) -> Constraint:
+    """∂e/∂v + (∂e/∂v)' - S ⪰ 0, for every v."""
+    part = conditions.monotone(e, names.v, 0)
+    return constraint(_minus(part, S), name="monotone")
+
+
+def _weighted(rows: ImplicitRows, S: Objects) -> list[Constraint]:
+    """(1/N) Σ |ε|²_{S⁻¹} ≤ bound: [t_j, r_j'; r_j, S] ⪰ 0 and Σ t_j ≤ bound, r = R [e; -f]."""
+    residual, (bound,) = _residual(rows), variables("bound")
+    if len(S) == 1:
+        s = S[0, 0]
+        return [NormBound((*(2.0 * residual[:, 0]), bound - s), bound + s)]
+    t = variables([f"t[{j}]" for j in range(len(residual))])
+    blocks: list[Constraint] = [NonNegative(bound - sum(t))]
+    for j, row in enumerate(residual):
+        matrix = np.empty((len(S) + 1,) * 2, dtype=object)
+        matrix[0, 0], matrix[1:, 1:] = t[j], S
+        matrix[0, 1:] = matrix[1:, 0] = row
+        blocks.append(matrix_sum_of_squares(matrix))
+    return blocks
+
+
+def _residual(rows: ImplicitRows) -> Objects:
+    """(p, n_v): R times the coefficients of [e; -f], affine in the decisions."""
+    columns, n_v = [], len(rows.y_scale[0])
+    for i in range(n_v):
+        right = [-c for c in variables([f"f{i}[{k}]" for k in range(len(rows.right))])]
+        columns.append([*_left_coefficients(rows, i, n_v), *right])
+    return np.asarray(rows.R @ np.array(columns, dtype=object).T)
+
+
+def _left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+    if rows.model_class.set != "2.19":
+        return list(variables([f"e{i}[{k}]" for k in range(len(rows.left))]))
+    E = symmetric_template("E", n_v)
+    return [E[i, int(np.argmax(unit))] for unit in rows.left]
+
+
+def _interior(constraints: list[Constraint], names: Names) -> tuple[Solution, float]:
+    """A point well inside the constraints whose bound is near the least, and its bound."""
+    (bound,) = variables("bound")
+    size = max(len(names.x) + max(len(names.x), len(names.v)), len(names.v)) + 1
+    indeterminates = (*names.all, *forms_of(size))
+    best = solve(Program(indeterminates, tuple(constraints), minimise=bound)).objective
+    allowed = max(best, 0.0) * (1.0 + ROOM) + NOISE_FREE
+    inside = NonNegative(allowed - bound)
+    found = solve(Program(indeterminates, (*constraints, inside)))
+    return found, float(found.values["bound"])
+
+
+def _coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:
+    """e (m_e, n_v) and f (m_f, n_v)."""
+    n_v = len(rows.y_scale[0])
+    e = [[float(found.value(p)) for p in _left_coefficients(rows, i, n_v)] for i in range(n_v)]
+    f = [[found.values[f"f{i}[{k}]"] for k in range(len(rows.right))] for i in range(n_v)]
+    return np.array(e).T, np.array(f).T
+
+
+def _values(found: Solution, matrix: Objects) -> FloatArray:
+    return np.array([[float(found.value(entry)) for entry in row] for row in matrix])
+
+
+def _domain(rows: ImplicitRows, names: tuple[str, ...]) -> conditions.Domain:
+    """The box in scaled variables."""
+    if not rows.ends:
+        return ()
+    mean, spread = rows.units
+    known = (*rows.names.x, *rows.names.w)
+    at = {name: j for j, name in enumerate(known)} | {
+        name: j for j, name in enumerate(rows.names.v)
+    }
+    ends = [
+        tuple(((np.array(rows.ends[at[name]]) - mean[at[name]]) / spread[at[name]]).tolist())
+        for name in names
+    ]
+    return conditions.box(names, ends)
+
+
+def _renamed(p: Polynomial, names: Names) -> Polynomial:
+    """The same polynomial of the present state."""
+    new = dict(zip(names.v, names.x, strict=True))
+    return Polynomial(p.exponents, p.coefficients, tuple(new.get(name, name) for name in p.names))
+
+
+def _form(matrix: FloatArray | Objects, names: tuple[str, ...]) -> Polynomial:
+    y = np.array(variables(names), dtype=object)
+    return as_polynomial(y @ matrix @ y)
+
+
+def _diagonal(first: FloatArray | Objects, second: FloatArray | Objects) -> Objects:
+    a = len(first)
+    both = np.zeros((a + len(second),) * 2).astype(object)
+    both[:a, :a], both[a:, a:] = first, second
+    return both
+
+
+def _minus(part: Inequality, kept: Objects | list[list[Polynomial]]) -> Inequality:
+    matrix = part.matrix - np.array(kept, dtype=object)
+    return replace(part, matrix=conditions.filled(matrix))
