@@ -131,6 +131,12 @@ def _funnel(bags: list[Path], design: Path, config: TrackingConfig) -> None:
     with progress_bar("designing") as progress:
         made = tracking_steps.design_tracking_funnel(design, bags, config, progress=progress)
     out.print(_funnel_table(made))
+    a = made.funnel.assumption
+    out.print(
+        f"assumed: the disturbance's {a.form} is at most {a.bound:.4g}, {a.safety_factor:g} times "
+        f"the largest of {len(a.measured_on)} runs; the monitor watches it",
+        soft_wrap=True,
+    )
     _wrote(design, documents.FUNNEL, documents.FUNNEL_PROOF, picture=documents.FUNNEL_PLOT)
 
 
@@ -143,7 +149,7 @@ def _wrote(folder: Path, *names: str, picture: str) -> None:
 def _monitor(bags: list[Path], funnel: Path, config: TrackingConfig) -> bool:
     proved = documents.load_proved_tracking(funnel)
     table = Table(title="runs against the funnel", title_justify="left")
-    for column in ("run", "verdict", "least margin", "disturbance / bound", "end", "why"):
+    for column in ("run", "verdict", "least margin", "most disturbance / bound", "end", "why"):
         table.add_column(column)
     inside, every = 0, []
     for bag in bags:
