@@ -70,7 +70,7 @@ class TrackingReading:
     `tube`; `inlet` if the state left the tube but can still reach the goal; `goal` at the end.
     time_to_exit: s until the margin is zero if it goes on falling as it did (no proof); infinite if
     it does not fall. worst_axis: the state furthest out relative to the tube. reason: why the
-    status is not inside.
+    status is not inside. deviation: x̂ - x_k, each state in its unit; empty if unknown.
     """
 
     t: float
@@ -81,6 +81,7 @@ class TrackingReading:
     time_to_exit: float = math.nan
     worst_axis: str = ""
     reason: str = ""
+    deviation: tuple[float, ...] = ()
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -201,6 +201,7 @@ class TrackingMonitor:
             time_to_exit=self._time_to_exit(margin),
             worst_axis=self.model.x[int(np.argmax(np.abs(x_bar) / self._half_widths[k]))].name,
             reason=reason,
+            deviation=tuple(x_bar.tolist()),
         )
 
     def _note_violations(

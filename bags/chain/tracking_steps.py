@@ -16,6 +16,7 @@ from bags.monitoring.designs import TrackingDesign
 from bags.monitoring.documents import Proved
 from bags.monitoring.replay import announced_runs, replay_messages
 from bags.monitoring.watch import WAITING
+from bags.pictures.report import report_available
 from bags.signals.grid import read_dataset
 from nlsid_core import _json
 from nlsid_core._types import FloatArray
@@ -73,7 +74,10 @@ def simulate_excitations(config: TrackingConfig, out: Path) -> list[Path]:
 
 
 def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path) -> StateFit:
-    """Bags in, model.json in `out`. Raises DataError where the data cannot be described."""
+    """Bags in, model.json and free_run.png in `out`; DataError if no class describes the data.
+
+    This picture and those of the other steps are drawn where the extra `report` is installed.
+    """
     data, options = read_states(bags, config), config.identification
     validation = data.select(options.validation)
     fit = identify_states(
@@ -85,11 +89,16 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
         implicit=options.implicit,
     )
     _json.write_document(out / documents.MODEL, fit.model.document())
+    if report_available():
+        from bags.pictures import plots, tracking_plots  # matplotlib only where something is drawn
+
+        drawn = tracking_plots.draw_free_run(fit.model, validation)
+        plots.write_png(out / documents.FREE_RUN_PLOT, drawn)
     return fit
 
 
 def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> TrackingPolicy:
-    """model.json in, policy.json in `out`: a motion within the data and its feedback."""
+    """model.json in, policy.json and motion.png in `out`: a motion in the data's box."""
     model, motion = load_state_model(model_path), config.motion
     if motion.samples is not None:
         x, u = follow_motion(model, _read_samples(motion.samples, model))
@@ -101,6 +110,10 @@ def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> Tracki
         x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
     policy = track(model, x, u, _feedback(model, x, u, config))
     _json.write_document(out / documents.POLICY, policy.document())
+    if report_available():
+        from bags.pictures import plots, tracking_plots
+
+        plots.write_png(out / documents.MOTION_PLOT, tracking_plots.draw_motion(model, policy))
     return policy
 
 
@@ -125,7 +138,7 @@ def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]
 def design_tracking_funnel(
     design: Path, runs: Sequence[Path], config: TrackingConfig, *, progress: Progress
 ) -> FunnelDesign:
-    """model.json, policy.json and commissioning bags in; funnel.json, funnel.proof.json beside.
+    """model.json, policy.json, commissioning bags in; funnel.json, funnel.proof.json, funnel.png.
 
     Raises DataError, Infeasible or CertificateRejected, saying what is in the way.
     """
@@ -133,12 +146,12 @@ def design_tracking_funnel(
     feedback = _feedback(model, policy.x, policy.u, config)
     if not np.array_equal(feedback.K, policy.K):
         raise DataError("policy.json was made with other weights than this configuration's")
-    options = config.disturbance
+    options, recorded = config.disturbance, read_states(runs, config)
     assumption = assume(
         model,
         policy,
         feedback,
-        read_states(runs, config),
+        recorded,
         form=options.form,
         safety_factor=options.safety_factor,
         rate=options.rate,
@@ -149,6 +162,11 @@ def design_tracking_funnel(
     )
     _json.write_document(design / documents.FUNNEL, made.funnel.document())
     _json.write_document(design / documents.FUNNEL_PROOF, proof)
+    if report_available():
+        from bags.pictures import plots, tracking_plots
+
+        drawn = tracking_plots.draw_funnel(model, policy, made.funnel, recorded)
+        plots.write_png(design / documents.FUNNEL_PLOT, drawn)
     return made
 
 

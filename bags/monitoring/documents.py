@@ -21,6 +21,8 @@ FUNNEL = "funnel.json"
 FUNNEL_PROOF = "funnel.proof.json"
 MARGIN_PLOT = "monitor.png"
 FUNNEL_PLOT = "funnel.png"
+FREE_RUN_PLOT = "free_run.png"
+MOTION_PLOT = "motion.png"
 
 
 D = TypeVar("D", bound=Design)

@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, png
-from nlsid_core import _json
+from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, write_png
 from nlsid_core._types import FloatArray
 from nlsid_core.continuous import Funnel
 from nlsid_core.funnels import FunnelDesign, Goal
@@ -22,7 +21,7 @@ DECADE = 10.0  # of margins that differ by more the logarithm is drawn
 
 def write_funnel_picture(path: Path, design: FunnelDesign) -> None:
     """Draw `funnel_picture` into a PNG file."""
-    _json.write_atomically(path, png(funnel_picture(design)))
+    write_png(path, funnel_picture(design))
 
 
 def funnel_picture(design: FunnelDesign) -> Figure:

@@ -2,12 +2,14 @@
 
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bags.monitoring.replay import Replay
+from nlsid_core import _json
 from nlsid_core.monitor import Reading, Status
 
 INK, BLUE, ORANGE, RED, GREY = "#222222", "#1f6fb4", "#d9822b", "#c23b3b", "#9aa0a6"
@@ -27,6 +29,11 @@ def png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     figure.savefig(stream, format="png", dpi=130, bbox_inches="tight")
     return stream.getvalue()
+
+
+def write_png(path: Path, figure: Figure) -> None:
+    """The figure as a PNG file, whole or not at all."""
+    _json.write_atomically(path, png(figure))
 
 
 def margins(replays: Sequence[Replay]) -> Figure:

@@ -57,7 +57,7 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
     """Draw replayed bags in their tubes as a PNG; needs the extra `report`."""
     from bags.pictures import plots
 
-    _json.write_atomically(path, plots.png(plots.margins(replays)))
+    plots.write_png(path, plots.margins(replays))
 
 
 def page(

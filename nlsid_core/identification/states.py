@@ -120,7 +120,7 @@ def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = Fal
     for trial in dataset:
         spread, mean = trial.y.std(axis=0), trial.y.mean(axis=0)
         missed = whole = 0.0
-        for part in _stretches(model, trial) if in_box else [slice(0, len(trial))]:
+        for part in stretches_in_box(model, trial) if in_box else [slice(0, len(trial))]:
             y, u = trial.y[part], trial.u[part]
             with np.errstate(over="ignore", invalid="ignore"):
                 missed += float(np.sum(((y - model.simulate(y[0], u[:-1])) / spread) ** 2))
@@ -130,7 +130,7 @@ def free_run_error(model: MeasuredState, dataset: Dataset, *, in_box: bool = Fal
     return float(max(errors, default=np.inf))
 
 
-def _stretches(model: MeasuredState, trial: Trajectory) -> list[slice]:
+def stretches_in_box(model: MeasuredState, trial: Trajectory) -> list[slice]:
     """Where the trajectory stays in the box of the model's data for SHORTEST samples or more."""
     outside = (trial.y < model.x_range[:, 0]) | (trial.y > model.x_range[:, 1])
     ends = [-1, *np.flatnonzero(outside.any(axis=1)).tolist(), len(trial)]
