@@ -130,7 +130,7 @@ def block_cascade(
 def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[MonotoneEquation]:
     """Monotone equations through moments, of repeated experiments if there are any."""
     offsets = offsets_of(train.trajectories)
-    plain = plain_moments(train.trajectories, model_class, offsets)
+    plain = plain_moments(train.trajectories, model_class, offsets, executor=task.executor)
     template = train.trajectories[0]
     refuse_unexcited(plain, model_class, template, offsets)
     trail: Trail[MonotoneEquation] = Trail(
