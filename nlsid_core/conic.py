@@ -28,6 +28,7 @@ ACCEPTED_RESIDUAL = 1e-5
 # Clarabel's own default; tighter stalls on problems whose optimum is not strictly feasible.
 TOLERANCE = 1e-8
 MAX_ITERATIONS = 200
+PANIC = "PanicException"  # how PyO3 raises a panic of Clarabel, say of an eigenvalue of NaN
 # SCS is a first-order method: asked for more digits it does not return in useful time.
 SCS_TOLERANCE = 1e-7
 SQRT2 = float(np.sqrt(2.0))
@@ -213,7 +214,12 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
     solver = clarabel.DefaultSolver(
         sp.triu(program.P, format="csc"), program.q, program.A, program.b, cones, settings
     )
-    solution = solver.solve()
+    try:
+        solution = solver.solve()
+    except BaseException as panic:  # of the Rust library: no Exception, and of a class not exported
+        if type(panic).__name__ != PANIC:
+            raise
+        return _Outcome("panicked")
     status = str(solution.status)
     if status.startswith("Almost") and "Infeasible" in status:
         return _Outcome("stalled")  # no proof of infeasibility: a later rung decides

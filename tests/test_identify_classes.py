@@ -75,7 +75,10 @@ def test_every_class_has_its_methods_and_together_they_are_all() -> None:
     classes = (LinearClass(2), StateAffineClass(2), CASCADE, MonotoneClass(2))
     assert {m for c in classes for m in methods_of(c)} == set(METHODS)
     assert methods_of(StateAffineClass(2, lagged_degree=1))[0] == "rse"
-    assert "rse_certified" not in methods_of(StateAffineClass(2, leading_degree=3))
+    for degrees in ((0, 1), (1, 1), (2, 0)):
+        assert "rse_certified" in methods_of(StateAffineClass(2, None, *degrees))
+    for degrees in ((3, 0), (2, 1), (0, 2)):
+        assert "rse_certified" not in methods_of(StateAffineClass(2, None, *degrees))
     with pytest.raises(DataError, match="is no model class; there are: LinearClass"):
         methods_of("linear")
 

@@ -55,6 +55,7 @@ from nlsid_core.trajectory import Dataset
 
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
+CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: corners decide
 
 
 def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
@@ -216,10 +217,10 @@ def methods_of(model_class: object) -> tuple[str, ...]:
         names = ", ".join(known.__name__ for known in OFFERS)
         raise DataError(f"{model_class!r} is no model class; there are: {names}")
     refused: set[str] = set()
-    if isinstance(model_class, StateAffineClass) and (
-        model_class.lagged_degree or model_class.leading_degree > CERTIFIABLE_DEGREE
-    ):
-        refused = {"rse_certified", "sem_certified"}
+    if isinstance(model_class, StateAffineClass):
+        most = CERTIFIABLE_AFFINE if model_class.lagged_degree else CERTIFIABLE_DEGREE
+        if max(model_class.lagged_degree, model_class.leading_degree) > most:
+            refused = {"rse_certified", "sem_certified"}
     return tuple(method for method in offer.methods if method not in refused)
 
 
