@@ -11,7 +11,7 @@ from nlsid_core.certificate import check
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.contraction import prove_state_affine
 from nlsid_core.identification.matrix_proof import sampled_radius
-from nlsid_core.identification.matrix_set import SLOWEST_RATE, MatrixSet
+from nlsid_core.identification.matrix_set import MatrixSet, slowest_rate
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.state_affine import StateAffineClass, StateAffineRows
@@ -84,6 +84,10 @@ def test_the_last_step_keeps_the_proof_and_lowers_the_error(
     assert "every input" in checked(found, tmp_path)
     objective = SimulationError(stacked.rows)
     assert objective.at(left(found)).J < 0.999 * objective.at(left(model)).J
+    proof = prove_state_affine(found)
+    assert proof is not None
+    again = descend_certified(stacked, found, proof)
+    assert objective.at(left(again)).J <= objective.at(left(found)).J
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -103,7 +107,7 @@ def test_models_in_the_set_contract_and_unstable_ones_are_outside(
         A = states(stacked.model(moved, iterate.point.p), w)
         if smallest(inside, moved, inside.extra) > 0:
             found += 1
-            decrease = SLOWEST_RATE**2 * inside.P - A.transpose(0, 2, 1) @ inside.P @ A
+            decrease = slowest_rate(stacked) ** 2 * inside.P - A.transpose(0, 2, 1) @ inside.P @ A
             assert np.linalg.eigvalsh(decrease).min() > 0
     assert 5 < found < 40
     unstable = theta.copy()

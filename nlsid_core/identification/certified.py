@@ -73,8 +73,10 @@ def descend_certified(
     theta = _left_parameters(model)
     J = objective.at(theta).J
     for _ in range(RENEWALS):
-        descent = Descent(objective, inside.inequalities(), len(theta))
-        found = descent.path(np.concatenate([theta, inside.extra]))
+        inequalities, z = inside.inequalities(), np.concatenate([theta, inside.extra])
+        if not np.isfinite(sum(part.barrier(z) for part in inequalities)):
+            break  # proved at a rate slower than the set's
+        found = Descent(objective, inequalities, len(theta)).path(z)
         if found.point.J >= J * (1.0 - STOP):
             break
         theta, J = found.point.theta, found.point.J

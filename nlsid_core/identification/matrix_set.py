@@ -24,13 +24,15 @@ from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values
 
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
+SLOWEST_IN_BOX = 1.0 - 1e-3  # the same where w matters: the search for a proof needs more room
+GROWTH = 4.0  # of G_0 from one iterate to the next, at most, as its multiplier weighs it
 MOST_CORNERS = 256  # of the input box, an inequality for each
 LARGEST_MULTIPLIER = 100.0  # of the mean eigenvalue of P: where nothing else bounds M
 
 
 @dataclass(frozen=True, eq=False)
 class MatrixSet:
-    """The set around P (n n_y, n n_y) and M (n_y, (n + 1) n_y). Unknowns [θ; entries of P].
+    """The set around θ with P (n n_y, n n_y), M (n_y, (n + 1) n_y). Unknowns [θ; entries of P].
 
     Raises ShapeError unless the coefficients are of degree 1 at most, in few inputs.
     """
@@ -38,6 +40,7 @@ class MatrixSet:
     problem: StateAffineRows
     P: FloatArray
     M: FloatArray
+    theta: FloatArray
 
     def __post_init__(self) -> None:
         if any((g.sum(axis=1) > 1).any() for g in self.problem.left):
@@ -58,7 +61,7 @@ class MatrixSet:
         """The set around G = I."""
         n, n_y = len(problem.left) - 1, len(problem.y_scale[0])
         P = np.kron(np.diag(0.5 ** np.arange(n)), np.eye(n_y))
-        return cls(problem, P, np.eye(n_y, (n + 1) * n_y))
+        return cls(problem, P, np.eye(n_y, (n + 1) * n_y), problem.rows.identity)
 
     @classmethod
     def of_proof(
@@ -67,13 +70,15 @@ class MatrixSet:
         model: StateAffineModel,
         proof: StateAffineProof | MatrixProof,
     ) -> "MatrixSet":
-        """A set that the model with its proof is strictly inside of."""
+        """A set that the model is strictly inside of, if its proved rate is below the set's."""
         n_y, P = len(problem.y_scale[0]), proof.P
+        theta = np.concatenate([g.coefficients.ravel() for g in model.G])
         if isinstance(proof, MatrixProof):
-            return cls(problem, P, np.pad(proof.T.T, ((0, 0), (0, len(P)))))
+            return cls(problem, P, np.pad(proof.T.T, ((0, 0), (0, len(P)))), theta)
         lead = model.G[0].coefficients[0]
         # Completes the square: what is left is r²P - A'PA and P₁₁ on the equation's residual.
-        return cls(problem, P, np.linalg.solve(lead.T, np.pad(P[:n_y], ((0, 0), (0, n_y)))))
+        M = np.linalg.solve(lead.T, np.pad(P[:n_y], ((0, 0), (0, n_y))))
+        return cls(problem, P, M, theta)
 
     @property
     def extra(self) -> FloatArray:
@@ -81,7 +86,7 @@ class MatrixSet:
         return self.P[np.triu_indices(len(self.P))]
 
     def inequalities(self) -> tuple[MatrixInequality, ...]:
-        """A decrease at every corner, and P."""
+        """A decrease at every corner, P, and the scale of θ, which the error does not depend on."""
         n_P, size = len(self.extra), len(self.P)
         basis = np.array([_symmetric(entry, size) for entry in np.eye(n_P)])
         corners = _coefficients(self.problem)
@@ -89,10 +94,15 @@ class MatrixSet:
         positive = np.zeros((1 + n_theta + n_P, size, size))
         positive[1 + n_theta :] = basis
         result = [MatrixInequality(positive)]
-        decrease = _decrease(basis, size + len(self.M))
+        decrease = _decrease(self.problem, basis)
         for G in corners:
             slopes = _twice_symmetric(self.M.T @ G)
             result.append(MatrixInequality(np.concatenate([0.0 * decrease[:1], slopes, decrease])))
+        lead = len(self.M)
+        scale = np.einsum("ab,viab->i", self.M[:, :lead], corners[..., :lead])  # Σ tr T G_0
+        limit = np.zeros((1 + n_theta + n_P, 1, 1))
+        limit[0], limit[1 : 1 + n_theta, 0, 0] = GROWTH * float(scale @ self.theta), -scale
+        result.append(MatrixInequality(limit))
         return tuple(result)
 
     def renewed(self, theta: FloatArray, extra: FloatArray) -> "MatrixSet":
@@ -114,7 +124,7 @@ class MatrixSet:
         bounded[1 + n_P :, :n_y, n_y:] = multipliers
         bounded[1 + n_P :, n_y:, :n_y] = multipliers.transpose(0, 2, 1)
         inequalities = [MatrixInequality(positive), MatrixInequality(bounded)]
-        storage = _decrease(np.concatenate([P[None], moves]), size + n_y)
+        storage = _decrease(problem, np.concatenate([P[None], moves]))
         for corner in _coefficients(problem):
             G = np.tensordot(theta, corner, axes=1)
             terms = _twice_symmetric(np.concatenate([M[None], multipliers]).transpose(0, 2, 1) @ G)
@@ -126,6 +136,7 @@ class MatrixSet:
             problem,
             P + np.tensordot(z[:n_P], moves, axes=1),
             M + np.tensordot(z[n_P:], multipliers, axes=1),
+            theta,
         )
 
 
@@ -149,11 +160,16 @@ def _coefficients(problem: StateAffineRows) -> FloatArray:
     return np.concatenate(parts, axis=1)
 
 
-def _decrease(P: FloatArray, size: int) -> FloatArray:
-    """(…, size, size): r²|[ξ₁; …; ξ_n]|²_P - |[ξ₀; …; ξ_{n-1}]|²_P for P (…, n n_y, n n_y)."""
-    states = P.shape[-1]
-    F = np.zeros((len(P), size, size))
-    F[:, size - states :, size - states :] += SLOWEST_RATE**2 * P
+def slowest_rate(problem: StateAffineRows) -> float:
+    """r: V shrinks by r² a sample, or faster, in the whole set."""
+    return SLOWEST_IN_BOX if _used(problem).any() else SLOWEST_RATE
+
+
+def _decrease(problem: StateAffineRows, P: FloatArray) -> FloatArray:
+    """(…, s, s): r²|[ξ₁; …; ξ_n]|²_P - |[ξ₀; …; ξ_{n-1}]|²_P for P (…, n n_y, n n_y)."""
+    states, n_y = P.shape[-1], len(problem.y_scale[0])
+    F = np.zeros((len(P), states + n_y, states + n_y))
+    F[:, n_y:, n_y:] += slowest_rate(problem) ** 2 * P
     F[:, :states, :states] -= P
     return F
 
