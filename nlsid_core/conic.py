@@ -9,7 +9,6 @@ takes the solution to `nlsid_core.certificate`.
 
 import importlib
 import time
-import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -29,7 +28,6 @@ ACCEPTED_RESIDUAL = 1e-5
 # Clarabel's own default; tighter stalls on problems whose optimum is not strictly feasible.
 TOLERANCE = 1e-8
 MAX_ITERATIONS = 200
-PANIC = "PanicException"  # how PyO3 raises a panic of Clarabel, say of an eigenvalue of NaN
 # SCS is a first-order method: asked for more digits it does not return in useful time.
 SCS_TOLERANCE = 1e-7
 SQRT2 = float(np.sqrt(2.0))
@@ -217,8 +215,8 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
     )
     try:
         solution = solver.solve()
-    except BaseException as panic:  # of the Rust library: no Exception, and of a class not exported
-        if type(panic).__name__ != PANIC:
+    except BaseException as panic:  # of the Rust library: neither an Exception nor exported
+        if type(panic).__name__ != "PanicException":
             raise
         return _Outcome("panicked")
     status = str(solution.status)
@@ -348,9 +346,7 @@ def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:
     options = {"eps_abs": SCS_TOLERANCE, "eps_rel": SCS_TOLERANCE, "max_iters": 100_000}
     problem = cp.Problem(cp.Minimize(objective), constraints)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of inaccuracy: the residuals judge
-            problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
+        problem.solve(solver=name.upper(), **(options if name.upper() == "SCS" else {}))
     except cp.SolverError as error:
         return _Outcome(f"failed ({error})")
     if x.value is None:

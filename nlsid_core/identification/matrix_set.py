@@ -142,7 +142,7 @@ class MatrixSet:
 
 def _used(problem: StateAffineRows) -> FloatArray:
     """(n_w,): 1 for the entries of w that a coefficient of the outputs depends on, else 0."""
-    return np.any([g.any(axis=0) for g in problem.left], axis=0).astype(np.float64)
+    return np.asarray(np.any([g.any(axis=0) for g in problem.left], axis=0), dtype=np.float64)
 
 
 def _coefficients(problem: StateAffineRows) -> FloatArray:
