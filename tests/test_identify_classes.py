@@ -350,13 +350,15 @@ def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
     assert errors[CERTIFIED_SEM] <= errors[METHODS[before]] * (1 + 1e-9)
 
 
-def test_several_outputs_have_no_certified_iterates_and_say_what_to_use() -> None:
+def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_use() -> None:
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, 2))
     data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
-    with pytest.raises(ShapeError, match="certified iterates are for one output"):
-        identify(data, StateAffineClass(1), method="rse_certified", comparators=())
+    assert identify(data, StateAffineClass(1), method="rse_certified").proof.rate < 1.0
+    quadratic = StateAffineClass(1, (0,), leading_degree=2)
+    with pytest.raises(ShapeError, match="degree 1 at most; minimise the robust simulation error"):
+        identify(data, quadratic, method="rse_certified", comparators=())
     beside = identify(
-        data, StateAffineClass(1), comparators=["rse_certified"], iterations=2, allow_unproved=True
+        data, quadratic, comparators=["rse_certified"], iterations=2, allow_unproved=True
     )
     assert beside.methods == ("robust simulation error, final iterate",)
