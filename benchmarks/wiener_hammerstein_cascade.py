@@ -39,7 +39,7 @@ def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], C
     fit = identify_block_cascade(
         single("train", u[TRAIN], y[TRAIN], PERIOD),
         single("validation", u[VALIDATION], y[VALIDATION], PERIOD),
-        BlockCascadeClass(phases=PHASES, intervals=INTERVALS),
+        BlockCascadeClass(phases=PHASES, intervals=INTERVALS, begin="rest"),
         transient=200,
         progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
         rng=np.random.default_rng(seed),

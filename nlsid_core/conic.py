@@ -213,7 +213,12 @@ def _clarabel(program: ConeProgram, tolerance: float, *, refine: bool) -> _Outco
     solver = clarabel.DefaultSolver(
         sp.triu(program.P, format="csc"), program.q, program.A, program.b, cones, settings
     )
-    solution = solver.solve()
+    try:
+        solution = solver.solve()
+    except BaseException as panic:  # of the Rust library: neither an Exception nor exported
+        if type(panic).__name__ != "PanicException":
+            raise
+        return _Outcome("panicked")
     status = str(solution.status)
     if status.startswith("Almost") and "Infeasible" in status:
         return _Outcome("stalled")  # no proof of infeasibility: a later rung decides

@@ -26,49 +26,12 @@ from nlsid_core.identification.cascade_fit import (
     Parameters,
     Trial,
     second_inputs,
-    sensitivities,
-    simulate,
 )
 from nlsid_core.identification.cascade_proof import prove_block_cascade
 from nlsid_core.identification.cascade_search import mean_square, with_intervals, with_phases
-from nlsid_core.models import BlockCascade, Signal, Spline
+from nlsid_core.models import BlockCascade, Spline
 from nlsid_core.trajectory import Dataset, Trajectory
-
-
-def truth() -> BlockCascade:
-    """Two well damped filters around a saturation."""
-    f = Spline(-3.0, 0.5, np.tanh(np.arange(-3.5, 3.75, 0.5)))
-    return BlockCascade(
-        a1=np.array([1.2, -0.5]),
-        b1=np.array([[0.2, 0.1, 0.0]]),
-        f=f,
-        a2=np.array([0.7]),
-        b2=np.array([[0.5, 0.2]]),
-        period=0.01,
-        y=Signal("y", "V"),
-        u=Signal("u", "V"),
-    )
-
-
-def two_phases() -> BlockCascade:
-    model = truth()
-    return BlockCascade(
-        a1=model.a1,
-        b1=np.array([[0.2, 0.1, 0.0], [0.1, 0.2, 0.05]]),
-        f=model.f,
-        a2=model.a2,
-        b2=np.array([[0.5, 0.2], [-0.1, 0.3]]),
-        period=0.01,
-        y=model.y,
-        u=model.u,
-    )
-
-
-def recording(samples: int, seed: int, noise: float = 0.002) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    u = 2.0 * rng.standard_normal(samples)
-    y = truth().simulate(u) + noise * rng.standard_normal(samples)
-    return Trajectory(t=0.01 * np.arange(samples), y=y, u=u, name=f"run {seed}")
+from tests.cascades import recording, truth, two_phases
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +116,6 @@ def test_simulation_agrees_with_scipys_filters() -> None:
         x = lfilter(b1, np.r_[1.0, -model.a1], u)
         total = total + lfilter(b2, np.r_[1.0, -model.a2], model.f(x))
     np.testing.assert_allclose(model.simulate(u), total, atol=1e-12)
-    fast = simulate(Parameters(model.a1, model.b1, model.f, model.a2, model.b2), u)
-    np.testing.assert_allclose(model.simulate(u), fast, atol=1e-12)
 
 
 def test_the_state_matrix_moves_the_difference_of_two_solutions() -> None:
@@ -179,17 +140,6 @@ def test_the_state_matrix_moves_the_difference_of_two_solutions() -> None:
         start = A @ start
 
 
-def test_sensitivities_are_the_derivatives_of_the_output() -> None:
-    model, rng = two_phases(), np.random.default_rng(2)
-    p = Parameters(model.a1, model.b1, model.f, model.a2, model.b2)
-    trial = Trial(2.0 * rng.standard_normal(200), np.zeros(200), 20)
-    J, size, step = sensitivities(trial, p), p.vector().size, 1e-6
-    for k in range(size):
-        up, down = (simulate(p.moved(sign * step * np.eye(size)[k]), trial.u) for sign in (1, -1))
-        slope = (up - down)[20:] / (2 * step)
-        np.testing.assert_allclose(J[k], slope, atol=1e-7 * (1.0 + np.abs(slope).max()))
-
-
 def test_a_cascade_is_identified_to_the_noise_and_proved(fit: CascadeFit, tmp_path: Path) -> None:
     unseen = recording(1500, 9, noise=0.0)
     error = (fit.model.simulate(unseen.u[:, 0]) - unseen.y[:, 0])[60:]
@@ -202,20 +152,21 @@ def test_a_cascade_is_identified_to_the_noise_and_proved(fit: CascadeFit, tmp_pa
     assert "proved" in str(fit)
 
 
-def test_more_phases_or_knots_start_no_worse_than_they_found_it() -> None:
+@pytest.mark.parametrize("from_rest", [True, False])
+def test_more_phases_or_knots_start_no_worse_than_they_found_it(from_rest: bool) -> None:
     model, rng = truth(), np.random.default_rng(4)
     p = Parameters(model.a1, model.b1, model.f, model.a2, model.b2)
     u = rng.standard_normal(1500)
     u = np.convolve(u, np.ones(4) / 4)[:1500]  # little power near half the sampling frequency
-    y = simulate(p, u) + 0.05 * rng.standard_normal(1500)
-    trials = (Trial(u, y, 60),)
+    y = model.simulate(u, None if from_rest else [0.5]) + 0.05 * rng.standard_normal(1500)
+    trials = (Trial(u, y, 60, from_rest),)
     before = mean_square(p, trials)
     for phases in (2, 3):
         split = with_phases(p, trials, phases)
         assert split.b1.shape == (phases, 3)
         assert split.b2.shape == (phases, 2)
         assert mean_square(split, trials) <= before * (1 + 1e-9)
-    x = second_inputs(with_phases(p, trials, 2), u)[:, 60:-60]
+    x = second_inputs(with_phases(p, trials, 2), trials[0])[:, 60:-60]
     halfway = (x[0, 1:] + x[0, :-1]) / 2
     assert np.abs(x[1, 1:] - halfway).max() < 0.1 * np.abs(x[0]).max()
     finer = with_intervals(p, trials, 40)
@@ -348,6 +299,8 @@ def test_bad_data_and_bad_models_say_what_is_wrong() -> None:
     with pytest.raises(DataError, match="phases"):
         BlockCascadeClass(phases=(0,))
     t = np.arange(900.0)
+    with pytest.raises(DataError, match="begin is 'motion'; known: measured, rest"):
+        BlockCascadeClass(begin="motion")  # type: ignore[arg-type]
     flat = Dataset((Trajectory(t=t, y=np.ones(900), u=rng.standard_normal(900)),))
     with pytest.raises(DataError, match="constant"):
         identify_block_cascade(flat, flat, BlockCascadeClass(), rng=rng)
@@ -357,5 +310,12 @@ def test_bad_data_and_bad_models_say_what_is_wrong() -> None:
     model = truth()
     with pytest.raises(ShapeError, match="equal phases"):
         BlockCascade(model.a1, model.b1, model.f, model.a2, np.ones((2, 2)), 0.01, model.y, model.u)
+    with pytest.raises(ShapeError, match=r"y_start has shape \(2,\)"):
+        model.simulate(np.ones(5), np.zeros(2))
+    integrating = BlockCascade(
+        np.ones(1), model.b1, model.f, model.a2, model.b2, 0.01, model.y, model.u
+    )
+    with pytest.raises(DataError, match="pole at 1"):
+        integrating.simulate(np.ones(5), np.zeros(1))
     with pytest.raises(DataError, match="spacing"):
         Spline(0.0, 0.0, np.ones(5))

@@ -79,7 +79,10 @@ def test_every_class_has_its_methods_and_together_they_are_all() -> None:
     assert methods_of(LinearStateClass()) == ("least_squares",)
     assert {m for c in classes for m in methods_of(c)} == set(METHODS)
     assert methods_of(StateAffineClass(2, lagged_degree=1))[0] == "rse"
-    assert "rse_certified" not in methods_of(StateAffineClass(2, leading_degree=3))
+    for degrees in ((0, 1), (1, 1), (2, 0)):
+        assert "rse_certified" in methods_of(StateAffineClass(2, None, *degrees))
+    for degrees in ((3, 0), (2, 1), (0, 2)):
+        assert "rse_certified" not in methods_of(StateAffineClass(2, None, *degrees))
     with pytest.raises(DataError, match="is no model class; there are: LinearClass"):
         methods_of("linear")
 
@@ -349,13 +352,15 @@ def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
     assert errors[CERTIFIED_SEM] <= errors[METHODS[before]] * (1 + 1e-9)
 
 
-def test_several_outputs_have_no_certified_iterates_and_say_what_to_use() -> None:
+def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_use() -> None:
     rng = np.random.default_rng(0)
     u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, 2))
     data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
-    with pytest.raises(ShapeError, match="certified iterates are for one output"):
-        identify(data, StateAffineClass(1), method="rse_certified", comparators=())
+    assert identify(data, StateAffineClass(1), method="rse_certified").proof.rate < 1.0
+    quadratic = StateAffineClass(1, (0,), leading_degree=2)
+    with pytest.raises(ShapeError, match="degree 1 at most; minimise the robust simulation error"):
+        identify(data, quadratic, method="rse_certified", comparators=())
     beside = identify(
-        data, StateAffineClass(1), comparators=["rse_certified"], iterations=2, allow_unproved=True
+        data, quadratic, comparators=["rse_certified"], iterations=2, allow_unproved=True
     )
     assert beside.methods == ("robust simulation error, final iterate",)

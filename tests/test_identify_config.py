@@ -52,7 +52,7 @@ def test_each_section_says_a_model_class(
         ({"lags": 2, "method": "magic"},
          r"identification.method: Input should be 'rse', .* or 'sem_certified' \(found 'magic'\)"),
         ({"lags": 2, "seed": 1}, "identification.seed: there is no such key"),
-        ({"model": "state_affine", "lags": 2, "lagged_degree": 1, "method": "rse_certified"},
+        ({"model": "state_affine", "lags": 2, "lagged_degree": 2, "method": "rse_certified"},
          "method 'rse_certified' is not for these degrees"),
         ({"model": "state_affine", "lags": 2, "delays": [3]}, "should be between 0 and 2"),
         ({"model": "state_affine", "lags": 2, "on_out_of_range": "warn"},

@@ -218,7 +218,12 @@ def test_more_parameters_than_equations_are_refused() -> None:
         )
 
 
-def test_certified_iterates_refuse_input_dependent_lags() -> None:
-    stacked = build_state_affine_rows(Dataset((recording(),)), StateAffineClass(2, lagged_degree=1))
-    with pytest.raises(ShapeError, match="constant lagged"):
-        next(certified_simulation_error(stacked))
+def test_certified_iterates_refuse_degrees_they_have_no_set_for() -> None:
+    for degrees in ((3, 0), (0, 2), (2, 1)):
+        model_class = StateAffineClass(1, (0,), *degrees)
+        stacked = build_state_affine_rows(Dataset((recording(),)), model_class)
+        with pytest.raises(ShapeError, match="at most"):
+            next(certified_simulation_error(stacked))
+    many = build_state_affine_rows(Dataset((recording(),)), StateAffineClass(8, lagged_degree=1))
+    with pytest.raises(ShapeError, match=r"2\^9 corners .* fewer delays"):
+        next(certified_simulation_error(many))

@@ -187,6 +187,7 @@ class BlockCascadeConfig(_Identification):
     smoothing: Annotated[tuple[float, ...], Field(strict=False)] = (1e-8,)
     starts: int = Field(default=12, ge=1, le=1000)
     start_samples: int = Field(default=10_000, ge=1)
+    begin: Literal["measured", "rest"] = "measured"
     method: Literal["sem"] = "sem"
 
     @property
@@ -199,6 +200,7 @@ class BlockCascadeConfig(_Identification):
             smoothing=self.smoothing,
             starts=self.starts,
             start_samples=self.start_samples,
+            begin=self.begin,
         )
 
 

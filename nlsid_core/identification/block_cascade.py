@@ -7,7 +7,7 @@ smoothing are chosen by the simulation error on validation data.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
@@ -31,6 +31,7 @@ MAX_PHASES_TRIED = 4
 START_COEFFICIENTS = 15  # of f, at the start
 
 Progress = Callable[[str, float], None]
+Begin = Literal["measured", "rest"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class BlockCascadeClass:
     orders: of the two filters; (n, 0) are Wiener, (0, n) Hammerstein models. phases, intervals
     (ascending), smoothing: chosen on validation data; knots are refined while that helps. Several
     phases presume an input without power near half the sampling frequency; validation decides.
-    start_samples: of each trial, for the starts.
+    start_samples: of each trial, for the starts. begin: how trials begin, "measured" (in motion,
+    `BlockCascade.simulate` from the first measured outputs) or "rest" (from zero states).
     """
 
     orders: tuple[int, int] = (3, 3)
@@ -65,6 +67,7 @@ class BlockCascadeClass:
     smoothing: tuple[float, ...] = (1e-8,)
     starts: int = 12
     start_samples: int = 10_000
+    begin: Begin = "measured"
     kind: ClassVar[type[BlockCascade]] = BlockCascade
 
     def __post_init__(self) -> None:
@@ -72,6 +75,8 @@ class BlockCascadeClass:
             raise DataError(f"orders {self.orders} should be two, not negative, not both zero")
         if self.starts < 1 or self.start_samples < 1:
             raise DataError(f"starts {self.starts} and start_samples should be at least 1")
+        if self.begin not in get_args(Begin):
+            raise DataError(f"begin is '{self.begin}'; known: {', '.join(get_args(Begin))}")
         if not self.phases or not all(1 <= M <= MAX_PHASES_TRIED for M in self.phases):
             raise DataError(f"phases {self.phases} should be between 1 and {MAX_PHASES_TRIED}")
         if not self.intervals or min(self.intervals) < 1:
@@ -115,8 +120,7 @@ def identify_block_cascade(
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
 
-    transient: samples at the start of each trajectory that are simulated (from zero states) and not
-    scored.
+    transient: samples at the start of each trajectory that are simulated and not scored.
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
     Infeasible if the minimum found has no proof.
     """
@@ -125,9 +129,9 @@ def identify_block_cascade(
     smoothing, starts = model_class.smoothing, model_class.starts
     report = progress if progress is not None else _silent
     scales = _scales(train)
-    fitted, judged = (_trials(data, scales, transient) for data in (train, validation))
+    fitted, judged = (_trials(data, scales, transient, model_class) for data in (train, validation))
     needed = 2 * (sum(orders) + 2) + START_COEFFICIENTS
-    if sum(len(trial.y) - transient for trial in fitted) < needed:
+    if sum(len(trial.y) - trial.transient for trial in fitted) < needed:
         raise DataError(f"fewer than {needed} scored samples for orders {orders}; give more data")
     first = best_start(
         tuple(_shortened(trial, model_class.start_samples) for trial in fitted),
@@ -220,14 +224,20 @@ def _scales(train: Dataset) -> tuple[float, float]:
     return float(u.std()), float(y.std())
 
 
-def _trials(data: Dataset, scales: tuple[float, float], transient: int) -> tuple[Trial, ...]:
+def _trials(
+    data: Dataset, scales: tuple[float, float], transient: int, model_class: BlockCascadeClass
+) -> tuple[Trial, ...]:
+    from_rest = model_class.begin == "rest"
+    skipped = transient if from_rest else max(transient, model_class.orders[1])  # given, not made
     for trajectory in data:
-        if transient < 0 or len(trajectory) <= 3 * transient:
+        if transient < 0 or len(trajectory) <= 3 * skipped:
             raise DataError(
                 f"{trajectory.name or 'trajectory'}: {len(trajectory)} samples with a transient "
-                f"of {transient}; give more than three times as many"
+                f"of {skipped}; give more than three times as many"
             )
-    return tuple(Trial(t.u[:, 0] / scales[0], t.y[:, 0] / scales[1], transient) for t in data)
+    return tuple(
+        Trial(t.u[:, 0] / scales[0], t.y[:, 0] / scales[1], skipped, from_rest) for t in data
+    )
 
 
 def _shortened(trial: Trial, samples: int) -> Trial:

@@ -2,6 +2,8 @@
 
 With r = ŷ - y and J = ∂ŷ/∂θ, minimise mean(r²) + smoothing·Σ(second differences of f)² by
 Levenberg-Marquardt steps (J'J + λ diag(J'J))δ = -J'r; steps to unstable filters are rejected.
+A trial begins at rest, or in motion: the input held at its first value before, the second filter's
+state from the first n₂ measured outputs, as `BlockCascade.simulate` does; its sensitivities too.
 Source: Marquardt 1963; the sensitivities are those of linear filters, each a filter itself.
 """
 
@@ -24,11 +26,15 @@ RIDGE = 1e-10  # of the largest diagonal entry: a basis function without data ha
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One record, scaled: u, y (N,). The first `transient` samples are simulated, not scored."""
+    """One record, scaled: u, y (N,). The first `transient` samples are simulated, not scored.
+
+    from_rest: no input before the first sample; else it was held, and y starts as measured.
+    """
 
     u: FloatArray
     y: FloatArray
     transient: int
+    from_rest: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,37 +112,59 @@ def minimise(
     return Minimum(here, float(residual @ residual) / len(residual), taken)
 
 
-def simulate(parameters: Parameters, u: FloatArray) -> FloatArray:
-    """Outputs (N,) from rest, as `BlockCascade.simulate` and faster."""
-    forcing = np.zeros(len(u))
-    for b1, b2 in zip(parameters.b1, parameters.b2, strict=True):
-        forcing += lfilter(b2, [1.0], parameters.f(lfilter(b1, _monic(parameters.a1), u)))
-    outputs: FloatArray = lfilter([1.0], _monic(parameters.a2), forcing)
+def simulate(parameters: Parameters, trial: Trial) -> FloatArray:
+    """Outputs (N,), as `BlockCascade.simulate` and faster."""
+    forcing, A2 = np.zeros(len(trial.u)), _monic(parameters.a2)
+    for x, b2 in zip(second_inputs(parameters, trial), parameters.b2, strict=True):
+        forcing += filtered(b2, np.ones(1), parameters.f(x), trial)
+    if n := 0 if trial.from_rest else len(parameters.a2):
+        forcing[:n] = lfilter(A2, [1.0], trial.y[:n])  # what makes them the first outputs
+    outputs: FloatArray = lfilter([1.0], A2, forcing)
     return outputs
 
 
-def second_inputs(parameters: Parameters, u: FloatArray) -> FloatArray:
+def filtered(b: FloatArray, A: FloatArray, signal: FloatArray, trial: Trial) -> FloatArray:
+    """(…, N): b/A of signal (…, N), before its first sample zero or held as the trial's input."""
+    if trial.from_rest:
+        return np.asarray(lfilter(b, A, signal))
+    before = signal[..., :1]
+    return np.asarray(lfilter(b, A, signal - before) + before * (np.sum(b) / np.sum(A)))
+
+
+def output_of(b: FloatArray, a: FloatArray, signal: FloatArray, trial: Trial) -> FloatArray:
+    """(…, N): the output's part of what passes b/A, zero where outputs are given: see `simulate`.
+
+    Linear in the signal; `simulate` adds what the given outputs leave behind.
+    """
+    if trial.from_rest:
+        return np.asarray(lfilter(b, _monic(a), signal))
+    forcing = filtered(b, np.ones(1), signal, trial)
+    forcing[..., : len(a)] = 0.0
+    return np.asarray(lfilter([1.0], _monic(a), forcing))
+
+
+def second_inputs(parameters: Parameters, trial: Trial) -> FloatArray:
     """(M, N): x_j, what each phase of f sees."""
-    inputs = [lfilter(b1, _monic(parameters.a1), u) for b1 in parameters.b1]
-    return np.array(inputs)
+    A1 = _monic(parameters.a1)
+    return np.array([filtered(b1, A1, trial.u, trial) for b1 in parameters.b1])
 
 
-def basis_responses(parameters: Parameters, x: FloatArray) -> FloatArray:
+def basis_responses(parameters: Parameters, x: FloatArray, trial: Trial) -> FloatArray:
     """(K + 3, N): the output's part of each coefficient of f, for x (M, N)."""
-    A2, rows = _monic(parameters.a2), np.arange(x.shape[1])
+    rows = np.arange(x.shape[1])
     responses = np.zeros((len(parameters.f.coefficients), x.shape[1]))
     for x_j, b2 in zip(x, parameters.b2, strict=True):
         index, weights = parameters.f.weights(x_j)
         basis = np.zeros_like(responses)
         for r in range(4):
             basis[index + r, rows] = weights[r]
-        responses += lfilter(b2, A2, basis)
+        responses += output_of(b2, parameters.a2, basis, trial)
     return responses
 
 
 def _residual(trials: tuple[Trial, ...], parameters: Parameters) -> FloatArray:
     with np.errstate(all="ignore"):  # a wild candidate may overflow: its cost is not less
-        parts = [simulate(parameters, t.u)[t.transient :] - t.y[t.transient :] for t in trials]
+        parts = [simulate(parameters, t)[t.transient :] - t.y[t.transient :] for t in trials]
         return np.concatenate(parts)
 
 
@@ -163,10 +191,9 @@ def _step(
 def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:
     """(number of parameters, N - transient): ∂ŷ/∂θ, rows in the order of `Parameters.vector`."""
     p = parameters
-    N = len(trial.u)
-    A1, A2 = _monic(p.a1), _monic(p.a2)
-    x = second_inputs(p, trial.u)
-    u_filtered = lfilter([1.0], A1, trial.u)
+    N, A1, one = len(trial.u), _monic(p.a1), np.ones(1)
+    x, y = second_inputs(p, trial), simulate(p, trial)
+    u_filtered = filtered(one, A1, trial.u, trial)
     n1, m1, n2, m2, M = len(p.a1), p.b1.shape[1], len(p.a2), p.b2.shape[1], len(p.b1)
     J = np.zeros((p.vector().size, N))
     at_b1, at_a2 = n1, n1 + M * m1
@@ -175,22 +202,24 @@ def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:
         slope = p.f.slope(x[j])
         # ∂x/∂b1[i] and ∂x/∂a1[k] are u and x, delayed and filtered by 1/A1.
         for i in range(m1):
-            J[at_b1 + j * m1 + i] = lfilter(p.b2[j], A2, slope * _delayed(u_filtered, i))
-        x_filtered = lfilter([1.0], A1, x[j])
+            J[at_b1 + j * m1 + i] = output_of(
+                p.b2[j], p.a2, slope * delayed(u_filtered, i, trial), trial
+            )
+        x_filtered = filtered(one, A1, x[j], trial)
         for k in range(n1):
-            J[k] += lfilter(p.b2[j], A2, slope * _delayed(x_filtered, k + 1))
-        w_filtered = lfilter([1.0], A2, p.f(x[j]))
+            J[k] += output_of(p.b2[j], p.a2, slope * delayed(x_filtered, k + 1, trial), trial)
+        w = p.f(x[j])
         for i in range(m2):
-            J[at_b2 + j * m2 + i] = _delayed(w_filtered, i)
-    y_filtered = lfilter([1.0], A2, simulate(p, trial.u))
+            J[at_b2 + j * m2 + i] = output_of(one, p.a2, delayed(w, i, trial), trial)
     for k in range(n2):
-        J[at_a2 + k] = _delayed(y_filtered, k + 1)
-    J[at_c:] = basis_responses(p, x)
+        J[at_a2 + k] = output_of(one, p.a2, delayed(y, k + 1, trial), trial)
+    J[at_c:] = basis_responses(p, x, trial)
     return J[:, trial.transient :]
 
 
-def _delayed(signal: FloatArray, samples: int) -> FloatArray:
-    moved = np.zeros_like(signal)
+def delayed(signal: FloatArray, samples: int, trial: Trial) -> FloatArray:
+    """(N,): signal(t - samples), before its first sample zero or held as the trial's input."""
+    moved = np.full_like(signal, 0.0 if trial.from_rest else signal[0])
     moved[samples:] = signal[: len(signal) - samples]
     return moved
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from nlsid_core._types import FloatArray
 from nlsid_core.identification.cascade_fit import (
@@ -11,7 +10,10 @@ from nlsid_core.identification.cascade_fit import (
     Parameters,
     Trial,
     basis_responses,
+    delayed,
+    filtered,
     minimise,
+    output_of,
     second_inputs,
     simulate,
 )
@@ -53,7 +55,7 @@ def best_start(
 def with_intervals(parameters: Parameters, trials: tuple[Trial, ...], intervals: int) -> Parameters:
     """The same cascade with f on `intervals` knot intervals over the range that x takes."""
     low, spacing = _knots(
-        np.concatenate([second_inputs(parameters, t.u).ravel() for t in trials]), intervals
+        np.concatenate([second_inputs(parameters, t).ravel() for t in trials]), intervals
     )
     f = Spline(low, spacing, np.zeros(intervals + 3))
     x = np.linspace(f.low, f.high, FINE * intervals)
@@ -71,30 +73,30 @@ def with_phases(parameters: Parameters, trials: tuple[Trial, ...], phases: int) 
     b1[j] is fitted to x delayed by FFT, then every b2 to the outputs; both are linear.
     """
     m1, m2 = parameters.b1.shape[1], parameters.b2.shape[1]
-    A1, A2 = (np.concatenate([[1.0], -a]) for a in (parameters.a1, parameters.a2))
+    A1, one = np.concatenate([[1.0], -parameters.a1]), np.ones(1)
     columns, targets = [], []
     for trial in trials:
-        v = lfilter([1.0], A1, trial.u)
-        x = lfilter(parameters.b1[0], [1.0], v)
+        v = filtered(one, A1, trial.u, trial)
+        x = filtered(parameters.b1[0], one, v, trial)
         inside = slice(trial.transient, len(x) - trial.transient)  # an FFT is periodic
-        columns.append(_lags(v, m1)[inside])
+        columns.append(_lags(v, m1, trial).T[inside])
         targets.append(np.stack([_late(x, j / phases)[inside] for j in range(1, phases)], axis=1))
     shifted = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
     b1 = np.concatenate([parameters.b1[:1], shifted.T])
     columns, targets = [], []
     for trial in trials:
-        v = lfilter([1.0], A1, trial.u)
-        seen = [parameters.f(lfilter(b, [1.0], v)) for b in b1]
-        filtered = [_lags(lfilter([1.0], A2, w), m2) for w in seen]
-        columns.append(np.concatenate(filtered, axis=1)[trial.transient :])
-        targets.append(trial.y[trial.transient :])
+        seen = parameters.f(second_inputs(replace(parameters, b1=b1), trial))
+        lagged = np.concatenate([_lags(w, m2, trial) for w in seen])
+        columns.append(output_of(one, parameters.a2, lagged, trial).T[trial.transient :])
+        free = simulate(replace(parameters, b2=np.zeros_like(parameters.b2)), trial)
+        targets.append((trial.y - free)[trial.transient :])
     b2 = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
     return replace(parameters, b1=b1, b2=b2.reshape(phases, m2))
 
 
 def mean_square(parameters: Parameters, trials: tuple[Trial, ...]) -> float:
     """Mean squared simulation error over the scored samples, in the trials' scaled unit."""
-    errors = np.concatenate([(simulate(parameters, t.u) - t.y)[t.transient :] for t in trials])
+    errors = np.concatenate([(simulate(parameters, t) - t.y)[t.transient :] for t in trials])
     return float(errors @ errors) / len(errors)
 
 
@@ -109,15 +111,16 @@ def _random_start(
     a1, a2 = (_random_denominator(order, rng) for order in orders)
     b1, b2 = np.eye(1, orders[0] + 1), np.eye(1, orders[1] + 1)
     flat = Parameters(a1, b1, Spline(0.0, 1.0, np.zeros(START_INTERVALS + 3)), a2, b2)
-    gain = 1.0 / float(np.std(np.concatenate([second_inputs(flat, t.u)[0] for t in trials])))
-    inputs = [gain * second_inputs(flat, t.u) for t in trials]
+    gain = 1.0 / float(np.std(np.concatenate([second_inputs(flat, t)[0] for t in trials])))
+    inputs = [gain * second_inputs(flat, t) for t in trials]
     low, spacing = _knots(np.concatenate(inputs, axis=1), START_INTERVALS)
     flat = replace(flat, b1=gain * b1, f=replace(flat.f, low=low, spacing=spacing))
     R = np.concatenate(
-        [basis_responses(flat, x)[:, t.transient :] for x, t in zip(inputs, trials, strict=True)],
+        [basis_responses(flat, x, t)[:, t.transient :]
+         for x, t in zip(inputs, trials, strict=True)],
         axis=1,
-    )
-    y = np.concatenate([t.y[t.transient :] for t in trials])
+    )  # fmt: skip
+    y = np.concatenate([(t.y - simulate(flat, t))[t.transient :] for t in trials])
     H = R @ R.T
     H += max(RIDGE, smoothing) * np.trace(H) / len(H) * np.eye(len(H))
     return replace(flat, f=replace(flat.f, coefficients=np.linalg.solve(H, R @ y)))
@@ -147,9 +150,6 @@ def _late(x: FloatArray, delay: float) -> FloatArray:
     return np.asarray(np.fft.irfft(np.fft.rfft(x) * turn, len(x)))
 
 
-def _lags(signal: FloatArray, count: int) -> FloatArray:
-    """(N, count): signal(t), signal(t - 1), …; zero before the first sample."""
-    columns = np.zeros((len(signal), count))
-    for k in range(count):
-        columns[k:, k] = signal[: len(signal) - k]
-    return columns
+def _lags(signal: FloatArray, count: int, trial: Trial) -> FloatArray:
+    """(count, N): signal(t), signal(t - 1), …, before the first sample as the trial's input."""
+    return np.stack([delayed(signal, k, trial) for k in range(count)])

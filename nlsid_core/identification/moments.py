@@ -195,10 +195,19 @@ def refuse_unexcited(
 
 
 def plain_moments(
-    trials: Sequence[Trajectory], model_class: MonotoneClass, offsets: Offsets
+    trials: Sequence[Trajectory],
+    model_class: MonotoneClass,
+    offsets: Offsets,
+    *,
+    executor: Executor | None = None,
 ) -> Moments:
-    """Moments of the signals as measured: right without noise, biased with it."""
-    return reduce(add, [_pair(trial, trial, model_class, offsets) for trial in trials])
+    """Moments of the signals as measured: right without noise, biased with it.
+
+    executor: shares the trials.
+    """
+    classes, shifts = [model_class] * len(trials), [offsets] * len(trials)
+    mapped = map if executor is None else executor.map
+    return reduce(add, mapped(_pair, trials, trials, classes, shifts))
 
 
 def _pair(

@@ -27,19 +27,22 @@ ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it
 
 
 def history(model: Model) -> int:
-    """How many measured samples start a simulation; none for a block cascade, which is at rest."""
+    """How many measured samples start a simulation: for a block cascade its second filter's."""
     if isinstance(model, BlockCascade):
-        return 0
+        return len(model.a2)
     return model.history if isinstance(model, MonotoneEquation | ImplicitModel) else len(model)
 
 
 def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
-    """(N, n_y) outputs, from the first measured outputs with the recorded inputs."""
+    """(N, n_y) outputs, from the first measured outputs with the recorded inputs.
+
+    The input of a block cascade's first filter is held at its first value before the trial.
+    """
     n = history(model)
     if isinstance(model, StateAffineModel):
         return model.simulate(trial.u, trial.y[:n])
     if isinstance(model, BlockCascade):
-        return model.simulate(trial.u[:, 0])[:, None]
+        return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
     if isinstance(model, ImplicitModel):
         return model.simulate_outputs(trial.u, trial.y[:n])
     u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
@@ -49,15 +52,15 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
 def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:
     """(N - n - horizon + 1, n_y): ŷ(t) from measurements up to t - horizon, t = n + horizon - 1 ….
 
-    n is the model's history. A block cascade's noise is that of the measurement, so past outputs
-    tell it nothing: its predictions are its simulation.
+    n is the model's history. A block cascade's noise is that of the measurement, so outputs later
+    than the first n tell it nothing: its predictions are its simulation.
     Raises DataError if the horizon is not positive or the trial is too short.
     """
     n, N = history(model), len(trial)
     if horizon < 1 or n + horizon > N:
         raise DataError(f"{trial.name}: a horizon of {horizon} needs 1 to {N - n} samples")
     if isinstance(model, BlockCascade):
-        return simulate_trial(model, trial)[horizon - 1 :]
+        return simulate_trial(model, trial)[n + horizon - 1 :]
     step, lags = _step(model, trial)
     starts = N - n - horizon + 1
     past = [trial.y[n - k : n - k + starts] for k in range(1, lags + 1)]

@@ -68,6 +68,7 @@ from nlsid_core.trajectory import Dataset
 
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
+CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: corners decide
 
 
 def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
@@ -143,7 +144,7 @@ def block_cascade(
 def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[MonotoneEquation]:
     """Monotone equations through moments, of repeated experiments if there are any."""
     offsets = offsets_of(train.trajectories)
-    plain = plain_moments(train.trajectories, model_class, offsets)
+    plain = plain_moments(train.trajectories, model_class, offsets, executor=task.executor)
     template = train.trajectories[0]
     refuse_unexcited(plain, model_class, template, offsets)
     trail: Trail[MonotoneEquation] = Trail(
@@ -263,10 +264,10 @@ def methods_of(model_class: object) -> tuple[str, ...]:
         names = ", ".join(known.__name__ for known in OFFERS)
         raise DataError(f"{model_class!r} is no model class; there are: {names}")
     refused: set[str] = set()
-    if isinstance(model_class, StateAffineClass) and (
-        model_class.lagged_degree or model_class.leading_degree > CERTIFIABLE_DEGREE
-    ):
-        refused = {"rse_certified", "sem_certified"}
+    if isinstance(model_class, StateAffineClass):
+        most = CERTIFIABLE_AFFINE if model_class.lagged_degree else CERTIFIABLE_DEGREE
+        if max(model_class.lagged_degree, model_class.leading_degree) > most:
+            refused = {"rse_certified", "sem_certified"}
     return tuple(method for method in offer.methods if method not in refused)
 
 

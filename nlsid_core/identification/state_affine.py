@@ -72,9 +72,9 @@ class StateAffineRows:
     on_out_of_range: OutOfRange = "clip"
 
     @property
-    def has_constant_lags(self) -> bool:
+    def is_bounded_by_leading(self) -> bool:
         """One output, and G_1 … G_n do not depend on the input."""
-        return bool(self.rows.identity.sum() == 1) and all(len(g) == 1 for g in self.left[1:])
+        return len(self.y_scale[0]) == 1 and all(len(g) == 1 for g in self.left[1:])
 
     def window_range(self) -> FloatArray:
         """(n_w, 2): the box of normalised windows that the declared input range allows."""

@@ -80,15 +80,42 @@ class BlockCascade:
         )
         return first, second
 
-    def simulate(self, u: ArrayLike) -> FloatArray:
-        """Outputs (N,) for inputs u (N,) from rest (no input before the first sample)."""
+    def simulate(self, u: ArrayLike, y_start: ArrayLike | None = None) -> FloatArray:
+        """Outputs (N,) for inputs u (N,), from rest or from the first n₂ measured outputs.
+
+        y_start None: from rest, u, v and f's outputs zero before the first sample. y_start (n₂,):
+        in motion, u before the first sample held at its first value for ever, and the second
+        filter's state from y_start; the first n₂ outputs are y_start itself.
+        Raises ShapeError on other shapes, DataError if no state goes with a held input.
+        """
         inputs = np.asarray(u, dtype=np.float64)
         if inputs.ndim != 1:
             raise ShapeError(f"u should be (N,); has shape {inputs.shape}")
-        v, forcing = _recursion(self.a1, inputs), np.zeros(len(inputs))
+        if y_start is None or not len(inputs):
+            held, start = 0.0, np.zeros(0)
+        else:
+            held, start = self._held(float(inputs[0])), np.asarray(y_start, dtype=np.float64)
+            if start.shape != self.a2.shape or len(inputs) < len(start):
+                raise ShapeError(
+                    f"y_start has shape {start.shape} and u {inputs.shape}; y_start should be "
+                    f"({len(self.a2)},), u no shorter"
+                )
+        v = _recursion(self.a1, inputs, np.full(len(self.a1), held))
+        forcing = np.zeros(len(inputs))
         for b1, b2 in zip(self.b1, self.b2, strict=True):
-            forcing += _moving_sum(b2, self.f(_moving_sum(b1, v)))
-        return _recursion(self.a2, forcing)
+            w = self.f(_moving_sum(b1, v, held))
+            forcing += _moving_sum(b2, w, 0.0 if y_start is None else w[:1])
+        if y_start is None:
+            return _recursion(self.a2, forcing, np.zeros(len(self.a2)))
+        n = len(start)
+        return np.concatenate([start, _recursion(self.a2, forcing[n:], start[::-1])])
+
+    def _held(self, u: float) -> float:
+        """The first filter's v under the constant input u."""
+        rest = 1.0 - float(self.a1.sum())
+        if rest == 0.0:
+            raise DataError("the first filter has a pole at 1: no state goes with a held input")
+        return u / rest
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -132,15 +159,14 @@ class BlockCascade:
         )
 
 
-def _moving_sum(b: FloatArray, signal: FloatArray) -> FloatArray:
-    """Σ_i b[i] signal(t - i), the signal zero before its first sample."""
-    return np.asarray(np.convolve(signal, b)[: len(signal)])
+def _moving_sum(b: FloatArray, signal: FloatArray, before: float | FloatArray) -> FloatArray:
+    """Σ_i b[i] signal(t - i), the signal `before` until its first sample."""
+    return np.asarray(np.convolve(signal - before, b)[: len(signal)] + before * b.sum())
 
 
-def _recursion(a: FloatArray, forcing: FloatArray) -> FloatArray:
-    """x(t) = Σ_k a[k-1] x(t-k) + forcing(t), x zero before the first sample."""
-    coefficients = a.tolist()
-    past = [0.0] * len(coefficients)
+def _recursion(a: FloatArray, forcing: FloatArray, newest: FloatArray) -> FloatArray:
+    """x(t) = Σ_k a[k-1] x(t-k) + forcing(t), from newest = x(-1), x(-2), …."""
+    coefficients, past = a.tolist(), newest.tolist()
     outputs = []
     for value in forcing.tolist():
         for coefficient, x in zip(coefficients, past, strict=True):
