@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-STAY: Final = 0.02  # s until services and other topics get their turn
+STAY: Final = 0.1  # s until services and other topics get their turn
 BATCH: Final = 200  # messages in one go; then the other subscriptions get their turn
 
 Received = Callable[[Any], None]
