@@ -1,5 +1,6 @@
 """The section `identification`: one form for each model class, its options and its methods."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Annotated, Any, ClassVar, Literal
@@ -51,7 +52,7 @@ def _nested(value: list[object]) -> bool:
 Ranges = Annotated[tuple[Corner, ...], BeforeValidator(_pairs), Field(strict=False)]
 
 
-class _Identification(Section):
+class _Identification(Section, ABC):
     """What every model class takes. transient: samples at the start of each trial not scored.
 
     allow_unproved: write a model without a proof of stability too; nothing is certified then.
@@ -65,9 +66,9 @@ class _Identification(Section):
     accept_untested_repeats: bool = False
 
     @property
+    @abstractmethod
     def model_class(self) -> ModelClass[Model]:
         """The same as the core's noun."""
-        raise NotImplementedError
 
     @model_validator(mode="after")
     def _refuse_impossible(self) -> "_Identification":

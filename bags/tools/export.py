@@ -6,6 +6,7 @@ One table on a common grid needs the memory of its columns.
 
 import io
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -194,9 +195,9 @@ class TableWriter(Protocol):
         """Finish the file."""
 
 
-class _Closing:
-    def close(self) -> None:
-        raise NotImplementedError
+class _Closing(ABC):
+    @abstractmethod
+    def close(self) -> None: ...
 
     def __enter__(self) -> Any:
         return self

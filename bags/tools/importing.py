@@ -209,7 +209,7 @@ def _mat(path: Path) -> dict[str, FloatArray]:
     try:
         content = loadmat(path, squeeze_me=False)
     except NotImplementedError:
-        return _hdf5(path)  # version 7.3 is HDF5
+        return _hdf5(path)  # what SciPy says of version 7.3, which is HDF5
     except Exception as error:  # scipy raises what the bytes make it raise
         raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
     return {name: _column(value) for name, value in content.items() if _is_table(value)}
