@@ -15,22 +15,28 @@ PYTHON ?= $(shell \
     $$p -c '$(call SUITS,(3, 99))' 2>/dev/null && { echo $$p; exit; }; \
   done)
 
-.PHONY: demo test check lint clean help
+.PHONY: demo test check lint benchmarks clean help
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo   run the chain on the shipped bags'
 	@echo 'make test   run the tests that need no ROS'
 	@echo 'make check  ruff, mypy and make test'
+	@echo 'make benchmarks  run them all: one JSON file each in benchmarks/results'
 	@echo 'make clean  remove what these made'
 
 demo: $(VENV)/.demo
 	$(BIN)/nlsid demo
 
+# One process a core, each with one thread for its matrices: more threads than cores only wait.
 test: $(VENV)/.test
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations 25
 
 check: lint test
+
+# make benchmarks DATA=DIR: also those on recordings that do not ship with the project.
+benchmarks: $(VENV)/.bench
+	$(BIN)/python -m benchmarks $(if $(DATA),--data $(DATA))
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check
@@ -38,7 +44,7 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) nlsid-demo build install log *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* nlsid-demo build install log *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Editable, so that both commands run the checkout and an edit needs no second install.
@@ -55,6 +61,9 @@ $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 
 $(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)test)
+
+$(VENV)/.bench: pyproject.toml setup.py | $(BIN)/python
+	$(call install,report$(COMMA)sim$(COMMA)bench)
 
 COMMA := ,
 

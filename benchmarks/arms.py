@@ -20,9 +20,9 @@ import numpy as np
 from scipy.io import loadmat
 
 from benchmarks.machine import describe
-from nlsid_core._types import FloatArray
-from nlsid_core.identification import FINAL, LEAST_SQUARES, LinearClass, identify, validate
-from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification import LinearClass, identify, validate
 
 LAGS = 3
 SCHUNK_TEST = range(81, 101)
@@ -93,8 +93,8 @@ def main() -> None:
         started = time.perf_counter()
         fit = identify(train, LinearClass(LAGS), allow_unproved=True)
         seconds = time.perf_counter() - started
-        naive, ours = (validate(fit[method].model, test) for method in (LEAST_SQUARES, FINAL))
-        proof = fit[FINAL].proof
+        naive, ours = (validate(fit[method].model, test) for method in ("least_squares", "rse"))
+        proof = fit["rse"].proof
         rate = f"{proof.rate:.5f}" if proof else "-"
         print(
             f"{name:10s}{naive.simulation_percent:12.1f}{naive.prediction_percent[1]:10.2f}"

@@ -3,7 +3,8 @@
 python -m benchmarks.bag_reading [--json] [--messages 2000000] [--data DIR]
 
 The bag holds JointState (six joints), Odometry and Imu in equal parts, in zstd chunks; it is
-generated once and kept in DIR (default: the temporary folder). Beside ours run, on the first
+generated once and kept in a cache folder, which is printed; one that is in DIR is read there.
+Beside ours run, on the first
 messages of the same bag and selecting the same numbers, mcap-ros2-support's decoder and rosbags'
 deserialiser. One core; each reader in a process of its own, timed in CPU seconds so that a busy
 machine does not count; the memory is that process's.
@@ -18,7 +19,6 @@ import json
 import multiprocessing
 import resource
 import statistics
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -30,7 +30,8 @@ import numpy as np
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import read_signals
-from benchmarks.machine import describe
+from benchmarks.cache import cache_folder
+from benchmarks.machine import describe, peers
 
 MESSAGES: Final = 2_000_000
 SAMPLE: Final = 60_000  # messages that the decoders, which take minutes for all, are timed on
@@ -56,15 +57,18 @@ START_NS: Final = 1_700_000_000 * 10**9
 PERIOD_NS: Final = 1_000_000
 
 
-def generated_bag(folder: Path, messages: int) -> Path:
-    """The bag of that many messages, made if it is not there yet."""
-    bag = folder / f"nlsid_bag_reading_{messages}"
+def generated_bag(data: Path | None, messages: int) -> Path:
+    """The bag of that many messages: in `data`, which is only read, else in the cache."""
+    name = f"nlsid_bag_reading_{messages}"
+    if data is not None and (data / name).is_dir():
+        return data / name
+    bag = cache_folder() / name
     if not bag.is_dir():
         with BagWriter(bag) as writer:
-            for k, (topic, data) in zip(range(messages), _messages(), strict=False):
+            for k, (topic, content) in zip(range(messages), _messages(), strict=False):
                 stamp_ns = START_NS + k * PERIOD_NS
                 times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
-                writer.write(topic, TYPES[topic], data, **times)
+                writer.write(topic, TYPES[topic], content, **times)
     return bag
 
 
@@ -194,9 +198,8 @@ def timed(read: Callable[[Path, int], int], bag: Path, messages: int) -> tuple[f
         return pool.submit(_timed, read, bag, messages).result()
 
 
-def measure(folder: Path, messages: int) -> dict[str, float]:
+def measure(bag: Path, messages: int) -> dict[str, float]:
     """Run every reader side by side and return the promised keys."""
-    bag = generated_bag(folder, messages)
     readers = {"ours": read_ours, "mcap_ros2": read_mcap_ros2, "rosbags": read_rosbags}
     rates: dict[str, list[float]] = {name: [] for name in readers}
     peaks: list[float] = []
@@ -223,9 +226,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     parser.add_argument("--messages", type=int, default=MESSAGES)
-    parser.add_argument("--data", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--data", type=Path, help="folder that may hold the bag; only read")
     arguments = parser.parse_args()
-    keys = measure(arguments.data, arguments.messages)
+    bag = generated_bag(arguments.data, arguments.messages)
+    print(f"reading {bag}")
+    keys = measure(bag, arguments.messages)
     print(
         f"{arguments.messages} messages (JointState, Odometry, Imu), {len(SIGNALS)} numbers, "
         f"{keys['bag_mb']:.0f} MB, {describe()}\n"
@@ -241,7 +246,7 @@ def main() -> None:
     ):
         print(f"{label:44s}{keys[key]:12.1f}{wanted:>10s}")
     if arguments.json:
-        print(json.dumps(keys))
+        print(json.dumps(keys | peers("mcap-ros2-support", "rosbags")))
 
 
 if __name__ == "__main__":

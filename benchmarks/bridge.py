@@ -16,29 +16,27 @@ import json
 import tempfile
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from bags.chain.plants import PERIOD, ROBOTS, Robot
 from bags.chain.simulation import Push, record_repeats, run_policy
 from benchmarks.machine import describe
-from nlsid_core import _json
-from nlsid_core._types import FloatArray
-from nlsid_core.certificate import check
-from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
-from nlsid_core.funnels.state_funnel import (
-    FunnelDesign,
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design.sampled.design import (
+    TrackingDesign,
     assume,
     design_state_funnel,
     frame,
     undisturbed,
 )
+from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.identification.states import free_run_error, identify_states
 from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.monitor import Status
-from nlsid_core.tracking_monitor import TrackingMonitor
-from nlsid_core.trajectory import Dataset
+from nlsid_core.proofs import check
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Status
 
 START = 0.97  # of the inlet's level, on which the runs start
 COMMISSIONING = 30  # runs the assumption is measured on
@@ -110,7 +108,7 @@ PROMISED = {
 class Made:
     """A proved funnel, its feedback, seconds of design and exact check, and processor seconds."""
 
-    design: FunnelDesign
+    design: TrackingDesign
     feedback: Feedback
     commissioning: Dataset
     design_seconds: float
@@ -199,17 +197,14 @@ def designed(robot: Robot, task: Task, model: MeasuredState, seed: int) -> Made:
     design = design_state_funnel(model, policy, feedback, assumption=assumption)
     design_seconds = time.perf_counter() - started
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        proof = design.proof_document(model="model", policy="policy", funnel="funnel")
-        _json.write_document(folder / "model", model.document())
-        _json.write_document(folder / "policy", policy.document())
-        _json.write_document(folder / "funnel", design.funnel.document())
-        _json.write_document(folder / "proof", proof)
-        verdict = check(folder / "proof")
-    return Made(design, feedback, runs, design_seconds, verdict.seconds, time.process_time() - cpu)
+        proof = design.save(name)[-1]
+        started_check = time.perf_counter()
+        check(proof)
+        check_seconds = time.perf_counter() - started_check
+    return Made(design, feedback, runs, design_seconds, check_seconds, time.process_time() - cpu)
 
 
-def compared(design: FunnelDesign, feedback: Feedback) -> tuple[float, float]:
+def compared(design: TrackingDesign, feedback: Feedback) -> tuple[float, float]:
     """Inlet volume over that without disturbance; the tube's narrowest in mrad, from a small start.
 
     Small: the part of the inlet that the disturbance itself fills. Narrowest: in the second half of
@@ -229,7 +224,7 @@ def compared(design: FunnelDesign, feedback: Feedback) -> tuple[float, float]:
 
 
 def monitored(
-    robot: Robot, task: Task, design: FunnelDesign, runs: int, seed: int
+    robot: Robot, task: Task, design: TrackingDesign, runs: int, seed: int
 ) -> dict[str, float | int | None]:
     """What the monitor says of runs as they should be, pushed, and with more mass.
 
@@ -267,7 +262,7 @@ def monitored(
 
 def outcome(
     robot: Robot,
-    design: FunnelDesign,
+    design: TrackingDesign,
     rng: np.random.Generator,
     seed: int,
     *,
@@ -281,7 +276,7 @@ def outcome(
     run = run_policy(
         robot, design.model, policy, seed=seed, start=start, push=push, mass_scale=mass
     )
-    monitor = TrackingMonitor(design.model, policy, funnel)
+    monitor = Monitor(design.model, policy, funnel)
     flagged = outside = None
     kept = False
     for k in range(len(run)):

@@ -20,9 +20,9 @@ from bags.chain.plants import ROBOTS, Robot
 from bags.chain.simulation import record_repeats
 from benchmarks.bridge import TASKS, VALIDATION, compared, designed
 from benchmarks.machine import describe
-from nlsid_core.discrete_funnel import FORMS
+from nlsid_core.design.sampled.design import assume, design_state_funnel, frame
 from nlsid_core.errors import Infeasible
-from nlsid_core.funnels.state_funnel import assume, design_state_funnel, frame
+from nlsid_core.funnels.sampled import FORMS
 from nlsid_core.identification.states import identify_states
 
 FIRST_FLOOR = {"response": "7", "fading": "23", "energy": "30", "peak": "81"}  # mrad, pendulum

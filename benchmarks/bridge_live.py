@@ -34,14 +34,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.monitoring.designs import TrackingDesign
-from bags.monitoring.documents import FUNNEL, load_proved_tracking
+from bags.designs.design import SampledDesign
+from bags.designs.documents import FUNNEL, load_proved_tracking
 from bags.monitoring.replay import announced_runs, replay_messages
-from benchmarks.machine import describe
+from benchmarks.machine import describe, peers
 from benchmarks.processes import isolate, node, python
 from benchmarks.swing import swing_config
 from nlsid_core.errors import NlsidError
-from nlsid_core.monitor import Nominal, Status
+from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 
 PUSH, PUSH_SECONDS = 60.0, 0.02  # N m on the joint, s
@@ -84,10 +84,10 @@ class Heard:
     def margin(self, message: JointState) -> None:
         """A verdict, unless it is unknown."""
         numbers = dict(zip(message.name, message.position, strict=True))
-        if "disturbance" in numbers and not math.isnan(numbers["margin"]):
+        if "assumption" in numbers and not math.isnan(numbers["margin"]):
             stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
             self.into_run += 1
-            self.verdicts[stamp_ns] = numbers["margin"], numbers["disturbance"]
+            self.verdicts[stamp_ns] = numbers["margin"], numbers["assumption"]
 
     def status(self, message: DiagnosticArray) -> None:
         """What each node said last, and every alarm of the monitor."""
@@ -170,16 +170,16 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
 
 
 def compared(
-    design: TrackingDesign, bag: Path, heard: Heard, pushed_ns: int, seconds: float, runs: int
+    design: SampledDesign, bag: Path, heard: Heard, pushed_ns: int, seconds: float, runs: int
 ) -> LiveLoop:
     """The recording's own verdicts beside those heard."""
     replayed = [
         entry
-        for entry in replay_messages(design, bag, nominal=Nominal.PROFILE)
+        for entry in replay_messages(design, bag)
         if entry.reading.status is not Status.UNKNOWN
     ]
     expected = {
-        entry.stamp_ns: (entry.reading.numbers["margin"], entry.reading.numbers["disturbance"])
+        entry.stamp_ns: (entry.reading.numbers["margin"], entry.reading.numbers["assumption"])
         for entry in replayed
     }
     reasons = {entry.reading.reason for entry in replayed}
@@ -249,7 +249,7 @@ def main() -> None:
     for key, value in asdict(result).items():
         print(f"{key:22} {value}")
     if options.json:
-        print(json.dumps(asdict(result)))
+        print(json.dumps(asdict(result) | peers("ros-jazzy-rclpy")))
 
 
 if __name__ == "__main__":

@@ -26,10 +26,10 @@ from scipy.io import loadmat
 from bags.chain import tracking_steps
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.tracking_config import TrackingConfig
-from bags.monitoring import documents
-from nlsid_core.certificate import check
+from bags.designs import documents
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import NlsidError
-from nlsid_core.trajectory import Trajectory
+from nlsid_core.proofs import check
 
 TRIALS = 30  # of Schunk's 100: 20 to fit, 5 to choose the degrees, 5 to commission
 SCHUNK_PERIOD, EMPS_PERIOD = 0.004, 0.01

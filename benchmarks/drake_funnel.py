@@ -23,12 +23,13 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"
 
 import numpy as np  # noqa: E402 - the thread counts have to be set first
 
-from benchmarks.machine import describe  # noqa: E402
+from benchmarks.machine import describe, peers  # noqa: E402
 from examples import satellite  # noqa: E402
 from examples.satellite_funnel import goal_matrix, problem  # noqa: E402
-from nlsid_core._types import FloatArray  # noqa: E402
-from nlsid_core.funnels import design_funnel, sample_funnel  # noqa: E402
-from nlsid_core.funnels.alternation import STOP  # noqa: E402
+from nlsid_core.arrays import FloatArray  # noqa: E402
+from nlsid_core.design import design_funnel  # noqa: E402
+from nlsid_core.design.continuous.shape import STOP  # noqa: E402
+from nlsid_core.design.thesis.relaxation import sample_funnel  # noqa: E402
 
 BALL = np.pi**3 / 6  # volume of the unit ball in 6 dimensions
 SAMPLES = satellite.SAMPLES_PER_INTERVAL
@@ -208,7 +209,7 @@ def main() -> None:
     for key, value in result.items():
         print(f"{key:24} {value:.5g}" if isinstance(value, float) else f"{key:24} {value}")
     if arguments.json:
-        print(json.dumps(result))
+        print(json.dumps(result | peers("drake")))
 
 
 if __name__ == "__main__":

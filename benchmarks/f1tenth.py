@@ -22,25 +22,21 @@ from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.samples import f1tenth
 from benchmarks.machine import describe
-from nlsid_core.certificate import check
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.identification import (
-    FINAL,
-    FIRST,
-    LEAST_SQUARES,
-    SEM,
     simulation_percent,
 )
-from nlsid_core.identification.from_repeats import identify_from_repeats
 from nlsid_core.identification.moment_rie import minimise_moment_rie
 from nlsid_core.identification.moments import MonotoneClass, offsets_of, plain_moments
+from nlsid_core.identification.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
-from nlsid_core.monitor import Status
-from nlsid_core.trajectory import Dataset
+from nlsid_core.proofs import check
+from nlsid_core.running.reading import Status
 
 CHECKS = 11  # repetitions of the check; the median is reported
 
@@ -63,13 +59,13 @@ def measure() -> dict[str, float | int | bool]:
             seconds.append(time.perf_counter() - started)
         inside, caught = monitored(config, bags, out)
         lags = len(documents.load_model(out / documents.MODEL))
-    errors = {c.method: c.error_percent(result.test) for c in result.fit.candidates}
+    errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     repeats = bias_removed(result.train, result.test, lags)
     return {
-        "ls": errors[LEAST_SQUARES],
-        "first": errors[FIRST],
-        "final": errors[FINAL],
-        "sem": errors[SEM],
+        "ls": errors["least_squares"],
+        "first": errors["rse_first"],
+        "final": errors["rse"],
+        "sem": errors["sem"],
         **repeats,
         "proved": proved,
         "test_trials_inside": sum(r.verdict == Status.INSIDE.value for r in inside),
@@ -113,15 +109,15 @@ def is_proved(path: Path) -> bool:
 def monitored(config: Config, bags: list[Path], out: Path) -> tuple[list[Replay], list[Replay]]:
     """Replays of the test trials, and of each with each sensor fault."""
     proved = documents.load_proved_funnel(out / documents.FUNNEL)
-    nominal = config.monitor.nominal_source
+    centre = config.monitor.nominal_source
     test = [bag for bag in bags if bag.name in config.split.test]
-    clean = [replay_bag(proved, bag, nominal=nominal) for bag in test]
+    clean = [replay_bag(proved, bag, centre=centre) for bag in test]
     faulty = []
     for bag in test:
         for name, fault in FAULTS.items():
             copy = out / f"{bag.name} {name}"
             write_faulty_copy(bag, copy, config.signals.response[0].path, fault)
-            faulty.append(replay_bag(proved, copy, nominal=nominal))
+            faulty.append(replay_bag(proved, copy, centre=centre))
     return clean, faulty
 
 

@@ -20,7 +20,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from benchmarks.machine import describe
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.moment_rie import minimise_moment_rie
 from nlsid_core.identification.moments import (
     MonotoneClass,
@@ -28,10 +30,8 @@ from nlsid_core.identification.moments import (
     plain_moments,
     repeated_moments,
 )
-from nlsid_core.identification.rows import Rows
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
-from nlsid_core.trajectory import Dataset, Trajectory
 
 POLE, SAMPLES = 0.9, 5000
 LEVELS = (0, 5, 10, 15, 20, 30)  # dB

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
-from nlsid_core.continuous import VectorField
+from nlsid_core.design import design_funnel, integrate_nominal
+from nlsid_core.design.continuous.lstep import LSteps, section_at
+from nlsid_core.design.continuous.tvlqr import tvlqr
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import NlsidError
-from nlsid_core.funnels import design_funnel, integrate_nominal
-from nlsid_core.funnels.lstep import LSteps, section_at
-from nlsid_core.funnels.tvlqr import tvlqr
 
 KNOTS, FINAL_TIME = 9, 1.0  # s
 GOAL = 8.0  # P = 8 I: 0.35 rad and rad/s around rest
@@ -59,7 +59,7 @@ def row(n: int) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         design = design_funnel(field, nominal, goal=goal, Q=np.eye(n), R=np.eye(half))
-        proved, pieces = True, len(design.proved.pieces)
+        proved, pieces = True, len(design.found.proved.pieces)
     except NlsidError:
         proved, pieces = False, 0
     return {

@@ -20,9 +20,9 @@ from pathlib import Path
 from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import heat_exchanger, percent, single
-from nlsid_core import _json
+from nlsid_core import files
+from nlsid_core.identification import prove_stability
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.contraction import prove_state_affine
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
@@ -43,7 +43,7 @@ def measure(data: Path, n: int) -> dict[str, float | bool]:
     """Errors in % at n lags, and whether the exact checker proves the certified model."""
     flow, temperature = heat_exchanger(data)
     train = single("exchanger", flow[:TRAINING], temperature[:TRAINING], 1.0)
-    model_class = StateAffineClass(n, leading_degree=2, right_degree=3, u_range=(FLOW_RANGE,))
+    model_class = StateAffineClass(n, leading_degree=2, right_degree=3, input_range=(FLOW_RANGE,))
     problem = build_state_affine_rows(train, model_class)
 
     def score(model: StateAffineModel) -> float:
@@ -64,21 +64,21 @@ def measure(data: Path, n: int) -> dict[str, float | bool]:
     started = time.perf_counter()
     *_, last = certified_simulation_error(problem, iterations=ITERATES)
     model = problem.model(last.point.theta, last.point.p)
-    proof = prove_state_affine(model)
+    proof = prove_stability(model)
     assert proof is not None, "the certified set was left"
     keys["certified_seconds"] = time.perf_counter() - started
     keys["certified"] = score(model)
     with tempfile.TemporaryDirectory() as folder:
-        _json.write_document(Path(folder) / "model.json", model.document())
+        files.write_document(Path(folder) / "model.json", model.document())
         path = Path(folder) / "model.proof.json"
-        _json.write_document(path, proof.document(model, "model.json"))
+        files.write_document(path, proof.document(model, "model.json"))
         keys["certified_proved"] = is_proved(path)
     keys["certified_rate"] = proof.rate
     started = time.perf_counter()
     lowest = descend_certified(problem, model, proof)
     keys["last_step_seconds"] = time.perf_counter() - started
     keys["last_step"] = score(lowest)
-    keys["last_step_proved"] = prove_state_affine(lowest) is not None
+    keys["last_step_proved"] = prove_stability(lowest) is not None
     return keys
 
 

@@ -2,6 +2,7 @@
 
 import os
 import platform
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 
@@ -16,3 +17,14 @@ def describe() -> str:
         name = models[0].partition(":")[2].strip() if models else name
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     return f"{name}, {threads} thread(s), Python {platform.python_version()}"
+
+
+def peers(*distributions: str) -> dict[str, dict[str, str]]:
+    """{"peers": {distribution: version}} of what ours is measured beside, for the JSON result."""
+    versions = {}
+    for name in distributions:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    return {"peers": versions}

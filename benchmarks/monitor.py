@@ -34,16 +34,16 @@ from std_msgs.msg import String
 
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
-from benchmarks.machine import describe
+from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python
-from nlsid_core import _json
-from nlsid_core._types import FloatArray
-from nlsid_core.funnels import TubeDesign, design_tube
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import TubeDesign, design_tube
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
-from nlsid_core.monitor import MonitorBank
-from nlsid_core.reading import Reading, Status
-from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.lane import Lane
 from nlsid_ros.messages import stamp_ns_of
@@ -77,7 +77,7 @@ def updates() -> dict[str, float]:
     ]
     result = {}
     for label, count in (("update", 1), ("update10", FUNNELS)):
-        bank = MonitorBank(model, [(d.policy, d.funnel) for d in designs[:count]])
+        bank = Monitor.of_several(model, [(d.policy, d.funnel) for d in designs[:count]])
         times = []
         for trial in data.trajectories[:ROUNDS]:
             bank.restart()
@@ -88,7 +88,7 @@ def updates() -> dict[str, float]:
                 if k == LAGS + designs[0].funnel.assumption.samples:
                     break
                 started = time.perf_counter_ns()
-                bank.update(t, y, u)
+                bank.readings(t, y, u)
                 if k >= LAGS:
                     times.append(time.perf_counter_ns() - started)
         for percent in (50, 99):
@@ -129,7 +129,7 @@ class Ear(Node):
         for role in ("model", "policy", "funnel"):
             document = getattr(design, role).document()
             publisher = self.create_publisher(String, f"{SOURCE}/{role}", qos.DOCUMENT)
-            publisher.publish(String(data=_json.canonical(document).decode()))
+            publisher.publish(String(data=files.encode(document).decode()))
         lane = Lane(self)
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
             lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)
@@ -274,7 +274,7 @@ def main() -> None:
         asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""
         print(f"{key:24} {value:10.4g} {asked}")
     if options.json:
-        print(json.dumps(result))
+        print(json.dumps(result | peers("ros-jazzy-rclpy")))
 
 
 if __name__ == "__main__":

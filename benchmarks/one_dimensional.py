@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
-from examples.one_dimensional import PUBLISHED_AREA, design, problem, radius, true_sets
-from nlsid_core.funnels.alternation import alternate_rho, exponential_start
-from nlsid_core.funnels.lstep import LSteps
+from examples.one_dimensional import PUBLISHED_AREA, designed, problem, radius, true_sets
+from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
 
 TIMES = np.linspace(-1.0, 1.0, 2001)
 
@@ -28,11 +28,11 @@ def run() -> dict[str, Any]:
     result: dict[str, Any] = {"best_area": float(2 * best.mean() / width.mean())}
     for knots in (40, 160):
         started = time.perf_counter()
-        found = design(knots)
+        found = designed(knots)
         result[f"seconds_{knots}"] = time.perf_counter() - started
         result[f"ratio_{knots}"] = float((radius(found.funnel, TIMES) / best).mean())
         result[f"area_{knots}"] = float(2 * radius(found.funnel, TIMES).mean() / width.mean())
-        result[f"pieces_{knots}"] = len(found.proved.pieces)
+        result[f"pieces_{knots}"] = len(found.found.proved.pieces)
         steps = LSteps(problem(knots)[0])
         start = exponential_start(steps, found.policy, found.funnel.P)
         two = alternate_rho(steps, found.policy, start, stop=0.0, iterations=2)
@@ -50,7 +50,7 @@ def draw(path: Path) -> None:
     from matplotlib.figure import Figure
 
     width, best = true_sets(TIMES)
-    funnel = design().funnel
+    funnel = designed().funnel
     middle = funnel.x(TIMES)[:, 0]
     low = _lower(TIMES)
     figure = Figure(figsize=(6, 4), layout="constrained")

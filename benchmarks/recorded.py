@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
-from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 
 
 def heat_exchanger(folder: Path) -> tuple[FloatArray, FloatArray]:

@@ -27,7 +27,7 @@ from sensor_msgs.msg import JointState
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns, standard_types
 from bags.recordings.repair import repair
-from benchmarks.machine import describe
+from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_ros import qos
 from nlsid_ros.running import ManagedNode, run
@@ -183,7 +183,7 @@ def main() -> None:
         asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""
         print(f"{key:30} {value:10.6g} {asked}")
     if options.json:
-        print(json.dumps(result))
+        print(json.dumps(result | peers("ros-jazzy-rclpy", "rosbags")))
 
 
 if __name__ == "__main__":

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import describe
-from nlsid_core import _json
-from nlsid_core._types import FloatArray
-from nlsid_core.certificate import check
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
 from nlsid_core.identification.moments import (
@@ -35,13 +35,13 @@ from nlsid_core.identification.moments import (
     plain_moments,
     repeated_moments,
 )
-from nlsid_core.identification.monotone_comparators import (
+from nlsid_core.identification.monotone import (
     least_squares_equation,
     minimise_monotone_simulation_error,
     simulate_banded,
 )
 from nlsid_core.models import MonotoneEquation, Signal
-from nlsid_core.trajectory import Trajectory
+from nlsid_core.proofs import check
 
 ORDERS, LENGTHS, TEST = (1, 8, 15), (5_000, 50_000), 50_000
 NOISE = 0.05
@@ -107,9 +107,9 @@ def identify(runs: list[Trajectory], n: int) -> tuple[MomentFit, float]:
 def is_proved(fit: MomentFit) -> bool:
     """What the exact checker says of the written files."""
     with tempfile.TemporaryDirectory() as folder:
-        _json.write_document(Path(folder) / "model.json", fit.model.document())
+        files.write_document(Path(folder) / "model.json", fit.model.document())
         path = Path(folder) / "model.proof.json"
-        _json.write_document(path, fit.proof.document(fit.model, "model.json"))
+        files.write_document(path, fit.proof.document(fit.model, "model.json"))
         try:
             check(path)
         except CertificateRejected:

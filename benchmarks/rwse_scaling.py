@@ -20,12 +20,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.signal import lfilter
 
-from benchmarks.machine import describe
+from benchmarks.machine import describe, peers
 from benchmarks.recorded import single
-from nlsid_core._types import FloatArray
-from nlsid_core.identification.bound import Bound
+from nlsid_core.arrays import FloatArray
+from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.newton import minimise
-from nlsid_core.identification.rows import Rows
+from nlsid_core.identification.rse import Bound
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 
 SIZES = (500, 2000, 10_000, 90_000, 300_000, 1_000_000)
@@ -146,7 +146,7 @@ def main() -> None:
             print(f"{N:9d}{lmi:9.2f}{ours:9.4f}{lmi / ours:9.0f}{difference:12.1e}  {boundary}",
                   flush=True)  # fmt: skip
     if arguments.json:
-        print(json.dumps(keys))
+        print(json.dumps(keys | peers("clarabel")))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 
 ROOT = Path(__file__).resolve().parents[1]
 HEIGHT, SECONDS, PERIOD = 0.25, 1.2, 0.01

@@ -24,9 +24,9 @@ from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import percent, single, wiener_hammerstein
 from benchmarks.wiener_hammerstein_cascade import measure as measure_cascade
-from nlsid_core import _json
-from nlsid_core._types import FloatArray, Json
-from nlsid_core.identification.contraction import prove_state_affine
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.identification import prove_stability
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.models import StateAffineModel
@@ -48,8 +48,8 @@ Keys = dict[str, float | bool]
 def stored_and_proved(model: Json, proof: Json) -> bool:
     """What the exact checker says of the files."""
     with tempfile.TemporaryDirectory() as folder:
-        _json.write_document(Path(folder) / "model.json", model)
-        _json.write_document(Path(folder) / "model.proof.json", proof)
+        files.write_document(Path(folder) / "model.json", model)
+        files.write_document(Path(folder) / "model.proof.json", proof)
         return is_proved(Path(folder) / "model.proof.json")
 
 
@@ -63,7 +63,7 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
     """First and chosen iterate at n lags: errors in % and V on the thesis's test samples."""
     problem = build_state_affine_rows(
         single("estimation", u[train], y[train], PERIOD),
-        StateAffineClass(n, right_degree=3, u_range=((float(np.min(u)), float(np.max(u))),)),
+        StateAffineClass(n, right_degree=3, input_range=((float(np.min(u)), float(np.max(u))),)),
     )
     started = time.perf_counter()
     iterates: list[tuple[float, StateAffineModel]] = []
@@ -75,7 +75,7 @@ def difference_equation(u: FloatArray, y: FloatArray, n: int, train: slice) -> K
         iterates.append((percent(y[THESIS_VALIDATION], validation), model))
     model = min(iterates, key=lambda entry: entry[0])[1]
     seconds = time.perf_counter() - started
-    proof = prove_state_affine(model)
+    proof = prove_stability(model)
     measured, simulated = y[THESIS_TEST], simulate(model, u, THESIS_TEST)
     residual = measured - simulated
     return {

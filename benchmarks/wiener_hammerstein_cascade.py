@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.f1tenth import is_proved
 from benchmarks.machine import describe
 from benchmarks.recorded import single, wiener_hammerstein
-from nlsid_core import _json
+from nlsid_core import files
 from nlsid_core.identification import BlockCascadeClass, CascadeFit, identify_block_cascade
 
 PERIOD = 1 / 51200  # s
@@ -39,17 +39,16 @@ def measure(data: Path, *, seed: int = SEED) -> tuple[dict[str, float | bool], C
     fit = identify_block_cascade(
         single("train", u[TRAIN], y[TRAIN], PERIOD),
         single("validation", u[VALIDATION], y[VALIDATION], PERIOD),
-        BlockCascadeClass(phases=PHASES, intervals=INTERVALS, begin="rest"),
+        BlockCascadeClass(phases=PHASES, intervals=INTERVALS, seed=seed, begin="rest"),
         transient=200,
         progress=lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True),
-        rng=np.random.default_rng(seed),
     )
     seconds, busy = time.perf_counter() - started, time.process_time() - busy
     error = (fit.model.simulate(u[TEST]) - y[TEST])[SKIPPED:]
     with tempfile.TemporaryDirectory() as folder:
-        _json.write_document(Path(folder) / "model.json", fit.model.document())
+        files.write_document(Path(folder) / "model.json", fit.model.document())
         path = Path(folder) / "model.proof.json"
-        _json.write_document(path, fit.proof.document(fit.model, "model.json"))
+        files.write_document(path, fit.proof.document(fit.model, "model.json"))
         proved = is_proved(path)
     keys: dict[str, float | bool] = {
         "cascade_mv": 1e3 * float(np.sqrt(np.mean(error**2))),

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from examples.transcription import motion
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Nominal, VectorField
-from nlsid_core.continuous.taylor import taylor_field
-from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, nominal_through
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, nominal_through
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics.taylor import taylor_field
 
 CART, POLE, LENGTH, GRAVITY = 1.0, 0.25, 0.5, 9.81  # kg, kg, m, m/s²
 SECONDS, SEGMENTS = 2.0, (24, 100)
@@ -46,19 +46,19 @@ def problem() -> tuple[VectorField, Nominal]:
     return field, nominal_through(t, x, u, field)
 
 
-def design() -> FunnelDesign:
+def designed() -> FunnelDesign:
     """The funnel, proved for every t and for the true dynamics."""
     field, nominal = problem()
     end = nominal.x.ends()[-1]
     A, B = field.jacobians(SECONDS, end, nominal.u.ends()[-1])
     S = solve_continuous_are(A, B, Q, R)
     goal = Goal(end, (S + S.T) / 2 / LEVEL)
-    return design_funnel(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL)
+    return design(ContinuousTracking(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL))
 
 
 def main() -> tuple[float, float]:
     """(smallest half-width of the funnel at the start in the angle in rad, 0)."""
-    found = design()
+    found = designed()
     print(found)
     return float(np.sqrt(np.linalg.inv(found.funnel.shape(0.0))[1, 1])), 0.0
 

@@ -7,10 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from nlsid_core._types import Json
-from nlsid_core.certificate.documents import bound_document
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Gram, Polynomial, variables
 from nlsid_core.sos.exact import exact_gram
+from nlsid_core.sos.proofs import bound_document
 
 x, y = variables("x y")
 CHOI_LAM: Polynomial = x**4 * y**2 + y**4 + x**2 - 3 * x**2 * y**2

@@ -7,11 +7,10 @@ Source: Scherer and Hol, "Matrix sum-of-squares relaxations", Math. Programming 
 
 import numpy as np
 
-from nlsid_core._types import Json
-from nlsid_core.certificate.documents import matrix_document
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.sos import Identity, Program, forms_of, matrix_sum_of_squares, solve
-from nlsid_core.sos.search import positive_semidefinite
+from nlsid_core.sos.proofs import matrix_document
 
 PUBLISHED = 3 - 2**0.5
 BACK_OFF = 1e-6  # below the optimum, where the Gram matrices are positive definite
@@ -36,7 +35,7 @@ def document() -> Json:
         identity.gram,
         names=("x",),
         domain=[INTERVAL],
-        multipliers=[positive_semidefinite(gram) for gram in identity.multipliers],
+        multipliers=identity.multipliers,
     )
 
 

@@ -5,7 +5,7 @@ in Papachristodoulou and Prajna, "On the construction of Lyapunov functions usin
 squares decomposition", CDC 2002.
 """
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.sos.search import lyapunov
 

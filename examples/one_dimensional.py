@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Funnel, Nominal, VectorField
-from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, integrate_nominal
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
 
 KNOTS = 40
 GOAL = Goal(np.array([0.5]), np.array([[4.0]]))
@@ -26,12 +27,12 @@ def problem(knots: int = KNOTS) -> tuple[VectorField, Nominal]:
     return field, integrate_nominal(field, lambda _: np.zeros(0), t=t, final=[0.5])
 
 
-def design(knots: int = KNOTS) -> FunnelDesign:
+def designed(knots: int = KNOTS) -> FunnelDesign:
     """The funnel, with P(t) from the linearisation alone (Q = 0)."""
-    return design_funnel(*problem(knots), goal=GOAL, Q=np.zeros((1, 1)))
+    return design(ContinuousTracking(*problem(knots), goal=GOAL, Q=np.zeros((1, 1))))
 
 
-def radius(funnel: Funnel, t: FloatArray) -> FloatArray:
+def radius(funnel: ContinuousFunnel, t: FloatArray) -> FloatArray:
     """Half the width of the funnel at times t."""
     return np.array([1 / np.sqrt(funnel.shape(float(s))[0, 0]) for s in t])
 
@@ -56,7 +57,7 @@ def main() -> tuple[float, float]:
     """(area fraction of the true backward reachable set, what the best symmetric funnel covers)."""
     t = np.linspace(-1.0, 1.0, 401)
     width, _ = true_sets(t)
-    found = design()
+    found = designed()
     print(found)
     return float(2 * radius(found.funnel, t).mean() / width.mean()), PUBLISHED_AREA
 

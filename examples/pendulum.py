@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Nominal, VectorField
-from nlsid_core.funnels import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
+from nlsid_core.dynamics import Nominal, VectorField
 
 LENGTH, GRAVITY, DAMPING = 0.5, 9.81, 0.1  # m, m/s², 1/s
 ANGLE, TORQUE = 0.6, 12.0  # rad where the sine is bounded; limit of torque over inertia in 1/s²
@@ -36,20 +36,21 @@ def problem() -> tuple[VectorField, Nominal]:
     """The pendulum at rest, upright."""
     most = ROUNDING_ROOM * GRAVITY / LENGTH * ANGLE**5 / 120
     field = VectorField.from_function(
-        taylor, 2, 1, uncertain=[[-most, most]], valid=[[0, -ANGLE, ANGLE], [2, -TORQUE, TORQUE]]
-    )
+        taylor, 2, 1, uncertain=[[-most, most]], valid=[[0, -ANGLE, ANGLE], [2, -TORQUE, TORQUE]],
+        expansion="a cubic for the sine, whose remainder is bounded by its fifth-order term",
+    )  # fmt: skip
     t = np.linspace(0, FINAL_TIME, KNOTS)
     return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
-def design() -> FunnelDesign:
+def designed() -> FunnelDesign:
     """The funnel, proved for the true sine and within the torque's limits."""
-    return design_funnel(*problem(), goal=GOAL, Q=Q, R=R)
+    return design(ContinuousTracking(*problem(), goal=GOAL, Q=Q, R=R))
 
 
 def main() -> tuple[float, float]:
     """(largest torque in the funnel, its limit)."""
-    found = design()
+    found = designed()
     print(found)
     torques = [
         float(np.abs(found.policy(float(t), found.funnel.outline(float(t), (0, 1)))).max())

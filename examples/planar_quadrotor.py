@@ -10,10 +10,10 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from examples.transcription import motion
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Nominal, VectorField
-from nlsid_core.continuous.taylor import taylor_field
-from nlsid_core.funnels import FunnelDesign, Goal, design_funnel, nominal_through
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, nominal_through
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics.taylor import taylor_field
 
 GRAVITY = 9.81  # m/s²
 SECONDS, SEGMENTS = 2.0, (20, 40)
@@ -43,19 +43,19 @@ def problem() -> tuple[VectorField, Nominal]:
     return field, nominal_through(t, x, u, field)
 
 
-def design() -> FunnelDesign:
+def designed() -> FunnelDesign:
     """The funnel, proved for every t and for the true dynamics."""
     field, nominal = problem()
     end = nominal.x.ends()[-1]
     A, B = field.jacobians(SECONDS, end, nominal.u.ends()[-1])
     S = solve_continuous_are(A, B, Q, R)
     goal = Goal(end, (S + S.T) / 2 / LEVEL)
-    return design_funnel(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL)
+    return design(ContinuousTracking(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL))
 
 
 def main() -> tuple[float, float]:
     """(half-width of the funnel at the start in tilt, the tilt around the motion covered)."""
-    found = design()
+    found = designed()
     print(found)
     shadow = np.linalg.inv(found.funnel.shape(0.0))
     return float(np.sqrt(shadow[2, 2])), float(RADIUS[2])

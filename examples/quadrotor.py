@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Nominal, VectorField
-from nlsid_core.funnels import integrate_nominal
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import integrate_nominal
+from nlsid_core.dynamics import Nominal, VectorField
 
 MASS, GRAVITY = 0.5, 9.81  # kg, m/s²
 INERTIA = np.array([0.0032, 0.0032, 0.0055])  # kg m²
@@ -98,8 +98,10 @@ def problem(knots: int) -> tuple[VectorField, Nominal, FloatArray]:
     hover = MASS * GRAVITY
     valid = [[6 + i, -TILT, TILT] for i in range(3)] + [[12, hover - THRUST, hover + THRUST]]
     field = VectorField.from_function(
-        taylor, 12, 4, uncertain=np.stack([-most, most], axis=1), valid=valid
-    )
+        taylor, 12, 4, uncertain=np.stack([-most, most], axis=1), valid=valid,
+        expansion="a cubic expansion of the rotation, with a remainder bounded by hand in "
+        "examples/quadrotor.py",
+    )  # fmt: skip
     nominal = integrate_nominal(
         field, inputs, t=np.linspace(0, FINAL_TIME, knots), start=np.zeros(12)
     )

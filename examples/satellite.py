@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.polynomial import Polynomial, compose_affine, trace
 
 INERTIA = np.array([5.0, 3.0, 2.0])  # kg m², principal axes

@@ -5,7 +5,7 @@ Source: Dixon and Szegö 1978: minimum -1.0316284535 at (±0.08984, ∓0.71266).
 
 from fractions import Fraction
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.sos.search import lower_bound
 

@@ -7,7 +7,7 @@ level is 1/20. Source: Drake issue 12876, where 0.067 to 0.070 was returned.
 
 import numpy as np
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.sos.search import attraction
 

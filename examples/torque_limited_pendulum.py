@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
-from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
-from nlsid_core.funnels import FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
 
 STIFFNESS, DAMPING = 19.62, 0.1  # g/length in 1/s², 1/s
 TORQUE = 12.0  # over inertia, in 1/s²: holds the pendulum up to 0.66 rad
@@ -41,18 +43,19 @@ def problem() -> tuple[VectorField, Nominal]:
     """The pendulum at rest, upright."""
     most = ROUNDING_ROOM * ANGLE**2 / 120
     field = VectorField.from_function(
-        bounded, 2, 1, uncertain=[[0, most]], valid=[[0, -ANGLE, ANGLE]]
-    )
+        bounded, 2, 1, uncertain=[[0, most]], valid=[[0, -ANGLE, ANGLE]],
+        expansion="a cubic for the sine, whose remainder is bounded by its fifth-order term",
+    )  # fmt: skip
     t = np.linspace(0, FINAL_TIME, KNOTS)
     return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
 
 
-def design() -> FunnelDesign:
+def designed() -> FunnelDesign:
     """The funnel of the saturating policy."""
-    return design_funnel(*problem(), goal=GOAL, Q=Q, R=R, limits=LIMITS)
+    return design(ContinuousTracking(*problem(), goal=GOAL, Q=Q, R=R, limits=LIMITS))
 
 
-def reaching(policy: Policy, points: int) -> tuple[FloatArray, FloatArray, IntArray]:
+def reaching(policy: ContinuousPolicy, points: int) -> tuple[FloatArray, FloatArray, IntArray]:
     """Angles, rates (points,), and which starts on that grid truly end in the goal, (rate, angle).
 
     By simulation of the saturated closed loop with the true sine, from t = 0.
@@ -74,7 +77,9 @@ def reaching(policy: Policy, points: int) -> tuple[FloatArray, FloatArray, IntAr
     return angles, rates, reached.reshape(points, points).astype(int)
 
 
-def area_fractions(policy: Policy, funnel: Funnel, points: int = 401) -> tuple[float, float]:
+def area_fractions(
+    policy: ContinuousPolicy, funnel: ContinuousFunnel, points: int = 401
+) -> tuple[float, float]:
     """Area of the funnel at t = 0 over that of all starts that truly end in the goal, and over that
     of the largest ellipse of its own shape among those."""
     angles, rates, reached = reaching(policy, points)
@@ -86,7 +91,7 @@ def area_fractions(policy: Policy, funnel: Funnel, points: int = 401) -> tuple[f
 
 def main() -> tuple[float, float]:
     """(largest torque that the policy asks for in the funnel, the torque there is)."""
-    found = design()
+    found = designed()
     print(found)
     all_starts, ellipse = area_fractions(found.policy, found.funnel)
     print(f"{all_starts:.1%} of what truly reaches the goal, {ellipse:.1%} of its largest ellipse")

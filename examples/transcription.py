@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 
 Rate = Callable[[FloatArray, FloatArray], FloatArray]  # (N, n), (N, m) to (N, n), analytic
 COMPLEX_STEP = 1e-30

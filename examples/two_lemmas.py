@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Funnel, Policy, VectorField, constant_on
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.continuous.pieces import Proved, prove_pieces
+from nlsid_core.design.thesis.lemmas import Lemma, lemma_decay
+from nlsid_core.dynamics import VectorField, constant_on
 from nlsid_core.errors import Infeasible
-from nlsid_core.funnels.lemmas import Lemma, lemma_decay
-from nlsid_core.funnels.lstep import LSteps
-from nlsid_core.funnels.pieces import Proved, prove_pieces
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial import variables
 
 END, KNOTS = 4 * np.pi, 9
@@ -37,7 +39,7 @@ def decay(sigma: float) -> Lemma:
     )
 
 
-def invariance(last: float) -> tuple[Funnel, Proved]:
+def invariance(last: float) -> tuple[ContinuousFunnel, Proved]:
     """Lemma 5.2 for W = x² ≤ ρ(t), ρ linear from 2.65 to `last`."""
     field = VectorField.from_function(
         lambda x, w: np.array([x[0] / 2 + w[0] / 2 - x[0] ** 3]), 1, 0, uncertain=[[-1, 1]]
@@ -45,9 +47,9 @@ def invariance(last: float) -> tuple[Funnel, Proved]:
     t = np.linspace(0, END, KNOTS)
     still = constant_on(t, np.zeros((KNOTS - 1, 1)))
     nothing = constant_on(t, np.zeros((KNOTS - 1, 0)))
-    policy = Policy(still, nothing, constant_on(t, np.zeros((KNOTS - 1, 0, 1))), "")
+    policy = ContinuousPolicy(still, nothing, constant_on(t, np.zeros((KNOTS - 1, 0, 1))), "")
     rho = FIRST + (last - FIRST) * t / END
-    funnel = Funnel(still, np.ones((KNOTS, 1, 1)), rho, "", "")
+    funnel = ContinuousFunnel(still, np.ones((KNOTS, 1, 1)), rho, "", "")
     return funnel, prove_pieces(LSteps(field), policy, funnel)
 
 

@@ -3,7 +3,7 @@
 Source: Seiler and Balas, "Quasiconvex sum-of-squares programming", CDC 2010: level 2.30.
 """
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.sos.search import largest_level
 

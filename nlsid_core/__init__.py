@@ -1,9 +1,25 @@
 """From recorded data to provably stable models, proved funnels and live monitors.
 
-The nouns of a funnel around a trajectory, and `load`, which reads whichever document a file holds.
+Importing it loads nothing: a name of `__all__` brings its module along when it is first used.
 """
 
-from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
-from nlsid_core.documents import load
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-__all__ = ["Funnel", "Nominal", "Policy", "VectorField", "load"]
+if TYPE_CHECKING:
+    from nlsid_core.documents import load
+    from nlsid_core.dynamics import Nominal, VectorField
+
+__all__ = ["Nominal", "VectorField", "load"]
+
+HOMES = {
+    "Nominal": "nlsid_core.dynamics",
+    "VectorField": "nlsid_core.dynamics",
+    "load": "nlsid_core.documents",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(HOMES[name]), name)

@@ -4,7 +4,7 @@
 
 Clarabel is called directly; every other solver by name through cvxpy. A solver's status is a
 rumour: what is returned is judged by the residuals computed here, and a caller that needs a proof
-takes the solution to `nlsid_core.certificate`.
+takes the solution to the kernel.
 """
 
 import importlib
@@ -18,7 +18,7 @@ import clarabel
 import numpy as np
 import scipy.sparse as sp
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 
 ConeKind: TypeAlias = Literal["zero", "nonnegative", "second_order", "psd"]

@@ -5,11 +5,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TypeAlias
 
-from nlsid_core import _json
-from nlsid_core.continuous import Funnel, Policy, VectorField
-from nlsid_core.discrete_funnel import DiscreteFunnel
+from nlsid_core import files
+from nlsid_core.arrays import Json
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnel import Funnel as EnergyTube
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.models import (
     BlockCascade,
     DifferenceEquation,
@@ -17,32 +19,37 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
     StateModel,
+    trapezoidal,
 )
-from nlsid_core.policy import Policy as TubePolicy
-from nlsid_core.tracking_policy import TrackingPolicy
+from nlsid_core.models.trapezoidal import TrapezoidalModel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.linear import LinearPolicy
+from nlsid_core.policies.sampled import SampledPolicy
 
 Noun: TypeAlias = (
-    Funnel | DiscreteFunnel | EnergyTube | Policy | TrackingPolicy | TubePolicy | VectorField
+    ContinuousFunnel | SampledFunnel | LinearFunnel
+    | ContinuousPolicy | SampledPolicy | LinearPolicy | VectorField
     | BlockCascade | DifferenceEquation | ImplicitModel | MonotoneEquation | StateAffineModel
-    | StateModel
+    | StateModel | TrapezoidalModel
 )  # fmt: skip
 
 # By format, and by kind where the format has kinds.
 READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType(
     {
-        ("nlsid/trajectory_funnel", None): Funnel.from_document,
-        ("nlsid/trajectory_policy", None): Policy.from_document,
+        ("nlsid/funnel", "continuous"): ContinuousFunnel.from_document,
+        ("nlsid/policy", "continuous"): ContinuousPolicy.from_document,
         ("nlsid/vector_field", None): VectorField.from_document,
-        ("nlsid/funnel", None): EnergyTube.from_document,
-        ("nlsid/funnel", "discrete"): DiscreteFunnel.from_document,
-        ("nlsid/policy", None): TubePolicy.from_document,
-        ("nlsid/policy", "time_varying"): TrackingPolicy.from_document,
+        ("nlsid/funnel", "linear"): LinearFunnel.from_document,
+        ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
+        ("nlsid/policy", "linear"): LinearPolicy.from_document,
+        ("nlsid/policy", "sampled"): SampledPolicy.from_document,
         ("nlsid/model", "block_cascade"): BlockCascade.from_document,
         ("nlsid/model", "difference_equation"): DifferenceEquation.from_document,
         ("nlsid/model", "implicit"): ImplicitModel.from_document,
         ("nlsid/model", "monotone_equation"): MonotoneEquation.from_document,
         ("nlsid/model", "state_affine"): StateAffineModel.from_document,
         ("nlsid/model", "state_map"): StateModel.from_document,
+        ("nlsid/model", trapezoidal.KIND): TrapezoidalModel.from_document,
     }
 )
 
@@ -50,13 +57,17 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
 def load(path: Path | str) -> Noun:
     """Read a funnel, policy, vector field or model of any kind; DocumentError says what is wrong.
 
-    For one kind only, ask its class: `Funnel.load(path)`, `Policy.load(path)`.
+    For one kind only, ask its class: `ContinuousFunnel.load(path)`, `ContinuousPolicy.load(path)`.
     """
-    document = _json.load_document(path)
-    name = _json.member(document, "format", str, source=str(path))
+    return read(files.load_document(path), source=str(path))
+
+
+def read(document: Json, *, source: str) -> Noun:
+    """`load` for a document in memory."""
+    name = files.member(document, "format", str, source=source)
     kind = document.get("kind")
     reader = READERS.get((name, kind if isinstance(kind, str) else None))
     if reader is None:
         known = ", ".join(sorted({f"{f} {k or ''}".strip() for f, k in READERS}))
-        raise DocumentError(f"{path}: no '{name}' of kind {kind!r} is known; known: {known}")
-    return reader(document, source=str(path))
+        raise DocumentError(f"{source}: no '{name}' of kind {kind!r} is known; known: {known}")
+    return reader(document, source=source)

@@ -16,6 +16,17 @@ class DataError(NlsidError, ValueError):
     """Data that cannot be used as given: NaN, unsorted time, a gap, no excitation."""
 
 
+class OptionError(DataError):
+    """An option that is not allowed; the message states its name, its value, what is allowed."""
+
+    def __init__(self, key: str, value: object, allowed: str) -> None:
+        super().__init__(key, value, allowed)
+        self.key, self.value, self.allowed = key, value, allowed
+
+    def __str__(self) -> str:
+        return f"{self.key} is {self.value!r}; it should be {self.allowed}"
+
+
 class BagError(DataError):
     """A bag that cannot be read as asked: damaged, or a missing topic, field or type."""
 
@@ -46,3 +57,17 @@ class Undecided(CertificateRejected):
 
 class CertificateMismatch(CertificateRejected):
     """A proof is about another model, policy or funnel than the files beside it."""
+
+
+def apart(*numbers: float) -> tuple[str, ...]:
+    """The numbers as text with so many digits that different ones read differently, at least 6."""
+    for digits in range(6, 16):
+        texts = tuple(f"{number:.{digits}g}" for number in numbers)
+        if len(set(texts)) == len(set(numbers)):
+            return texts
+    return tuple(repr(float(number)) for number in numbers)
+
+
+def percent(error: float) -> str:
+    """A model's error in %, as text; from 1000 % on the model diverges and digits say nothing."""
+    return f"{error:.2f} %" if error < 1000.0 else "diverges"

@@ -58,7 +58,9 @@ class BagPlayer(Node):
             names = self._topics or list(bag.topics)
             publishers = {
                 topic: self.create_publisher(
-                    message_class(bag.types_on(topic)[0]), topic, qos.STREAM
+                    message_class(bag.types_on(topic)[0]),
+                    topic,
+                    qos.playing_of(bag.offered(topic)),
                 )
                 for topic in names
             }

@@ -25,9 +25,9 @@ from std_srvs.srv import Trigger
 from bags.signals.grid import seconds
 from bags.signals.reader import read_signals
 from bags.signals.signal import SignalPath
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError, NlsidError
-from nlsid_core.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.messages import SignalMessage

@@ -23,19 +23,20 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
-from bags.monitoring.designs import Design
-from bags.monitoring.watch import Stamped, Watch
-from bags.recordings.message_types import is_stamped, standard_types
+from bags.monitoring.watch import WAITING, Stamped, Watch
+from bags.recordings.message_types import standard_types
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
-from nlsid_core import _json
-from nlsid_core.alarm import SEVERITY, AlarmOptions, Alert, State
+from nlsid_core import files
 from nlsid_core.errors import BagError, NlsidError
-from nlsid_core.reading import AnyReading, Nominal, Reading, Status
+from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription
+from nlsid_ros.documents import FunnelSubscription, declare_wiring
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
@@ -52,7 +53,6 @@ LEVELS = {
     State.UNKNOWN: DiagnosticStatus.STALE,
 }
 ALARM = [field.name for field in fields(AlarmOptions)]
-NOTHING = Alert(State.UNKNOWN, float("nan"))
 
 
 class FunnelMonitor(ManagedNode):
@@ -66,9 +66,10 @@ class FunnelMonitor(ManagedNode):
         self._controller = declare_text(
             self, "controller", "", "node that announces when a run starts; empty: first sample"
         )
-        self._nominal = Nominal(
+        self._centre = Centre(
             declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
+        self._wiring = declare_wiring(self)
         number = partial(declare_number, self, tunable=True)
         number("stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0))
         number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
@@ -98,15 +99,17 @@ class FunnelMonitor(ManagedNode):
         self._waiting: dict[str, SignalPath | SignalVector] = {}
         self._watch = None
         self._run: Run | None = None
-        self._said: tuple[AnyReading, Alert]
-        self._said = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel"), NOTHING
+        waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel")
+        self._said: tuple[Reading, State] = waiting, State.UNKNOWN
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
         self._judged = 0
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._funnel = FunnelSubscription(self, self._source, self._on_funnel, self._on_refusal)
+        self._funnel = FunnelSubscription(
+            self, self._source, self._on_funnel, self._on_refusal, wiring=self._wiring
+        )
         if self._controller:
             self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
         self.create_service(Trigger, "~/restart", self._on_restart)
@@ -124,10 +127,10 @@ class FunnelMonitor(ManagedNode):
         )
         self._release.cancel()
 
-    def _on_funnel(self, design: Design) -> None:
+    def _on_funnel(self, design: AnyDesign) -> None:
         """A funnel came, or another one: watch its signals from scratch."""
         watch = Watch(
-            design, nominal=self._nominal, options=self._options, announced=bool(self._controller)
+            design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
         signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
@@ -146,7 +149,7 @@ class FunnelMonitor(ManagedNode):
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0."""
         try:
-            self._run = Run.from_document(_json.parse_document(message.data, source="run"))
+            self._run = Run.from_document(files.parse_document(message.data, source="run"))
         except NlsidError as error:
             self.get_logger().error(f"announcement not used: {error}")
             return
@@ -163,7 +166,7 @@ class FunnelMonitor(ManagedNode):
 
     def _connect(self) -> None:
         """Subscribe to signals whose topic has appeared, once its type is known to carry them."""
-        if not self._waiting:
+        if not self._waiting or self._watch is None:
             return
         types = dict(self.get_topic_names_and_types())
         for role, path in list(self._waiting.items()):
@@ -174,9 +177,7 @@ class FunnelMonitor(ManagedNode):
             del self._waiting[role]
             kind = kinds[0]
             try:
-                path.check(kind, standard_types())
-                if not is_stamped(kind, standard_types()):
-                    raise BagError(f"{path.topic}: {kind} has no header stamp")
+                self._watch.pairing.check(path.topic, kind, standard_types())
             except BagError as error:
                 self.get_logger().error(str(error))
                 self._tell(str(error))
@@ -190,7 +191,8 @@ class FunnelMonitor(ManagedNode):
         watch = self._watch
         if watch is None:
             return
-        stamp_ns = stamp_ns_of(message)
+        logged = watch.pairing.clock == "log"
+        stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
         try:
             value = path.value(message)
         except BagError as error:
@@ -205,6 +207,8 @@ class FunnelMonitor(ManagedNode):
         judged = watch.response(stamp_ns, value)
         self._publish(judged)
         if not judged:
+            if watch.is_waiting:  # also before the first command, without which there is no sample
+                self._say(Reading(0.0, Status.UNKNOWN, reason=WAITING), State.UNKNOWN)
             due = self._heard_ns + round(self._command_wait * 1e9)
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
@@ -238,39 +242,39 @@ class FunnelMonitor(ManagedNode):
             name = self._watch.design.name
             self._publish(self._watch.flush())
             for entry in self._watch.missing(f"no {name} for {self._stale_after:g} s"):
-                self._say(entry.reading, entry.alert)
+                self._say(entry.reading, entry.state)
 
     def _publish(self, judged: Iterable[Stamped]) -> None:
         """Diagnostics first: an alarm should not wait behind a number."""
-        for stamp_ns, reading, alert in judged:
-            self._say(reading, alert)
-            self._publish_margin(stamp_ns, reading, alert)
+        for stamp_ns, reading, state in judged:
+            self._say(reading, state)
+            self._publish_margin(stamp_ns, reading)
 
-    def _publish_margin(self, stamp_ns: int, reading: AnyReading, alert: Alert) -> None:
+    def _publish_margin(self, stamp_ns: int, reading: Reading) -> None:
         latency_ns = self.get_clock().now().nanoseconds - stamp_ns
         self._slowest_ns = max(self._slowest_ns, latency_ns)
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         numbers = reading.numbers
-        message.name = [*numbers, "time_to_exit", "latency"]
-        message.position = array("d", (*numbers.values(), alert.time_to_exit, latency_ns * 1e-9))
+        message.name = [*numbers, "latency"]
+        message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)
 
     def _tell(self, reason: str) -> None:
         """Unknown, and why, at once."""
-        self._say(Reading(0.0, Status.UNKNOWN, reason=reason), NOTHING, at_once=True)
+        self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN, at_once=True)
 
-    def _say(self, reading: AnyReading, alert: Alert, *, at_once: bool = False) -> None:
+    def _say(self, reading: Reading, state: State, *, at_once: bool = False) -> None:
         """Publish diagnostics, and an event, if the state changed; remember what to repeat."""
-        before = self._said[1].state
-        self._said = reading, alert
-        if alert.state is before and not at_once:
+        before = self._said[1]
+        self._said = reading, state
+        if state is before and not at_once:
             return
         message = self._status_message()
         self._diagnostics.publish(message)
         self._events.publish(message)
-        worse = SEVERITY.get(alert.state, 0) >= SEVERITY[State.ASSUMPTION_VIOLATED]
+        worse = SEVERITY.get(state, 0) >= SEVERITY[State.ASSUMPTION_VIOLATED]
         if worse and SEVERITY.get(before, 0) < SEVERITY[State.ASSUMPTION_VIOLATED]:
             self._call_for_help()
 
@@ -292,21 +296,21 @@ class FunnelMonitor(ManagedNode):
         self._slowest_ns = 0
 
     def _status_message(self) -> DiagnosticArray:
-        reading, alert = self._said
+        reading, state = self._said
         watch = self._watch
         values = {
             **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
             "worst axis": reading.worst_axis,
-            "time to exit [s]": f"{alert.time_to_exit:.4g}",
+            "assuming": reading.assuming,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
-        text = alert.state.value + (f": {reading.reason}" if reading.reason else "")
+        text = state.value + (f": {reading.reason}" if reading.reason else "")
         stamp = self.get_clock().now().to_msg()
-        return status(stamp, name_of(self), LEVELS[alert.state], text, values)
+        return status(stamp, name_of(self), LEVELS[state], text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""

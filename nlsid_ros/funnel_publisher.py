@@ -19,10 +19,10 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from bags.monitoring import documents
-from bags.monitoring.designs import Design
-from bags.monitoring.documents import Proved, load_proved
-from nlsid_core._types import Json
+from bags.designs import documents
+from bags.designs.design import AnyDesign
+from bags.designs.documents import Proved, load_proved
+from nlsid_core.arrays import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
@@ -75,7 +75,13 @@ class FunnelPublisher(ManagedNode):
 
     def _files(self, path: Path) -> list[tuple[int, int]]:
         """When each file last changed, and its size."""
-        names = (documents.MODEL, documents.POLICY, documents.FUNNEL_PROOF, path.name)
+        names = (
+            documents.MODEL,
+            documents.VECTOR_FIELD,
+            documents.POLICY,
+            documents.FUNNEL_PROOF,
+            path.name,
+        )
         found = (path.with_name(name) for name in names)
         states = (each.stat() for each in found if each.exists())
         return [(state.st_mtime_ns, state.st_size) for state in states]
@@ -89,7 +95,7 @@ class FunnelPublisher(ManagedNode):
         with suppress(NlsidError, OSError):  # said by _load
             self._publish(self._load(self._path))
 
-    def _load(self, path: Path) -> Proved[Design]:
+    def _load(self, path: Path) -> Proved[AnyDesign]:
         try:
             return load_proved(path)
         except (NlsidError, OSError) as refusal:
@@ -97,7 +103,7 @@ class FunnelPublisher(ManagedNode):
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
 
-    def _publish(self, proved: Proved[Design]) -> None:
+    def _publish(self, proved: Proved[AnyDesign]) -> None:
         for name in ("model", "policy", "funnel"):
             document: Json = getattr(proved.design, name).document()
             self._latched[name].publish(String(data=json.dumps(document)))
@@ -105,8 +111,6 @@ class FunnelPublisher(ManagedNode):
         self._latched["nominal"].publish(nominal_trajectory(proved.design))
         self._say(DiagnosticStatus.OK, str(proved.verdict))
         self.get_logger().info(str(proved.verdict))
-        for assumption in proved.verdict.assumptions:
-            self.get_logger().info(f"assuming {assumption}")
 
     def _say(self, level: bytes, message: str) -> None:
         now = self.get_clock().now().to_msg()

@@ -19,7 +19,7 @@ from rclpy.utilities import try_shutdown
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.samples import f1tenth
 from nlsid_core.errors import NlsidError
 from nlsid_ros.excitation import Excitation
@@ -38,7 +38,8 @@ graph of the running processes against it. `~` is the node's name; every name ca
 node put in a namespace. Topics in *italics* are named by the funnel's model or by a parameter; here
 they are the F1TENTH car's. All nodes also have the services of a
 [lifecycle node](https://design.ros2.org/articles/node_lifecycle.html). A parameter is read when the
-node is made; those marked • can be changed while it runs.
+node is made; those marked • can be changed while it runs. The words are explained
+in the [glossary](glossary.md).
 """
 PATIENCE = 20.0  # s for the nodes to find each other
 SIGNALS = {"/odom", "/cmd_vel"}

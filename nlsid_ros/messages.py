@@ -7,7 +7,7 @@ import numpy as np
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
-from nlsid_core._types import ArrayLike
+from nlsid_core.arrays import ArrayLike
 from nlsid_core.errors import BagError
 from nlsid_ros.message_classes import message_class
 

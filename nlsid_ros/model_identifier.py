@@ -15,9 +15,9 @@ from std_srvs.srv import Trigger
 
 from bags.chain.background import BackgroundIdentification, Progress
 from bags.chain.config import load_config
-from bags.monitoring import documents
-from nlsid_core.certificate import check
+from bags.designs import documents
 from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.proofs import check
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
 from nlsid_ros.running import ManagedNode, declare, declare_text, run

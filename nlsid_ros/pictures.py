@@ -1,5 +1,7 @@
 """A funnel as RViz, Foxglove and trajectory tools show it."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from builtin_interfaces.msg import Duration
 from geometry_msgs.msg import Point
@@ -7,29 +9,50 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bags.monitoring.designs import Design, LinearDesign
-from nlsid_core._types import FloatArray
+from bags.designs.design import AnyDesign, is_continuous, is_linear, is_sampled
+from nlsid_core.arrays import FloatArray
 
 LINE = 0.005  # m, width of the lines
 NOMINAL, EDGE = ColorRGBA(r=0.2, g=0.4, b=1.0, a=1.0), ColorRGBA(r=0.2, g=0.7, b=0.2, a=1.0)
 
 
-def tube_lines(design: Design) -> list[tuple[str, FloatArray, FloatArray]]:
-    """(name, nominal (N,), half-width (N,) or scalar) of what is drawn, in the signals' units.
-
-    The output of a difference equation, y_k = C x_k + D u_k + c; of a state model every state.
+@dataclass(frozen=True)
+class Plan:
+    """What is drawn: t (N,) s, the names of the signals, nominal and half-widths (N, n), and the
+    nominal inputs (M, m), M <= N.
     """
-    if isinstance(design, LinearDesign):
-        nominal = design.policy.x[:, 0] + design.model.D * design.policy.u + design.model.c
-        return [(design.model.y.name, nominal, np.array(design.funnel.half_width))]
-    columns = zip(design.model.x, design.policy.x.T, design.funnel.half_widths.T, strict=True)
-    return [(signal.name, nominal, width) for signal, nominal, width in columns]
+
+    t: FloatArray
+    names: tuple[str, ...]
+    nominal: FloatArray
+    half_widths: FloatArray
+    inputs: FloatArray
 
 
-def tube_markers(design: Design, frame: str) -> MarkerArray:
+def plan_of(design: AnyDesign) -> Plan:
+    """The output of a linear model, y_k = C x_k + D u_k + c; of the others every state."""
+    if is_continuous(design):
+        funnel = design.funnel
+        widths = np.array([funnel.widths(t) for t in funnel.t])
+        names = tuple(f"x{i}" for i in range(funnel.n))
+        return Plan(funnel.t - funnel.t0, names, funnel.x.ends(), widths, design.policy.planned)
+    if is_linear(design):
+        model, policy = design.model, design.policy
+        nominal = policy.x[:, 0] + model.D * policy.u + model.c
+        t = np.arange(len(nominal)) * policy.period
+        width = np.full((len(t), 1), design.funnel.half_width)
+        return Plan(t, (model.y.name,), nominal[:, None], width, policy.u[:, None])
+    assert is_sampled(design)
+    t = np.arange(len(design.policy.x)) * design.policy.period
+    names = tuple(signal.name for signal in design.model.x)
+    return Plan(t, names, design.policy.x, design.funnel.half_widths, design.policy.u)
+
+
+def tube_markers(design: AnyDesign, frame: str) -> MarkerArray:
     """The plan and the tube's edges over time: 1 m along x is 1 s, along y one unit."""
-    markers = []
-    for name, nominal, width in tube_lines(design):
+    plan, markers = plan_of(design), []
+    columns = zip(plan.names, plan.nominal.T, plan.half_widths.T, strict=True)
+    for name, nominal, width in columns:
         lines = ((nominal, NOMINAL), (nominal + width, EDGE), (nominal - width, EDGE))
         for number, (values, color) in enumerate(lines):
             marker = Marker(ns=f"tube {name}", id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
@@ -37,27 +60,26 @@ def tube_markers(design: Design, frame: str) -> MarkerArray:
             marker.pose.orientation.w = 1.0
             marker.scale.x, marker.color = LINE, color
             marker.points = [
-                Point(x=k * design.policy.period, y=float(value)) for k, value in enumerate(values)
+                Point(x=t, y=value)
+                for t, value in zip(plan.t.tolist(), values.tolist(), strict=True)
             ]
             markers.append(marker)
     return MarkerArray(markers=markers)
 
 
-def nominal_trajectory(design: Design) -> JointTrajectory:
-    """The plan: of a difference equation the output as position, the input as effort; of a state
-    model the first half of the state as positions, the rest as velocities.
+def nominal_trajectory(design: AnyDesign) -> JointTrajectory:
+    """The plan: of a linear model the output as position, the input as effort; of a state the
+    first half as positions, the rest as velocities.
     """
-    columns = [nominal for _, nominal, _ in tube_lines(design)]
-    u = design.policy.u.reshape(len(design.policy), -1)
-    joints = (len(columns) + 1) // 2
-    message = JointTrajectory(joint_names=[name for name, _, _ in tube_lines(design)[:joints]])
-    for k, efforts in enumerate(u):
-        seconds, nanoseconds = divmod(round(k * design.policy.period * 1e9), 10**9)
-        state = [float(column[k]) for column in columns]
+    plan = plan_of(design)
+    joints = (len(plan.names) + 1) // 2
+    message = JointTrajectory(joint_names=list(plan.names[:joints]))
+    for t, state, efforts in zip(plan.t.tolist(), plan.nominal, plan.inputs, strict=False):
+        seconds, nanoseconds = divmod(round(t * 1e9), 10**9)
         message.points.append(
             JointTrajectoryPoint(
-                positions=state[:joints],
-                velocities=state[joints:],
+                positions=state[:joints].tolist(),
+                velocities=state[joints:].tolist(),
                 effort=efforts.tolist(),
                 time_from_start=Duration(sec=seconds, nanosec=nanoseconds),
             )

@@ -19,12 +19,12 @@ from std_srvs.srv import Trigger
 
 from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
-from bags.monitoring.documents import load_model
+from bags.designs.documents import load_model
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.plants import ModelPlant, Pendulum, Plant, Satellite
+from nlsid_core.running.plants import ModelPlant, Pendulum, Plant, Satellite
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run

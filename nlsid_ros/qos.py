@@ -12,6 +12,8 @@ EVENTS: diagnostics. Reliable; a few pending are enough.
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from bags.recordings.quality import Profile
+
 DOCUMENT = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
@@ -47,6 +49,20 @@ def subscription_to(offered: list[ReliabilityPolicy]) -> QoSProfile:
         depth=STREAM.depth,
         reliability=ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def playing_of(recorded: tuple[Profile, ...]) -> QoSProfile:
+    """STREAM, and latched if every publisher was when the bag was recorded.
+
+    Reliable, whatever was offered: that serves every subscriber.
+    """
+    latched = bool(recorded) and all(profile.latched for profile in recorded)
+    return QoSProfile(
+        history=STREAM.history,
+        depth=STREAM.depth,
+        reliability=STREAM.reliability,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else STREAM.durability,
     )
 
 

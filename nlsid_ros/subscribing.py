@@ -9,6 +9,7 @@ from typing import NamedTuple
 from rclpy.node import Node
 
 from bags.recordings.definitions import Definition
+from bags.recordings.quality import Profile, profile_of
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
@@ -40,6 +41,7 @@ class _Undefined(NamedTuple):
     source: Source
     msgtype: str
     type_hash: str
+    offered: tuple[Profile, ...]
 
 
 @dataclass
@@ -47,7 +49,7 @@ class Listener:
     """What becomes of the topics: all called with the topic's name first."""
 
     expect: Callable[[str], None]
-    begin: Callable[[str, Definition], Received]
+    begin: Callable[[str, Definition, tuple[Profile, ...]], Received]
     lose: Callable[[str, int], None]
 
 
@@ -106,7 +108,12 @@ class Subscriptions:
             on_lost=partial(self.listener.lose, topic),
             on_incompatible=partial(self._warn_of_unheard, topic),
         )
-        self._undefined[topic] = _Undefined(source, msgtype, str(publishers[0].topic_type_hash))
+        self._undefined[topic] = _Undefined(
+            source,
+            msgtype,
+            str(publishers[0].topic_type_hash),
+            tuple(profile_of(publisher.qos_profile) for publisher in publishers),
+        )
 
     def _define(self, topic: str) -> None:
         """What has come meanwhile waits in the middleware."""
@@ -115,7 +122,7 @@ class Subscriptions:
             definition = self.types.find(found.msgtype, found.type_hash)
             if definition is None:
                 return
-            found.source.callback = self.listener.begin(topic, definition)
+            found.source.callback = self.listener.begin(topic, definition, found.offered)
         except NlsidError as error:
             self.polled.drop(found.source)
             self._refuse(topic, error)

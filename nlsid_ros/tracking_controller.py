@@ -22,18 +22,18 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
-from bags.monitoring.designs import Design
 from bags.recordings.message_types import standard_types
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
-from nlsid_core import _json
-from nlsid_core.controller import Limits
+from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription
+from nlsid_ros.documents import FunnelSubscription, declare_wiring
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
@@ -69,7 +69,8 @@ class TrackingController(ManagedNode):
         number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG))
         number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
         number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
-        self._controller: Any = None  # a Controller or a TrackingController
+        self._wiring = declare_wiring(self)
+        self._controller: Controller | None = None
         self._stopping = ""
         self.tune(self.tunable())
 
@@ -85,7 +86,7 @@ class TrackingController(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
-        self._design: Design | None = None
+        self._design: AnyDesign | None = None
         self._controller = None
         self._command: SignalMessage | None = None
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
@@ -97,7 +98,9 @@ class TrackingController(ManagedNode):
         self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self._funnel = FunnelSubscription(self, self._source, self._on_funnel, self._tell)
+        self._funnel = FunnelSubscription(
+            self, self._source, self._on_funnel, self._tell, wiring=self._wiring
+        )
         self._due = self.create_timer(1.0, self._on_due)
         self._due.cancel()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
@@ -112,14 +115,14 @@ class TrackingController(ManagedNode):
         if self._controller is None and not self._stopping:
             return
         assert self._design is not None
-        period = self._design.model.period
+        period = self._design.period
         self._halt("the node stops")
         while not self._limits.at_rest(self._input):
             self._step_down()
             time.sleep(period)
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
-    def _on_funnel(self, design: Design) -> None:
+    def _on_funnel(self, design: AnyDesign) -> None:
         """Take a funnel, but never in the middle of a run: stop that first."""
         if self._controller is not None or self._stopping:
             self._halt("the funnel was replaced")
@@ -150,7 +153,11 @@ class TrackingController(ManagedNode):
             return "there is no funnel yet"
         if self._controller is not None or self._stopping:
             return "a run is on"
-        self._controller = self._design.controller(self._limits, self._settling)
+        try:
+            self._controller = self._design.controller(self._limits, self._settling)
+        except NlsidError as error:
+            self._tell(f"idle; not started: {error}")
+            return str(error)
         self._first_ns = None
         self._stale.timer_period_ns = round(self._stale_after * 1e9)
         self._tell("waiting for the response")
@@ -177,7 +184,7 @@ class TrackingController(ManagedNode):
                 return
             if waiting and controller.k >= 1:
                 announced = Run(stamp_ns, self._funnel.digest).document()
-                self._announce.publish(String(data=_json.canonical(announced).decode()))
+                self._announce.publish(String(data=files.encode(announced).decode()))
                 self._tell("tracking")
         self._stale.reset()
         self._schedule(stamp_ns + round(controller.lead * 1e9))
@@ -204,11 +211,11 @@ class TrackingController(ManagedNode):
                 self._stopping = ""
             else:
                 assert self._design is not None
-                self._schedule(self._due_ns + round(self._design.model.period * 1e9))
+                self._schedule(self._due_ns + round(self._design.period * 1e9))
 
     def _step_down(self) -> None:
         assert self._design is not None
-        self._input = self._limits.towards_stop(self._input, self._design.model.period)
+        self._input = self._limits.towards_stop(self._input, self._design.period)
         self._send(self.get_clock().now().nanoseconds)
 
     def _send(self, stamp_ns: int) -> None:

@@ -23,11 +23,12 @@ from std_srvs.srv import Trigger
 from bags.recordings.definitions import Definition, read_definitions
 from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.part import COMPRESSIONS
+from bags.recordings.quality import Profile
 from bags.recordings.repair import repair, unfinished_bags
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Recent
 from bags.signals.recording import Recording
-from nlsid_core import _json
+from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import status
@@ -123,6 +124,7 @@ class TrajectoryRecorder(ManagedNode):
         """Subscribe to what is there already, and open a bag unless that is to wait."""
         self._expected: list[str] = []
         self._recorded: dict[str, Definition] = {}
+        self._offered: dict[str, tuple[Profile, ...]] = {}
         self._recent = Recent(self._snapshot) if self._snapshot else None
         self._snapshots = 0
         self._experiment: dict[str, str] = {}
@@ -179,7 +181,7 @@ class TrajectoryRecorder(ManagedNode):
         for topic in self._expected:
             self._recording.expect(topic)
         for topic, definition in self._recorded.items():
-            self._recording.add_topic(topic, definition)
+            self._recording.add_topic(topic, definition, self._offered[topic])
         self._recording.annotate(self._experiment)
         self.get_logger().info(
             f"recording {', '.join(each.topic for each in self._wanted)} to {path}"
@@ -191,10 +193,12 @@ class TrajectoryRecorder(ManagedNode):
         if self._recording is not None:
             self._recording.expect(topic)
 
-    def _begin_topic(self, topic: str, definition: Definition) -> Received:
+    def _begin_topic(
+        self, topic: str, definition: Definition, offered: tuple[Profile, ...]
+    ) -> Received:
         if self._recording is not None:
-            self._recording.add_topic(topic, definition)
-        self._recorded[topic] = definition
+            self._recording.add_topic(topic, definition, offered)
+        self._recorded[topic], self._offered[topic] = definition, offered
         return partial(self._record, topic, definition.msgtype, definition.is_stamped)
 
     def _record(
@@ -220,7 +224,7 @@ class TrajectoryRecorder(ManagedNode):
     def _on_experiment(self, message: String) -> None:
         """Keep what an excitation says it does; how one ended is for the bag it was in."""
         try:
-            said = _json.parse_document(message.data)
+            said = files.parse_document(message.data)
         except NlsidError as error:
             self.get_logger().warning(f"{self._said_by} is not in the bag's metadata: {error}")
             return
@@ -274,7 +278,7 @@ class TrajectoryRecorder(ManagedNode):
         self._snapshots += 1
         base = self._recording.bag.path if self._recording is not None else Path(self._name or NAME)
         path = base.with_name(f"{base.name}_snapshot_{self._snapshots}")
-        count = self._recent.save(path, definitions=self._recorded)
+        count = self._recent.save(path, definitions=self._recorded, offered=self._offered)
         return True, f"{count} messages in {path}"
 
     def _report(self) -> None:

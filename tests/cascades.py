@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.models import BlockCascade, Signal, Spline
-from nlsid_core.trajectory import Trajectory
 
 
 def truth() -> BlockCascade:

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.monitoring.documents import FUNNEL, FUNNEL_PROOF, MODEL, MODEL_PROOF, POLICY
-from nlsid_core import _json
-from nlsid_core.funnels import TubeDesign, design_tube
+from bags.designs.documents import MODEL, MODEL_PROOF
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import TubeDesign, design_tube
 from nlsid_core.identification import Fit, LinearClass, identify
 from nlsid_core.models import DifferenceEquation
-from nlsid_core.trajectory import Dataset, Trajectory
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -83,13 +83,6 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> TubeDesign:
 @pytest.fixture
 def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: TubeDesign) -> Path:
     """Model, policy, funnel and both proofs as files, as the command line writes them."""
-    model = design.model
-    for name, document in (
-        (MODEL, model.document()),
-        (MODEL_PROOF, fit.proof.document(model, MODEL)),
-        (POLICY, design.policy.document()),
-        (FUNNEL, design.funnel.document()),
-        (FUNNEL_PROOF, design.proof_document(model=MODEL, policy=POLICY, funnel=FUNNEL)),
-    ):
-        _json.write_document(tmp_path / name, document)
+    design.save(tmp_path)
+    files.write_document(tmp_path / MODEL_PROOF, fit.proof.document(design.model, MODEL))
     return tmp_path

@@ -7,9 +7,9 @@ import numpy as np
 import yaml
 
 from bags.chain.joint_bags import write_joint_bag
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.models import BlockCascade, Signal, Spline
-from nlsid_core.trajectory import Trajectory
 
 PERIOD = 0.01
 MIMO = (

@@ -1,7 +1,9 @@
 """Implicit models that tests share."""
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
+from nlsid_core.arrays import FloatArray
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 
@@ -68,4 +70,18 @@ def rotated(degrees: float = 120.0) -> ImplicitModel:
         ),
         monotonicity=0.9, period=0.1, states=("a", "b"), inputs=("u",),
         centre=Polynomials(basis[:2], R.T),
+    )  # fmt: skip
+
+
+def linear(A: FloatArray) -> ImplicitModel:
+    """P x⁺ = P A x + e₁w with a Lyapunov matrix P of A (of any A, if A is unstable P = I)."""
+    P = np.eye(2)
+    if max(abs(np.linalg.eigvals(A))) < 1.0:
+        P = solve_discrete_lyapunov(A.T, np.eye(2))
+        P = (P + P.T) / 2.0
+    units = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    return ImplicitModel.separable(
+        e=Polynomials(units[:2, :2], P),
+        f=Polynomials(units, np.vstack([(P @ A).T, [[1.0, 0.0]]])),
+        monotonicity=0.5, period=0.1, states=("a", "b"), inputs=("u",),
     )  # fmt: skip

@@ -4,14 +4,14 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.identification.moments import (
     MonotoneClass,
     Offsets,
 )
 from nlsid_core.models import MonotoneEquation, Signal
 from nlsid_core.polynomial import Polynomial, constant
-from nlsid_core.trajectory import Trajectory
 
 NOISE = 0.05
 CLASS = MonotoneClass(2, (0,))

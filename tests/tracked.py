@@ -6,18 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import FloatArray
-from nlsid_core.discrete_funnel import DisturbanceAssumption
-from nlsid_core.funnels.motion import Feedback, plan_motion, track, tvlqr
-from nlsid_core.funnels.state_funnel import FunnelDesign, design_state_funnel
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
+from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
+from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.models import Signal
 from nlsid_core.models.state_map import StateModel
-from nlsid_core.tracking_policy import TrackingPolicy
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.observer import StateObserver
 
 PERIOD = 0.02
 STEPS = 25
 BOUND = 0.02
+NOISE = np.array([1e-4, 1e-3])
 EXPONENTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [3, 0, 0]]
 
 
@@ -35,8 +38,8 @@ def pendulum() -> StateModel:
         exponents=np.array(EXPONENTS),
         coefficients=np.array(coefficients),
         period=PERIOD,
-        x=(Signal("angle", "rad"), Signal("rate", "rad/s")),
-        u=(Signal("torque", "N m"),),
+        x=(Signal("angle", "rad", "/arm:position[0]"), Signal("rate", "rad/s", "/arm:velocity[0]")),
+        u=(Signal("torque", "N m", "/torque:effort[0]"),),
         x_range=np.array([[-1.2, 1.2], [-4.0, 4.0]]),
         u_range=np.array([[-10.0, 10.0]]),
         noise=np.array([1e-3, 1e-2]),
@@ -50,7 +53,7 @@ class Tracked:
     """Model, motion and feedback before any funnel."""
 
     model: StateModel
-    policy: TrackingPolicy
+    policy: SampledPolicy
     feedback: Feedback
 
 
@@ -74,36 +77,51 @@ def assumption(form: str = "response", bound: float = BOUND) -> DisturbanceAssum
 
 
 @cache
-def designed(form: str = "response", goal: float = 0.4) -> FunnelDesign:
+def designed(form: str = "response", goal: float = 0.4) -> TrackingDesign:
     """The funnel around that motion."""
     base = tracked(goal)
     return design_state_funnel(base.model, base.policy, base.feedback, assumption=assumption(form))
 
 
-def write(design: FunnelDesign, folder: Path) -> Path:
+def write(design: TrackingDesign, folder: Path) -> Path:
     """Model, policy, funnel and proof as files; the proof's path."""
-    documents = {
-        "model.json": design.model.document(),
-        "policy.json": design.policy.document(),
-        "funnel.json": design.funnel.document(),
-        "funnel.proof.json": design.proof_document(
-            model="model.json", policy="policy.json", funnel="funnel.json"
-        ),
-    }
-    for name, document in documents.items():
-        _json.write_document(folder / name, document)
-    return folder / "funnel.proof.json"
+    return design.save(folder)[-1]
 
 
-def resigned(design: FunnelDesign, **changes: object) -> FunnelDesign:
+def resigned(design: TrackingDesign, **changes: object) -> TrackingDesign:
     """The design with another funnel, policy or model and every digest made to fit again."""
     design = replace(design, **changes)  # type: ignore[arg-type]
-    policy = replace(design.policy, model=_json.digest(design.model.document()))
-    funnel = replace(design.funnel, model=policy.model, policy=_json.digest(policy.document()))
+    policy = replace(design.policy, model=files.digest(design.model.document()))
+    funnel = replace(design.funnel, model=policy.model, policy=files.digest(policy.document()))
     return replace(design, policy=policy, funnel=funnel)
 
 
-def step(design: FunnelDesign, k: int, x: FloatArray) -> FloatArray:
+def step(design: TrackingDesign, k: int, x: FloatArray) -> FloatArray:
     """One undisturbed step of the closed loop from x (..., n)."""
     u = design.policy.u[k] - (x - design.policy.x[k]) @ design.policy.K[k].T
     return design.model(x, u)
+
+
+def run(
+    *,
+    seed: int = 0,
+    kick: FloatArray | None = None,
+    kick_at: int = 8,
+    start: FloatArray | None = None,
+) -> Trajectory:
+    """The policy on its own model with a little noise; a kick moves the state once."""
+    base = tracked()
+    rng = np.random.default_rng(seed)
+    observer = StateObserver(base.model, base.policy.L)
+    x = base.policy.x[0] if start is None else start
+    y, u = np.empty((STEPS + 1, 2)), np.zeros((STEPS + 1, 1))
+    for k in range(STEPS + 1):
+        y[k] = x + NOISE * rng.standard_normal(2)
+        estimate = observer.update(y[k], u[k - 1] if k else None)
+        if k < STEPS:
+            u[k] = base.policy(k, estimate)
+            x = base.model(x, u[k])
+            if kick is not None and k == kick_at:
+                x = x + kick
+    t = np.arange(STEPS + 1) * PERIOD
+    return Trajectory(t=t, y=y, u=u, name=f"run_{seed}", digest=f"sha256:run{seed}")

@@ -7,12 +7,12 @@ from pathlib import Path
 from bags.chain.config import Config
 from bags.chain.identification_config import IdentificationConfig
 from bags.chain.steps import Identified, Progress, Trials, part, read_trials, write_identified
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.pictures.choices import Scored, draw_comparison, draw_selection
 from bags.pictures.report import report_available
-from nlsid_core._json import write_atomically
 from nlsid_core.errors import DataError, Infeasible, NlsidError
-from nlsid_core.identification import Fit, Model, Selection, describe, methods_of, select
+from nlsid_core.files import write_atomically
+from nlsid_core.identification import Fit, Model, Selection, describe, identify, select
 from nlsid_core.identification.prediction import history
 
 
@@ -57,11 +57,8 @@ def select_bags(
         [section.model_class for section in sections],
         method=base.method,
         test=trials.test,
-        iterations=base.iterations,
         transient=base.transient,
         allow_unproved=base.allow_unproved,
-        accept_untested_repeats=base.accept_untested_repeats,
-        seed=base.seed,
         progress=part(progress, 0.3, 0.9),
     )
     identified = write_identified(selection.fit, trials, config, out, progress=progress)
@@ -126,14 +123,17 @@ def _every_method(
     section: IdentificationConfig, trials: Trials, progress: Progress
 ) -> tuple[Fit[Model] | None, str]:
     """A fit with a candidate of every method there is one of, and why the configured has none."""
-    known = methods_of(section.model_class)
     refusal = ""
-    for method in (section.method, *(m for m in known if m != section.method)):
+    methods = section.every_method()
+    for method in methods:
         try:
-            fit = section.model_copy(update={"method": method}).identify(
+            fit = identify(
                 trials.train,
+                section.model_class,
+                method=method,
+                comparators=methods,
                 validation=trials.validation,
-                comparators=known,
+                transient=section.transient,
                 allow_unproved=True,
                 progress=progress,
             )

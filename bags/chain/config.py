@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from bags.chain.identification_config import IdentificationConfig
+from bags.chain.identification_config import Identification
 from bags.chain.sections import (
     Corner,
     Names,
@@ -15,7 +15,7 @@ from bags.chain.sections import (
     SignalConfig,
     read_yaml,
 )
-from nlsid_core.monitor import Nominal
+from nlsid_core.running.comparison import Centre
 
 
 def _listed(value: object) -> object:
@@ -26,6 +26,8 @@ def _listed(value: object) -> object:
 Signals = Annotated[
     tuple[SignalConfig, ...], BeforeValidator(_listed), Field(min_length=1, strict=False)
 ]
+Clock = Literal["header", "log"]
+Files = Annotated[tuple[Annotated[Path, Field(strict=False)], ...], Field(strict=False)]
 Values = Annotated[tuple[object, ...], Field(min_length=1, strict=False)]
 
 
@@ -37,14 +39,19 @@ class SignalsConfig(Section):
 
 
 class GridConfig(Section):
-    """period: s between samples. max_gap: s without a response that is still interpolated.
+    """period: s between samples. max_gap: s without a response that is still filled in.
 
-    split_gaps: cut a trial where a response is missing for longer, or is NaN, and count what is
+    resample: `none`, responses are samples as they come, a period apart; `last` or `linear`, they
+    are put on a grid of the period, the latest value or one on the line between two values at most
+    max_gap apart (`bags.signals.sampling`). hold: s for which a command is held (default: max_gap).
+    split_gaps: cut a trial where a signal is missing for longer, or is NaN, and count what is
     skipped, instead of refusing it.
     """
 
     period: Positive
     max_gap: Positive
+    resample: Literal["none", "last", "linear"] = "none"
+    hold: Positive | None = None
     split_gaps: bool = False
 
 
@@ -94,25 +101,30 @@ class MonitorConfig(Section):
     command_wait: NonNegative = 0.02
 
     @property
-    def nominal_source(self) -> Nominal:
+    def nominal_source(self) -> Centre:
         """The same as the core's noun."""
-        return Nominal(self.nominal)
+        return Centre(self.nominal)
 
 
 class Config(Section):
     """One robot's configuration file.
 
-    select: values of the identification's options for `nlsid select` to try. compare: what
-    `nlsid compare` scores (default: the identification). funnel: for `nlsid funnel`.
+    clock: the stamps of the signals, `header` or, where some have none, `log`: the times at which
+    they were logged. definitions: .msg files or packages' folders that define types which the bags
+    do not, seen from the configuration. select: values of the identification's options for
+    `nlsid select` to try. compare: what `nlsid compare` scores (default: the identification).
+    funnel: for `nlsid funnel`.
     """
 
     robot: str
     signals: SignalsConfig
+    clock: Clock = "header"
+    definitions: Files = ()
     grid: GridConfig
     split: SplitConfig = SplitConfig()
-    identification: IdentificationConfig
+    identification: Identification
     select: dict[str, Values] | None = None
-    compare: Annotated[tuple[IdentificationConfig, ...], Field(strict=False)] = ()
+    compare: Annotated[tuple[Identification, ...], Field(strict=False)] = ()
     funnel: FunnelConfig | None = None
     monitor: MonitorConfig = MonitorConfig()
 
@@ -122,4 +134,8 @@ def load_config(path: Path | str) -> Config:
 
     OS errors pass through.
     """
-    return read_yaml(path, Config)
+    config = read_yaml(path, Config)
+    folder = Path(path).parent
+    return config.model_copy(
+        update={"definitions": tuple(folder / given for given in config.definitions)}
+    )

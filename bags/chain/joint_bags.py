@@ -9,8 +9,8 @@ import numpy as np
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.grid import REPEAT_GROUP
-from nlsid_core._types import FloatArray
-from nlsid_core.trajectory import Trajectory
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 
 JOINTS: Final = "sensor_msgs/msg/JointState"
 STATES, COMMANDS = "/joint_states", "/joint_commands"

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core._types import ArrayLike, FloatArray
+from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.errors import DataError
 
 PERIOD = 0.01  # s, what the drives and encoders of both robots run at

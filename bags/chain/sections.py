@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -21,21 +21,15 @@ Names = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class Section(BaseModel):
-    """A part of the file: unknown keys are errors, values are not coerced across types.
-
-    tag: what pydantic calls the section in a choice of several; never shown. hidden: fields that a
-    section inherits and does not take.
-    """
+    """A part of the file: unknown keys are errors, values are not coerced across types."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-    tag: ClassVar[str] = ""
-    hidden: ClassVar[frozenset[str]] = frozenset()
 
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, content: Any) -> Any:
         if isinstance(content, dict):
-            known = [key for key in cls.model_fields if key not in cls.hidden]
+            known = list(cls.model_fields)
             for key in content:
                 if key not in known:
                     raise PydanticCustomError(
@@ -87,19 +81,12 @@ def problems(error: ValidationError, *, prefix: Sequence[str] = ()) -> str:
 
 
 def _problem(details: ErrorDetails, prefix: Sequence[str]) -> str:
-    tags = {section.tag for section in _all_sections(Section)}
-    where = [str(part) for part in (*prefix, *details["loc"]) if part not in tags]
+    where = [str(part) for part in (*prefix, *details["loc"])]
     found = details["input"]
     if details["type"] == UNKNOWN_KEY:
         key = details["ctx"]["key"]
         where.append(key)
         found = found[key]
     message = details["msg"].removeprefix("Value error, ")
-    return f"{'.'.join(where)}: {message} (found {found!r:.60})"
-
-
-def _all_sections(root: type[Section]) -> list[type[Section]]:
-    found = [root]
-    for child in root.__subclasses__():
-        found += _all_sections(child)
-    return found
+    said = f"{'.'.join(where)}: {message}"
+    return said if message == "Field required" else f"{said} (found {found!r:.60})"

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bags.chain.plants import PERIOD, Plant, Robot
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.tracking_monitor import StateObserver
-from nlsid_core.tracking_policy import TrackingPolicy
-from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.observer import StateObserver
 
 TONES = 40  # sines of an excitation
 LOWEST, HIGHEST = 0.05, 1.5  # Hz: slower than the robots swing, and faster
@@ -62,7 +62,7 @@ def record_repeats(
 def run_policy(
     robot: Robot,
     model: MeasuredState,
-    policy: TrackingPolicy,
+    policy: SampledPolicy,
     *,
     seed: int,
     start: FloatArray | None = None,

@@ -7,26 +7,31 @@ from pathlib import Path
 from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_training, save_training
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.pictures.report import report_available, write_report
+from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
-from nlsid_core import _json
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import LinearTube, TubeDesign, design
 from nlsid_core.errors import DataError
-from nlsid_core.funnels import TubeDesign, design_tube
 from nlsid_core.identification import Fit, Model
-from nlsid_core.trajectory import Dataset, Trajectory
 
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """The bags' trials by what they are for, and how many samples were skipped in gaps."""
+    """The bags' trials by what they are for, and how many samples were skipped in gaps.
+
+    absent: names in the configuration's split that none of the bags has.
+    """
 
     train: Dataset
     test: Dataset
     validation: Dataset | None = None
     skipped: int = 0
+    absent: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,22 +79,22 @@ def write_identified(
         out / name for name in (documents.TRAINING, documents.MODEL, documents.MODEL_PROOF)
     )
     model: Model = replace(fit.model, training=save_training(training, trials.train))
-    _json.write_document(path, model.document())
-    files = [path, training]
+    files.write_document(path, model.document())
+    written = [path, training]
     if fit.chosen.proof is None:
         proof.unlink(missing_ok=True)
     else:
-        _json.write_document(proof, fit.proof.document(model, documents.MODEL))
-        files.insert(1, proof)
+        files.write_document(proof, fit.proof.document(model, documents.MODEL))
+        written.insert(1, proof)
     progress("drawing the report", 0.9)
     if report_available():
-        files.append(out / documents.REPORT)
+        written.append(out / documents.REPORT)
         write_report(
-            files[-1], fit, trials.train, trials.test,
+            written[-1], fit, trials.train, trials.test,
             validation=trials.validation, robot=config.robot,
         )  # fmt: skip
     progress("done", 1.0)
-    return Identified(fit, trials, tuple(files))
+    return Identified(fit, trials, tuple(written))
 
 
 def part(progress: Progress, start: float, end: float) -> Progress:
@@ -106,7 +111,11 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
         excitations=[signal.path for signal in excitations],
         period=config.grid.period,
         max_gap=config.grid.max_gap,
+        clock=config.clock,
+        resample=config.grid.resample,
+        hold=config.grid.hold,
         split_gaps=config.grid.split_gaps,
+        definitions=read_definitions(config.definitions),
         progress=lambda done, total: progress("reading bags", done / total),
     )
     labelled = _labelled(dataset, responses, excitations)
@@ -114,18 +123,19 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
         trials = cut(labelled, config.split.share, validation=config.split.validation)
     else:
         trials = split(labelled, test=config.split.test, validation=config.split.validation)
-    return replace(trials, skipped=skipped_samples(dataset))
+    named = (*config.split.test, *config.split.validation)
+    absent = tuple(name for name in named if not _of_bags(labelled, [name]))
+    return replace(trials, skipped=skipped_samples(dataset), absent=absent)
 
 
 def _labelled(
     dataset: Dataset, responses: Sequence[SignalConfig], excitations: Sequence[SignalConfig]
 ) -> Dataset:
-    """The same trials with the configured names, units and paths on their signals."""
+    """The same trials with the configured names and units on their signals."""
     labels: dict[str, tuple[str, ...]] = {}
     for letter, signals in (("y", responses), ("u", excitations)):
         labels[f"{letter}_names"] = tuple(signal.name for signal in signals)
         labels[f"{letter}_units"] = tuple(signal.unit for signal in signals)
-        labels[f"{letter}_paths"] = tuple(signal.path for signal in signals)
     return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
@@ -198,7 +208,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
     model = documents.load_model(model_path)
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
     weights = options.policy
-    design = design_tube(
+    problem = LinearTube(
         model,
         train,
         profile=options.profile,
@@ -207,17 +217,6 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
         inlet=options.inlet,
         lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
     )
-    proof = design.proof_document(
-        model=documents.MODEL, policy=documents.POLICY, funnel=documents.FUNNEL
-    )
-    out.mkdir(parents=True, exist_ok=True)
-    for name, document in (
-        (documents.MODEL, model.document()),
-        (documents.POLICY, design.policy.document()),
-        (documents.FUNNEL, design.funnel.document()),
-        (documents.FUNNEL_PROOF, proof),
-    ):
-        target = out / name
-        if target.resolve() != model_path.resolve():
-            _json.write_document(target, document)
-    return design
+    found = design(problem)
+    found.save(out)
+    return found

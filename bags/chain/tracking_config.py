@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from bags.chain.config import GridConfig
+from bags.chain.config import Clock, GridConfig
 from bags.chain.sections import NonNegative, Positive, Section, SignalConfig, read_yaml
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1, strict=False)]
@@ -88,6 +88,7 @@ class TrackingConfig(Section):
 
     robot: str
     signals: StateSignals
+    clock: Clock = "header"
     grid: GridConfig
     identification: StateIdentification
     motion: MotionConfig

@@ -11,24 +11,25 @@ from bags.chain.joint_bags import write_joint_bag
 from bags.chain.plants import ROBOTS, Robot
 from bags.chain.simulation import record_repeats, run_policy
 from bags.chain.tracking_config import SimulationConfig, TrackingConfig
-from bags.monitoring import documents
-from bags.monitoring.designs import TrackingDesign
-from bags.monitoring.documents import Proved
-from bags.monitoring.replay import announced_runs, replay_messages
+from bags.designs import documents
+from bags.designs.design import SampledDesign
+from bags.designs.documents import Proved
+from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import WAITING
 from bags.pictures.report import report_available
 from bags.signals.grid import read_dataset
-from nlsid_core import _json
-from nlsid_core._types import FloatArray
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import SampledTracking, design
+from nlsid_core.design.sampled.design import TrackingDesign, assume, frame
+from nlsid_core.design.sampled.motion import Feedback, follow_motion, plan_motion, track, tvlqr
 from nlsid_core.errors import CertificateMismatch, DataError
-from nlsid_core.funnels.motion import Feedback, follow_motion, plan_motion, track, tvlqr
-from nlsid_core.funnels.state_funnel import FunnelDesign, assume, design_state_funnel, frame
 from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
-from nlsid_core.reading import Nominal, TrackingReading
-from nlsid_core.tracking_monitor import OVER
-from nlsid_core.tracking_policy import TrackingPolicy
-from nlsid_core.trajectory import Dataset
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.monitor import OVER
+from nlsid_core.running.reading import Reading
 
 Progress = Callable[[str, float], None]
 
@@ -42,6 +43,9 @@ def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
         excitations=[signal.path for signal in signals.inputs],
         period=config.grid.period,
         max_gap=config.grid.max_gap,
+        clock=config.clock,
+        resample=config.grid.resample,
+        hold=config.grid.hold,
         split_gaps=config.grid.split_gaps,
     )
     labelled = [
@@ -49,10 +53,8 @@ def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:
             trial,
             y_names=tuple(signal.name for signal in signals.states),
             y_units=tuple(signal.unit for signal in signals.states),
-            y_paths=tuple(signal.path for signal in signals.states),
             u_names=tuple(signal.name for signal in signals.inputs),
             u_units=tuple(signal.unit for signal in signals.inputs),
-            u_paths=tuple(signal.path for signal in signals.inputs),
         )
         for trial in data
     ]
@@ -88,7 +90,7 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
         biased_without_repeats=options.biased_without_repeats,
         implicit=options.implicit,
     )
-    _json.write_document(out / documents.MODEL, fit.model.document())
+    files.write_document(out / documents.MODEL, fit.model.document())
     if report_available():
         from bags.pictures import plots, tracking_plots  # matplotlib only where something is drawn
 
@@ -97,7 +99,7 @@ def identify_state_bags(bags: Sequence[Path], config: TrackingConfig, out: Path)
     return fit
 
 
-def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> TrackingPolicy:
+def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> SampledPolicy:
     """model.json in, policy.json and motion.png in `out`: a motion in the data's box."""
     model, motion = load_state_model(model_path), config.motion
     if motion.samples is not None:
@@ -109,7 +111,7 @@ def plan_tracking(model_path: Path, config: TrackingConfig, out: Path) -> Tracki
         steps = round(motion.duration / model.period)
         x, u = plan_motion(model, motion.start, motion.goal, steps=steps)
     policy = track(model, x, u, _feedback(model, x, u, config))
-    _json.write_document(out / documents.POLICY, policy.document())
+    files.write_document(out / documents.POLICY, policy.document())
     if report_available():
         from bags.pictures import plots, tracking_plots
 
@@ -136,13 +138,13 @@ def simulate_runs(design: Path, config: TrackingConfig, out: Path) -> list[Path]
 
 
 def design_tracking_funnel(
-    design: Path, runs: Sequence[Path], config: TrackingConfig, *, progress: Progress
-) -> FunnelDesign:
+    folder: Path, runs: Sequence[Path], config: TrackingConfig, *, progress: Progress
+) -> TrackingDesign:
     """model.json, policy.json, commissioning bags in; funnel.json, funnel.proof.json, funnel.png.
 
     Raises DataError, Infeasible or CertificateRejected, saying what is in the way.
     """
-    model, policy = _load_pair(design)
+    model, policy = _load_pair(folder)
     feedback = _feedback(model, policy.x, policy.u, config)
     if not np.array_equal(feedback.K, policy.K):
         raise DataError("policy.json was made with other weights than this configuration's")
@@ -156,41 +158,30 @@ def design_tracking_funnel(
         safety_factor=options.safety_factor,
         rate=options.rate,
     )
-    made = design_state_funnel(model, policy, feedback, assumption=assumption, progress=progress)
-    proof = made.proof_document(
-        model=documents.MODEL, policy=documents.POLICY, funnel=documents.FUNNEL
-    )
-    _json.write_document(design / documents.FUNNEL, made.funnel.document())
-    _json.write_document(design / documents.FUNNEL_PROOF, proof)
+    problem = SampledTracking(model, policy, feedback, assumption)
+    made = design(problem, progress=progress)
+    made.save(folder)
     if report_available():
         from bags.pictures import plots, tracking_plots
 
         drawn = tracking_plots.draw_funnel(model, policy, made.funnel, recorded)
-        plots.write_png(design / documents.FUNNEL_PLOT, drawn)
+        plots.write_png(folder / documents.FUNNEL_PLOT, drawn)
     return made
 
 
-def replay_run(
-    proved: Proved[TrackingDesign], config: TrackingConfig, bag: Path
-) -> list[TrackingReading]:
-    """Every sample of one bag held against the funnel.
+def replay_run(proved: Proved[SampledDesign], bag: Path) -> list[Reading]:
+    """Every sample of one bag held against the funnel, message by message as they are live.
 
-    Runs begin where a controller announced them in the bag, and are read message by message, as
-    they are live; without an announcement the bag starts with sample 0.
+    Runs begin where a controller announced them in the bag; without an announcement the first
+    state is sample 0. What was before a run, and after its end, is left out.
     """
-    design = proved.design
-    if announced_runs(design, bag):
-        stamped = replay_messages(design, bag, nominal=Nominal.PROFILE)
-        said = [e.reading for e in stamped if isinstance(e.reading, TrackingReading)]
-        return [r for r in said if not r.reason.startswith((WAITING, OVER))]
-    run = read_states([bag], config).trajectories[0]
-    monitor = design.monitor(Nominal.PROFILE)
-    return [monitor.update(float(t), y, u) for t, y, u in zip(run.t, run.y, run.u, strict=True)]
+    said = [entry.reading for entry in replay_messages(proved.design, bag)]
+    return [r for r in said if not r.reason.startswith((WAITING, OVER))]
 
 
 def load_state_model(path: Path) -> MeasuredState:
     """Read a model file; DocumentError says what is wrong with it."""
-    return read_measured_state(_json.load_document(path), source=path.name)
+    return read_measured_state(files.load_document(path), source=path.name)
 
 
 def _read_samples(path: Path, model: MeasuredState) -> FloatArray:
@@ -206,12 +197,12 @@ def _read_samples(path: Path, model: MeasuredState) -> FloatArray:
         raise DataError(f"{path}: {error}") from error
 
 
-def _load_pair(folder: Path) -> tuple[MeasuredState, TrackingPolicy]:
+def _load_pair(folder: Path) -> tuple[MeasuredState, SampledPolicy]:
     model = load_state_model(folder / documents.MODEL)
-    policy = TrackingPolicy.from_document(
-        _json.load_document(folder / documents.POLICY), source=documents.POLICY
+    policy = SampledPolicy.from_document(
+        files.load_document(folder / documents.POLICY), source=documents.POLICY
     )
-    if policy.model != _json.digest(model.document()):
+    if policy.model != files.digest(model.document()):
         raise CertificateMismatch(f"{documents.POLICY} was made for another model")
     return model, policy
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core._json import write_atomically
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.trajectory import Dataset, Trajectory
+from nlsid_core.files import write_atomically
 
 LABELS = ("y_names", "u_names", "y_units", "u_units", "y_paths", "u_paths")
 NAMES = ("name", "group", "digest", "provenance")

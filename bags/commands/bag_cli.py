@@ -1,4 +1,7 @@
-"""The command line `nlsid bag`: look into recordings, check, repair, convert and cut them."""
+"""The command line `nlsid bag`: look into recordings, check, repair, convert and cut them.
+
+A command imports what it runs when it is called.
+"""
 
 import sys
 import time
@@ -6,25 +9,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bags.commands import bag_show
-from bags.pictures.report import report_available
-from bags.recordings.bag import Bag
-from bags.recordings.folders import expand_bags
-from bags.signals.reader import CLOCKS, read_signals
-from bags.signals.resample import Method
-from bags.tools import edit, export
-from bags.tools.fitness import Level, check_fitness
-from bags.tools.importing import import_tables
-from bags.tools.info import bag_info
-from bags.tools.recover import recover
 from nlsid_core.errors import BagError, DataError
+
+if TYPE_CHECKING:
+    from bags.recordings.definitions import Definition
 
 WIDTH_IN_FILES = 200  # columns where nobody's terminal sets them
 PROGRESS_AFTER = 2.0  # s of work before a progress bar appears
@@ -54,6 +48,13 @@ class Clock(StrEnum):
     PUBLISH = "publish"
 
 
+class SignalClock(StrEnum):
+    """Which times signals are paired by."""
+
+    HEADER = "header"
+    LOG = "log"
+
+
 class Resampling(StrEnum):
     """How a signal is put on a grid."""
 
@@ -75,25 +76,61 @@ SignalsOption = Annotated[
         help="topic:field.path[index], [*] or [name=elbow]; then |to(deg), |derivative(0.1 s), ...",
     ),
 ]
+DefinitionsOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--definitions",
+        help="PACKAGE/msg/Type.msg, or folders of packages: types that the bag does not define.",
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
+ClockOption = Annotated[
+    SignalClock, typer.Option(help="The signals' stamps: their header's, or of logging.")
+]
 UnfinishedOption = Annotated[
     bool, typer.Option("--unfinished", help="Read what there is of a recording not closed.")
 ]
 
 
 @bag_app.command()
-def info(bags: BagsArgument) -> None:
+def info(
+    bags: BagsArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
+) -> None:
     """Topics, types, counts, rates, jitter, gaps, clock offsets, losses and sizes."""
+    from bags.commands import bag_show
+    from bags.recordings.folders import expand_bags
+    from bags.tools.info import bag_info
+
     for path in expand_bags(bags):
         with _progress("reading") as progress:
-            found = bag_info(path, progress=progress)
-        bag_show.show_info(out, found)
+            found = bag_info(path, definitions=_definitions(definitions), progress=progress)
+        if as_json:
+            typer.echo(bag_show.info_json(found))
+        else:
+            bag_show.show_info(out, found)
 
 
 @bag_app.command()
-def signals(bag: BagArgument) -> None:
-    """Every number in the bag's messages as a signal, with its unit where the type implies one."""
-    with Bag(bag, unfinished=True) as source:
-        out.print(bag_show.signals_table(source))
+def signals(
+    bag: BagArgument, definitions: DefinitionsOption = None, as_json: JsonOption = False
+) -> None:
+    """Every number in the bag's messages as a signal: its range, its unit where the type says one.
+
+    Joints are named, orientations have a yaw, transforms their frames.
+    """
+    from bags.commands import bag_show
+    from bags.recordings.bag import Bag
+    from bags.tools.listing import bag_signals
+
+    with (
+        Bag(bag, unfinished=True, definitions=_definitions(definitions)) as source,
+        _progress("reading") as progress,
+    ):
+        found = bag_signals(source, progress=progress)
+    if as_json:
+        typer.echo(bag_show.signals_json(found))
+    else:
+        out.print(bag_show.signals_table(found))
 
 
 @bag_app.command()
@@ -102,16 +139,25 @@ def plot(
     picture: Annotated[Path, typer.Option("--out", help="A .png, .svg or .html file.")],
     signals: SignalsOption,
     clock: Annotated[Clock | None, typer.Option(help="Which times (default: header).")] = None,
+    definitions: DefinitionsOption = None,
     unfinished: UnfinishedOption = False,
 ) -> None:
     """Draw signals over time."""
+    from bags.pictures.report import report_available
+    from bags.signals.reader import read_signals
+
     if not report_available():
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
     with _progress("reading") as progress:
         samples = read_signals(
-            bag, signals, clock=_clock(clock), unfinished=unfinished, progress=progress
+            bag,
+            signals,
+            clock=_clock(clock),
+            unfinished=unfinished,
+            definitions=_definitions(definitions),
+            progress=progress,
         )
     write_picture(picture, draw_signals(list(samples.values()), title=str(bag)), title=str(bag))
     out.print(f"wrote {picture}", soft_wrap=True, markup=False)
@@ -126,10 +172,25 @@ def check(
     responses: Annotated[
         list[str], typer.Option("--response", "-y", help="Signals that are measured.")
     ],
+    clock: ClockOption = SignalClock.HEADER,
+    definitions: DefinitionsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Are these bags fit for identification? Status 1 if one is not."""
-    results = check_fitness(expand_bags(bags), excitations=excitations, responses=responses)
-    for result in results:
+    from bags.commands import bag_show
+    from bags.recordings.folders import expand_bags
+    from bags.tools.fitness import Level, check_fitness
+
+    results = check_fitness(
+        expand_bags(bags),
+        excitations=excitations,
+        responses=responses,
+        clock=clock.value,
+        definitions=_definitions(definitions),
+    )
+    if as_json:
+        typer.echo(bag_show.fitness_json(results))
+    for result in () if as_json else results:
         bag_show.show_fitness(out, result)
     if any(result.verdict is Level.BAD for result in results):
         raise typer.Exit(1)
@@ -138,6 +199,8 @@ def check(
 @bag_app.command("recover")
 def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
     """Make a whole bag of an unfinished or damaged one, verify it, and say what was lost."""
+    from bags.tools.recover import recover
+
     with _progress("recovering") as progress:
         found = recover(bag, bag_out, progress=progress)
     for topic, count in found.counts.items():
@@ -172,9 +235,13 @@ def export_command(
     max_gap: Annotated[
         float | None, typer.Option(help="s without a sample; default 1.5 periods.")
     ] = None,
+    clock: ClockOption = SignalClock.HEADER,
+    definitions: DefinitionsOption = None,
     unfinished: UnfinishedOption = False,
 ) -> None:
     """Write signals as CSV, npz or Parquet: a table per topic, or one on a common grid."""
+    from bags.tools import export
+
     if period is None:
         with _progress("exporting") as progress:
             rows = export.export_topics(
@@ -183,6 +250,7 @@ def export_command(
                 form=form.value,
                 signals=signals,
                 unfinished=unfinished,
+                definitions=_definitions(definitions),
                 progress=progress,
             )
         for file, count in rows.counts.items():
@@ -192,16 +260,18 @@ def export_command(
         return
     if not signals:
         raise BagError("a common grid needs to know which signals: --signal")
-    how: Method = _METHODS[method]
     errors = export.export_grid(
         bag,
         target,
         form=form.value,
         signals=signals,
         period=period,
-        method=how,
+        method=method.value,
         hold=hold or (),
         max_gap=1.5 * period if max_gap is None else max_gap,
+        clock=clock.value,
+        unfinished=unfinished,
+        definitions=_definitions(definitions),
     )
     for name, error in errors.items():
         out.print(f"{name}: off by at most {error:.2g}", soft_wrap=True, markup=False)
@@ -215,9 +285,12 @@ def cut(
     start: Annotated[float, typer.Option(help="s after the first message.")] = 0.0,
     end: Annotated[float | None, typer.Option(help="s after the first message.")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", "-t")] = None,
+    definitions: DefinitionsOption = None,
     unfinished: UnfinishedOption = False,
 ) -> None:
     """Copy a stretch of time, or some topics, to a new bag."""
+    from bags.tools import edit
+
     with _progress("copying") as progress:
         count = edit.cut(
             bag,
@@ -226,6 +299,7 @@ def cut(
             end=end,
             topics=topics or None,
             unfinished=unfinished,
+            definitions=_definitions(definitions),
             progress=progress,
         )
     out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
@@ -234,6 +308,9 @@ def cut(
 @bag_app.command()
 def merge(bags: BagsArgument, bag_out: OutOption) -> None:
     """Copy several bags into one, by log time."""
+    from bags.recordings.folders import expand_bags
+    from bags.tools import edit
+
     with _progress("copying") as progress:
         count = edit.merge(expand_bags(bags), bag_out, progress=progress)
     out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
@@ -249,6 +326,8 @@ def split(
     every: Annotated[float | None, typer.Option(help="s per part.")] = None,
 ) -> None:
     """Copy a bag in parts: at the repeats of an excitation, or every so many seconds."""
+    from bags.tools import edit
+
     with _progress("copying") as progress:
         parts = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
     for part in parts:
@@ -272,12 +351,17 @@ def import_command(
     time_column: Annotated[
         str | None, typer.Option("--time", help="The column with the rows' times in s.")
     ] = None,
+    drop_repeats: Annotated[
+        bool, typer.Option("--drop-repeats", help="Of rows with one time keep the first.")
+    ] = False,
     start: Annotated[float, typer.Option(help="s since 1970 of time 0.")] = 0.0,
     custom: Annotated[
         list[str] | None, typer.Option(help="key=value for the bag's metadata.")
     ] = None,
 ) -> None:
     """Write columns of tables as a bag of standard messages."""
+    from bags.tools.importing import import_tables
+
     counts = import_tables(
         tables,
         bag_out,
@@ -285,6 +369,7 @@ def import_command(
         types=_pairs(types, "--type"),
         period=period,
         time=time_column,
+        drop_repeats=drop_repeats,
         start_ns=round(start * 1e9),
         custom=_pairs(custom or (), "--custom"),
     )
@@ -292,11 +377,10 @@ def import_command(
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
 
 
-_METHODS: dict[Resampling, Method] = {
-    Resampling.LINEAR: "linear",
-    Resampling.CUBIC: "cubic",
-    Resampling.HOLD: "hold",
-}
+def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":
+    from bags.recordings.definitions import read_definitions
+
+    return read_definitions(paths or ())
 
 
 def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
@@ -310,12 +394,16 @@ def _pairs(texts: list[str] | tuple[str, ...], option: str) -> dict[str, str]:
 
 
 def _clock(clock: Clock | None) -> str | None:
+    from bags.signals.reader import CLOCKS
+
     return None if clock is None else next(name for name in CLOCKS if name.startswith(clock.value))
 
 
 @contextmanager
 def _progress(task: str) -> Iterator[Callable[[int, int], None]]:
     """A bar that appears after PROGRESS_AFTER s, and only where someone is watching."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
     started = time.monotonic()
     columns = (TextColumn(escape(task)), BarColumn(), TimeRemainingColumn())
     bar = Progress(*columns, console=err, transient=True, disable=not sys.stderr.isatty())

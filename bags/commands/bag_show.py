@@ -1,17 +1,18 @@
 """What `nlsid bag` prints."""
 
+import json
 import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bags.recordings.bag import Bag
-from bags.signals.signal import numeric_paths
-from bags.signals.units import implied_unit
 from bags.tools.fitness import Fitness, Level
 from bags.tools.info import BagInfo, TopicInfo
-from nlsid_core.errors import BagError
+from bags.tools.listing import Listed
 
 WORDS = {Level.GOOD: "good", Level.LOOK: "look", Level.BAD: "bad"}
 STYLES = {Level.GOOD: "green", Level.LOOK: "dark_orange3", Level.BAD: "red"}
@@ -60,20 +61,90 @@ def show_info(console: Console, info: BagInfo) -> None:
     console.print(JITTER_KEY, style="dim", highlight=False)
 
 
-def signals_table(bag: Bag) -> Table:
-    """Every number of every topic: signal, number type, unit."""
+def signals_table(found: Sequence[Listed]) -> Table:
+    """Every number of every topic: signal, number type, unit, smallest and largest value."""
     table = Table(box=None, pad_edge=False)
     table.add_column("signal", overflow="fold")
     table.add_column("number")
     table.add_column("unit")
-    for topic in bag.topics:
-        try:
-            kind = bag.types_on(topic)
-            for path, number, owners in numeric_paths(*kind):
-                table.add_row(Text(f"{topic}:{path}"), number, implied_unit(owners))
-        except BagError as error:
-            table.add_row(Text(topic), "-", Text(str(error)[:200], style="dim"))
+    for name in ("elements", "lowest", "highest"):
+        table.add_column(name, justify="right")
+    for listed in found:
+        elements = str(listed.elements) if "[*]" in listed.signal else ""
+        ends = ["-" if math.isnan(end) else f"{end:.6g}" for end in (listed.low, listed.high)]
+        table.add_row(Text(listed.signal), listed.number, listed.unit, elements, *ends)
+        if listed.note and listed.number == "":
+            table.add_row(Text(f"  {listed.note}", style="dim"))
     return table
+
+
+def info_json(info: BagInfo) -> str:
+    """What `show_info` shows, as JSON; times in s, sizes in bytes, null where nothing is known."""
+    return _json(
+        {
+            "bag": str(info.path),
+            "messages": info.messages,
+            "duration": info.duration,
+            "files": info.files,
+            "size": info.size,
+            "unfinished": info.ending,
+            "custom": dict(info.custom),
+            "topics": [
+                {
+                    "topic": topic.topic,
+                    "type": topic.msgtype,
+                    "count": topic.count,
+                    "size": topic.size,
+                    "rate": topic.rate,
+                    "gaps": topic.gaps,
+                    "longest_interval": topic.longest,
+                    "first_log_time_ns": topic.first_ns if topic.count else None,
+                    "last_log_time_ns": topic.last_ns if topic.count else None,
+                    "stamps_back": topic.backward,
+                    "stamps_repeated": topic.duplicates,
+                    "stamps_zero": topic.unstamped,
+                    "missing": topic.missing,
+                    "clock": None if topic.clock is None else asdict(topic.clock),
+                    "unreadable": topic.unreadable or None,
+                }
+                for topic in info.topics
+            ],
+        }
+    )
+
+
+def signals_json(found: Sequence[Listed]) -> str:
+    """The signals as JSON."""
+    return _json([asdict(listed) for listed in found])
+
+
+def fitness_json(results: Sequence[Fitness]) -> str:
+    """The verdicts and their reasons as JSON; levels: good, look, bad."""
+    return _json(
+        [
+            {
+                "bag": str(result.bag),
+                "verdict": WORDS[result.verdict],
+                "findings": [
+                    {"level": WORDS[found.level], "check": found.check, "what": found.what}
+                    for found in result.findings
+                ],
+            }
+            for result in results
+        ]
+    )
+
+
+def _json(content: object) -> str:
+    return json.dumps(_without_nan(content), ensure_ascii=False, indent=2, allow_nan=False)
+
+
+def _without_nan(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _without_nan(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_without_nan(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def show_fitness(console: Console, fitness: Fitness) -> None:

@@ -1,5 +1,9 @@
-"""The command line `nlsid`: the chain's verbs, and `bag` and `track` with verbs of their own."""
+"""The command line `nlsid`: the chain's verbs, and `bag` and `track` with verbs of their own.
 
+A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
+"""
+
+import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
@@ -9,32 +13,16 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from bags.chain.choosing import compare_bags, select_bags
-from bags.chain.config import load_config
-from bags.chain.problems import FunnelProblem
-from bags.chain.shipped import shipped_file
-from bags.chain.steps import Identified, design_funnel_files, identify_bags
-from bags.commands import show
 from bags.commands.bag_cli import bag_app
-from bags.commands.demo import run_demo
-from bags.commands.launching import LaunchFile, run_together
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
-from bags.monitoring import documents
-from bags.monitoring.replay import replay_bag
-from bags.pictures.report import report_available, write_margins
-from bags.recordings.folders import expand_bags
-from nlsid_core.certificate import Mode
-from nlsid_core.certificate import check as check_proof
-from nlsid_core.errors import CertificateRejected, NlsidError, Undecided
-from nlsid_core.funnels import compose_funnels
-from nlsid_core.monitor import Status
+from nlsid_core import kernel
+from nlsid_core.errors import NlsidError
 
 app = typer.Typer(
     name="nlsid",
     help="From a recorded bag to a proved model, a proved tracking tube and a monitor.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 app.add_typer(track_app, name="track")
@@ -51,14 +39,35 @@ OutOption = Annotated[
 ]
 
 
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"nlsid {importlib.metadata.version('nlsid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def nlsid(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_say_version, is_eager=True, help="Say which it is."),
+    ] = False,
+) -> None:
+    """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
+
+
 @app.command()
 def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
+    from bags.chain.config import load_config
+    from bags.chain.steps import identify_bags
+    from bags.commands import show
+    from bags.recordings.folders import expand_bags
+
     settings = load_config(config)
     folders = expand_bags(bags)
     with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)
-    _say_identified(result)
+    show.say_identified(out, result)
 
 
 LagsOption = Annotated[list[int] | None, typer.Option(help="Numbers of lags to try, repeatable.")]
@@ -72,13 +81,18 @@ def select(
 
     What is tried: the configuration's `select`, or --lags.
     """
+    from bags.chain.choosing import select_bags
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.recordings.folders import expand_bags
+
     settings = load_config(config)
     folders = expand_bags(bags)
     options = {"lags": lags} if lags else None
     with progress_bar("selecting") as progress:
         result = select_bags(folders, settings, out_dir, options=options, progress=progress)
     out.print(show.selection_table(result.selection))
-    _say_identified(result.identified)
+    show.say_identified(out, result.identified)
 
 
 @app.command()
@@ -95,6 +109,13 @@ def compare(
     What is compared: the configuration's `compare`, a list of model classes, or else the one it
     identifies, with --lags at each number of lags.
     """
+    from bags.chain.choosing import compare_bags
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.designs import documents
+    from bags.pictures.report import report_available
+    from bags.recordings.folders import expand_bags
+
     settings = load_config(config)
     folders = expand_bags(bags)
     with progress_bar("comparing") as progress:
@@ -124,6 +145,11 @@ def funnel(
 
     Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
     """
+    from bags.chain.config import load_config
+    from bags.chain.steps import design_funnel_files
+    from bags.commands import show
+    from bags.designs import documents
+
     if problem is not None:
         if model is not None or config is not None:
             raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
@@ -149,6 +175,8 @@ def compose(
     out_dir: OutOption,
 ) -> None:
     """Bind funnels that follow each other into one claim: composition.proof.json, for `check`."""
+    from nlsid_core.design import compose_funnels
+
     path = compose_funnels(proofs, out_dir)
     out.print(f"wrote {path} and {4 * len(proofs)} files of its stages", soft_wrap=True)
 
@@ -156,28 +184,22 @@ def compose(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
-    mode: Annotated[
-        Mode,
-        typer.Option(help="exact: integers; rigorous: floating point with proved rounding bounds."),
-    ] = "exact",
 ) -> None:
-    """Decide proofs without a solver: PROVED (status 0), REJECTED or UNDECIDED (status 1)."""
-    rejected = False
+    """Decide proofs without a solver: PROVED (status 0) or REJECTED (status 1).
+
+    Status 2 if a proof cannot be read, so that nothing was decided about it.
+    """
+    status = 0
     for path in proofs:
         try:
-            verdict = check_proof(path, mode=mode)
-        except Undecided as doubt:
-            rejected = True
-            typer.echo(f"UNDECIDED {path.name}: {doubt}")
-        except (CertificateRejected, OSError) as refusal:
-            rejected = True
+            typer.echo(str(kernel.check(path)))
+        except kernel.Rejected as refusal:
+            status = max(status, 1)
             typer.echo(f"REJECTED {path.name}: {refusal}")
-        else:
-            typer.echo(str(verdict))
-            for assumption in verdict.assumptions:
-                typer.echo(f"  assuming {assumption}")
-    if rejected:
-        raise typer.Exit(1)
+        except OSError as error:
+            status = 2
+            typer.echo(f"NOT READ {path.name}: {error.strerror}")
+    raise typer.Exit(status)
 
 
 @app.command()
@@ -193,35 +215,59 @@ def monitor(
     plot: Annotated[
         Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
     ] = None,
+    response: Annotated[
+        list[str] | None, typer.Option(help="topic:field of a continuous funnel's state; repeat.")
+    ] = None,
+    command: Annotated[
+        list[str] | None, typer.Option(help="topic:field of a continuous funnel's input; repeat.")
+    ] = None,
+    period: Annotated[
+        float, typer.Option(help="Seconds between samples of a continuous funnel.")
+    ] = 0.0,
 ) -> None:
-    """Hold recorded bags against a proved funnel: margin, worst axis, disturbance budget.
+    """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if every bag is inside with the assumption kept, 1 if one is not.
+    Status 0 if every bag is inside with the assumption kept, 1 if one is not. A tube of a linear
+    model is drawn too.
     """
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.designs import documents
+    from bags.designs.design import Wiring, is_linear
+    from bags.monitoring.replay import replay_bag
+    from bags.pictures.report import report_available, write_margins
+    from bags.recordings.folders import expand_bags
+    from nlsid_core.running.reading import Status
+
     if not replay:
         raise typer.BadParameter(
             "give --replay; a live robot is watched by the node funnel_monitor"
         )
     settings = load_config(config) if config is not None else None
-    proved = documents.load_proved_funnel(funnel)
+    wiring = Wiring.parse(response or [], command or [], period) if response or command else None
+    proved = documents.load_proved(funnel, wiring=wiring)
     folders = expand_bags(bags)
     if settings is not None:
         folders = [f for f in folders if f.name in settings.split.test] or folders
-    nominal = show.nominal_of(settings)
+    centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
-            replays.append(replay_bag(proved, bag, nominal=nominal))
+            replays.append(replay_bag(proved, bag, centre=centre))
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
-        if report_available():
+        drawn = report_available() and is_linear(proved.design)
+        if drawn:
             write_margins(picture, replays)
     out.print(show.replay_table(replays))
     for entry in replays:
         if entry.reason:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
-    if report_available():
+        if entry.over is not None:
+            said = f"{entry.name}: not judged from {entry.over.t:.3f} s on: {entry.over.reason}"
+            out.print(said, soft_wrap=True)
+    if drawn:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.verdict != Status.INSIDE.value for entry in replays):
         raise typer.Exit(1)
@@ -236,6 +282,9 @@ def live(
     ] = None,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
+    from bags.chain.shipped import shipped_file
+    from bags.commands.launching import LaunchFile, run_together
+
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
@@ -249,21 +298,17 @@ def demo(
     ] = Path("nlsid-demo"),
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
+    from bags.commands.demo import run_demo
+
     if not run_demo(out_dir, out):
         raise typer.Exit(1)
 
 
-def _say_identified(result: Identified) -> None:
-    out.print(show.methods_table(result.fit, result.test))
-    for line in show.notes(result):
-        out.print(line, soft_wrap=True, markup=False, highlight=False)
-    for file in result.files:
-        out.print(f"wrote {file}", soft_wrap=True)
-    if not report_available():
-        out.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
-
-
 def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
+    from bags.chain.problems import FunnelProblem
+    from bags.designs import documents
+    from bags.pictures.report import report_available
+
     with progress_bar("designing") as progress:
         design = FunnelProblem.load(problem).design(progress)
     for path in design.save(out_dir):
@@ -278,15 +323,19 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
 
 
 def main() -> None:
-    """Entry point: errors made for people are shown as one message and end with status 1."""
+    """Entry point: errors made for people are shown as one message and end with status 2.
+
+    Status 0 says yes, 1 no (not fit, outside, rejected), 2 that it could not be done or judged.
+    """
     try:
         app()
     except NlsidError as error:
         err.print(f"[red]error:[/red] {escape(str(error))}", soft_wrap=True, highlight=False)
-        sys.exit(1)
+        sys.exit(2)
     except OSError as error:
-        err.print(f"error: {error}", soft_wrap=True, markup=False, highlight=False)
-        sys.exit(1)
+        said = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        err.print(f"error: {said}", soft_wrap=True, markup=False, highlight=False)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -18,13 +18,13 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands import show
 from bags.commands.progress import progress_bar
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.pictures.report import report_available, write_margins
-from nlsid_core.certificate import check
-from nlsid_core.monitor import Status
+from nlsid_core.proofs import check
+from nlsid_core.running.reading import Status
 
-LIVE_MODULE = "nlsid_ros.live"  # started as a process: bags knows nothing of ROS
+LIVE_MODULE = "nlsid_ros.demo.live"  # started as a process: bags knows nothing of ROS
 LIVE_TRIAL = "trial_05"
 SABOTAGED_PLOT = "sabotaged.png"
 
@@ -133,8 +133,8 @@ class _Demo:
 
     def _replay(self, bags: Sequence[Path]) -> list[Replay]:
         proved = documents.load_proved_funnel(self.out / documents.FUNNEL)
-        nominal = self.config.monitor.nominal_source
-        return [replay_bag(proved, bag, nominal=nominal) for bag in bags]
+        centre = self.config.monitor.nominal_source
+        return [replay_bag(proved, bag, centre=centre) for bag in bags]
 
     def _heading(self, text: str) -> None:
         self.console.print()

@@ -1,19 +1,24 @@
-"""Tables for the terminal."""
+"""What the commands of the chain print."""
 
+import math
 from collections.abc import Sequence
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bags.chain.choosing import Compared
 from bags.chain.config import Config
 from bags.chain.steps import Identified
+from bags.designs import documents
 from bags.monitoring.replay import Replay
-from nlsid_core.errors import DataError
-from nlsid_core.funnels import TubeDesign
+from bags.pictures.report import report_available
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import TubeDesign
+from nlsid_core.errors import DataError, percent
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
-from nlsid_core.monitor import Nominal, Status
-from nlsid_core.trajectory import Dataset
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
 
 COLOURS = {
     Status.INSIDE.value: "green",
@@ -21,6 +26,17 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
+
+
+def say_identified(console: Console, result: Identified) -> None:
+    """Every method, what is to be known about the model, and the files that were written."""
+    console.print(methods_table(result.fit, result.test))
+    for line in notes(result):
+        console.print(line, soft_wrap=True, markup=False, highlight=False)
+    for file in result.files:
+        console.print(f"wrote {file}", soft_wrap=True)
+    if not report_available():
+        console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
 
 
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
@@ -32,8 +48,8 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     table.add_column("stability")
     for candidate in fit.candidates:
         table.add_row(
-            candidate.method,
-            f"{fit.errors['test'][candidate.method]:.2f} %",
+            candidate.method.title,
+            percent(fit.errors["test"][candidate.method.name]),
             f"{candidate.seconds * 1e3:.0f} ms",
             stability(candidate),
             style="bold" if candidate is fit.chosen else "",
@@ -52,6 +68,8 @@ def notes(result: Identified) -> list[str]:
         lines += str(scores).splitlines()
     if result.trials.skipped:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
+    if result.trials.absent:
+        lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
@@ -70,7 +88,7 @@ def selection_table(selection: Selection[Model]) -> Table:
         if entry.fit is None:
             table.add_row(label, "-", "-", "-", escape(entry.refusal))
             continue
-        errors = [f"{entry.error(name):.2f} %" for name in ("validation", "train", "test")]
+        errors = [percent(entry.error(name)) for name in ("validation", "train", "test")]
         table.add_row(label, *errors, stability(entry.fit.chosen), style=style)
     return table
 
@@ -101,9 +119,9 @@ def comparison_table(compared: Compared) -> Table:
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            row.candidate.method,
-            f"{scores.simulation_percent:.2f} %",
-            *(f"{scores.prediction_percent[k]:.2f} %" for k in horizons),
+            row.candidate.method.title,
+            percent(scores.simulation_percent),
+            *(percent(scores.prediction_percent[k]) for k in horizons),
             ", ".join(flaws) or "white, independent",
             stability(row.candidate),
             f"{row.candidate.seconds * 1e3:.0f} ms",
@@ -132,7 +150,8 @@ def funnel_table(design: TubeDesign) -> Table:
         "half-width",
         f"{funnel.half_width:g} {unit} of {model.y.name}",
     )
-    table.add_row("horizon", f"{assumption.samples * model.period:g} s")
+    span = (assumption.samples - 1) * model.period
+    table.add_row("horizon", f"{assumption.samples} samples, which span {span:g} s")
     table.add_row(
         "assuming",
         f"disturbance energy Σe² ≤ {assumption.budget:.4g} ({unit})²\n"
@@ -143,7 +162,7 @@ def funnel_table(design: TubeDesign) -> Table:
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag: verdict, worst margin, when, nearest bound, budget, first bad sample."""
+    """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample."""
     table = Table(
         title="held against the funnel",
         caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube",
@@ -156,10 +175,11 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("margin", "right"),
         ("at", "right"),
         ("axis", "left"),
-        ("budget", "right"),
+        ("assumption", "right"),
         ("bad from", "right"),
     ):
-        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
+        table.add_column(column, justify=justify, no_wrap=not long, overflow="fold")  # type: ignore[arg-type]
     for replay in replays:
         worst, bad = replay.worst, replay.first_bad
         colour = COLOURS[replay.verdict]
@@ -169,19 +189,24 @@ def replay_table(replays: Sequence[Replay]) -> Table:
             "-" if worst is None else f"{worst.margin:.3f}",
             "-" if worst is None else f"{worst.t:.3f} s",
             "-" if worst is None else worst.worst_axis,
-            "-" if worst is None else f"{100 * replay.budget_spent:.0f} %",
+            "-" if worst is None else _percent(replay.assumption),
             "-" if bad is None else f"{bad.t:.3f} s",
         )
     return table
 
 
+def _percent(part: float) -> str:
+    """The part of the assumption that is used; a continuous funnel's is not measured."""
+    return "not measured" if math.isnan(part) else f"{100 * part:.0f} %"
+
+
 def caught_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag that should be caught: verdict, first bad sample, budget spent in the end."""
+    """One row per bag that should be caught: verdict, first bad sample, assumption used."""
     table = Table(title="the same trials with a broken sensor", title_justify="left")
     table.add_column("bag", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     table.add_column("bad from", justify="right", no_wrap=True)
-    table.add_column("budget", justify="right", no_wrap=True)
+    table.add_column("assumption", justify="right", no_wrap=True)
     for replay in replays:
         bad = replay.first_bad
         colour = COLOURS[replay.verdict]
@@ -189,11 +214,11 @@ def caught_table(replays: Sequence[Replay]) -> Table:
             replay.name,
             f"[{colour}]{replay.verdict}[/{colour}]",
             "-" if bad is None else f"{bad.t:.3f} s",
-            f"{100 * replay.budget_spent:.0f} %",
+            _percent(replay.assumption),
         )
     return table
 
 
-def nominal_of(settings: Config | None) -> Nominal:
-    """The configured nominal; the received commands where there is no configuration."""
-    return Nominal.COMMAND if settings is None else settings.monitor.nominal_source
+def centre_of(settings: Config | None) -> Centre:
+    """What a tube is configured to be around; without a configuration the received commands."""
+    return Centre.COMMAND if settings is None else settings.monitor.nominal_source

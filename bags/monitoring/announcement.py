@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core import files
+from nlsid_core.arrays import Json
 
 FORMAT = "nlsid/run"
-VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,7 @@ class Run:
         """The JSON form."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "start_ns": self.start_ns,
             "funnel": self.funnel,
         }
@@ -28,8 +27,8 @@ class Run:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "run") -> "Run":
         """Raises DocumentError if the document is not a run."""
-        _json.header(document, FORMAT, VERSION, source=source)
+        files.header(document, FORMAT, source=source)
         return cls(
-            start_ns=_json.member(document, "start_ns", int, source=source),
-            funnel=_json.member(document, "funnel", str, source=source),
+            start_ns=files.member(document, "start_ns", int, source=source),
+            funnel=files.member(document, "funnel", str, source=source),
         )

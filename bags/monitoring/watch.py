@@ -1,46 +1,54 @@
 """`Watch`: stamped messages in, readings out; the one path for live messages and replayed ones."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from bags.monitoring.designs import Design
+import numpy as np
+
+from bags.designs.design import AnyDesign
 from bags.signals.grid import seconds
-from bags.signals.pairing import Pairing, Sample
-from nlsid_core.alarm import Alarm, AlarmOptions, Alert
-from nlsid_core.monitor import Nominal
-from nlsid_core.reading import AnyReading
+from bags.signals.sampling import NOT_FINITE, Sample
+from bags.signals.signal import SignalPath
+from nlsid_core.running.alarm import Alarm, AlarmOptions, State
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Reading
 
 HELD = 4096  # samples kept for a run whose start is announced late: 4 s at 1 kHz
 WAITING = "waiting for the controller to announce its start"
 
 
 class Stamped(NamedTuple):
-    """A reading and its alert, and the stamp (ns) of the response they judge."""
+    """A reading, what is said of the robot after it, and the stamp (ns) of the response."""
 
     stamp_ns: int
-    reading: AnyReading
-    alert: Alert
+    reading: Reading
+    state: State
 
 
 class Watch:
-    """Pairs responses with commands on message stamps and asks the monitor about each sample.
+    """Makes samples as identification does (`bags.signals.sampling`) and asks the monitor of each.
 
-    A run begins with the first response, or, if `announced`, at the stamp given to `begin`; the
-    samples before it then give the observer its state, and runs may follow each other. Time in the
-    readings is s since the run's first response or announced start.
+    A run begins with the first complete sample, or, if `announced`, at the stamp given to `begin`;
+    the samples before it then give the observer its state, and runs may follow each other. Time in
+    the readings is s since the run's first sample or announced start. `pairing.check` says whether
+    messages have the signals, `pairing.stamp` which of their times is the stamp.
     """
 
     def __init__(
         self,
-        design: Design,
+        design: AnyDesign,
         *,
-        nominal: Nominal = Nominal.COMMAND,
+        centre: Centre = Centre.COMMAND,
         options: AlarmOptions | None = None,
         announced: bool = False,
     ) -> None:
         self.design = design
-        self.monitor: Any = design.monitor(nominal)  # takes what the design's response gives
+        self.monitor = design.monitor(centre)
+        self.pairing = design.sampler()
+        self._single = isinstance(design.response, SignalPath)
+        self._framed = isinstance(design.response, SignalPath) and design.response.framed
         self._alarm = Alarm(options)
         self._announced = announced
         self.restart()
@@ -51,7 +59,7 @@ class Watch:
 
     def restart(self) -> None:
         """Begin a new run: forget stamps, lags and budget."""
-        self.pairing = Pairing()
+        self.pairing.restart()
         self.monitor.restart()
         self._alarm.restart()
         self.origin_ns: int | None = None
@@ -59,6 +67,11 @@ class Watch:
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
         self._start_ns: int | None = None
         self._running = not self._announced
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a run is still to be announced."""
+        return self._announced and not self._running
 
     def begin(self, start_ns: int) -> list[Stamped]:
         """The run's sample 0 is the response stamped `start_ns`, past or to come; readings from it.
@@ -76,11 +89,12 @@ class Watch:
 
     def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
         """Feed a response; the readings that can be given now, in order."""
-        if self.origin_ns is None:
-            self.origin_ns = stamp_ns
         self._newest_ns = max(self._newest_ns, stamp_ns)
         before = self.pairing.late_responses
-        readings = self._judge(self.pairing.response(stamp_ns, y))
+        numbers = _numbers(y)
+        readings = self._judge(self.pairing.respond(stamp_ns, numbers))
+        if self.origin_ns is None and not any(map(math.isfinite, numbers)) and not self._framed:
+            return self.missing(f"{self.design.name} is {y}")  # and no sample was before it
         if self.pairing.late_responses > before:
             back = seconds(self._newest_ns, stamp_ns)
             readings += self.missing(f"time went back by {back:g} s on {self.design.response}")
@@ -88,7 +102,7 @@ class Watch:
 
     def excitation(self, stamp_ns: int, u: Any) -> list[Stamped]:
         """Feed a command; the readings that can be given now, in order."""
-        return self._judge(self.pairing.excitation(stamp_ns, u))
+        return self._judge(self.pairing.excite(stamp_ns, _numbers(u)))
 
     def flush(self, until_ns: int | None = None) -> list[Stamped]:
         """Stop waiting for commands: responses stamped up to `until_ns` (None: all)."""
@@ -96,38 +110,55 @@ class Watch:
 
     def missing(self, reason: str) -> list[Stamped]:
         """The state is missing or stale: unknown from here on."""
-        if self.origin_ns is None:
+        if not self._newest_ns:
             return []
-        t = seconds(self._newest_ns, self.origin_ns)
+        t = seconds(self._newest_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
         reading = self.monitor.missing(t, reason)
         return [Stamped(self._newest_ns, reading, self._alarm.update(reading))]
 
     def _judge(self, samples: Sequence[Sample]) -> list[Stamped]:
-        if self.origin_ns is None:
-            return []
         judged = []
         for sample in samples:
+            if self.origin_ns is None:
+                self.origin_ns = sample.stamp_ns
             if self._start_ns is not None and sample.stamp_ns >= self._start_ns:
                 self.origin_ns, self._start_ns = self._start_ns, None
                 self._alarm.restart()
                 self._give_lags()
             t = seconds(sample.stamp_ns, self.origin_ns)
             self._recent.append(sample)
-            if self._running:
-                reading = self.monitor.update(t, sample.y, sample.u)
+            y, u = self._values(sample)
+            if not self._running:
+                reading = self.monitor.waiting(t, y, WAITING)
+            elif sample.missing and not sample.missing.endswith(NOT_FINITE):  # it says which
+                reading = self.monitor.missing(t, sample.missing)
             else:
-                reading = self.monitor.waiting(t, sample.y, WAITING)
+                reading = self.monitor.update(t, y, u)
             judged.append(Stamped(sample.stamp_ns, reading, self._alarm.update(reading)))
         return judged
 
     def _give_lags(self) -> None:
-        """The samples before the start give the observer its state, if it needs any."""
+        """The samples before the start give the observer its state, if it needs any.
+
+        The monitor is told the start, so that a sample that was lost there is missing.
+        """
         n = self.monitor.lags
         lags = list(self._recent)[-n:] if n else []
         self._running = True
-        self.monitor.restart()
+        self.monitor.restart(start=0.0)
         if len(lags) < n:
             reason = f"only {len(lags)} samples before the run's start; it takes {n}"
             self.monitor.missing(0.0, reason)
         for sample in lags:
-            self.monitor.update(seconds(sample.stamp_ns, self.origin_ns or 0), sample.y, sample.u)
+            y, u = self._values(sample)
+            self.monitor.update(seconds(sample.stamp_ns, self.origin_ns or 0), y, u)
+
+    def _values(self, sample: Sample) -> tuple[Any, Any]:
+        """Numbers of a tube of one output and one input, else arrays."""
+        if self._single:
+            return sample.y[0], sample.u[0]
+        return np.array(sample.y), np.array(sample.u)
+
+
+def _numbers(value: Any) -> Sequence[float]:
+    return (value,) if isinstance(value, float | int) else tuple(map(float, value))

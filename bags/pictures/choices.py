@@ -98,7 +98,9 @@ def draw_comparison(rows: Sequence[Scored]) -> bytes:
         axes.annotate(text, (min(error, SHOWN_ERROR), place), (4, 0), textcoords="offset points",
                       va="center", fontsize=8)  # fmt: skip
     axes.set_yticks(
-        range(len(ranked)), [f"{row.label}\n{row.candidate.method}" for row in ranked], fontsize=7
+        range(len(ranked)),
+        [f"{row.label}\n{row.candidate.method.title}" for row in ranked],
+        fontsize=7,
     )
     axes.set_xlabel("simulation error on the test trials [%]", fontsize=9)
     axes.set_xlim(0.0, 1.15 * min(max(r.scores.simulation_percent for r in rows), SHOWN_ERROR))

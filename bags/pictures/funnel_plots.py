@@ -9,9 +9,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, write_png
-from nlsid_core._types import FloatArray
-from nlsid_core.continuous import Funnel
-from nlsid_core.funnels import FunnelDesign, Goal
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import FunnelDesign, Goal
+from nlsid_core.funnels.continuous import ContinuousFunnel
 
 OUTLINES = 80  # ellipses of a projected tube: their shadows join into one
 RINGS = 6  # of them drawn with a line
@@ -36,7 +36,7 @@ def funnel_picture(design: FunnelDesign) -> Figure:
     over_time = range(min(funnel.n, PROJECTIONS - len(pairs)))
     panels = np.atleast_1d(rows[0].subplots(1, len(pairs) + len(over_time)))
     for axes, pair in zip(panels, pairs, strict=False):
-        _tube(axes, funnel, pair, design.goal)
+        _tube(axes, funnel, pair, design.found.goal)
     for i, axes in zip(over_time, panels[len(pairs) :], strict=True):
         _tube_over_time(axes, funnel, i)
     panels[0].legend(frameon=False, fontsize=8)
@@ -51,8 +51,9 @@ def funnel_picture(design: FunnelDesign) -> Figure:
         axes.xaxis.label.set_size(9)
         axes.yaxis.label.set_size(9)
     figure.suptitle(
-        f"funnel proved from {funnel.t0:g} to {funnel.tf:g} s: {len(design.proved.pieces)} pieces, "
-        f"least margin {np.min(design.proved.margins):.2g} 1/s",
+        f"funnel proved from {funnel.t0:g} to {funnel.tf:g} s: "
+        f"{len(design.found.proved.pieces)} pieces, "
+        f"least margin {np.min(design.found.proved.margins):.2g} 1/s",
         fontsize=11,
         x=0.01,
         ha="left",
@@ -68,7 +69,7 @@ def state_pairs(n: int) -> list[tuple[int, int]]:
     return pairs
 
 
-def _tube(axes: Axes, funnel: Funnel, pair: tuple[int, int], goal: Goal) -> None:
+def _tube(axes: Axes, funnel: ContinuousFunnel, pair: tuple[int, int], goal: Goal) -> None:
     times = np.linspace(funnel.t0, funnel.tf, OUTLINES)
     shadows = [funnel.outline(float(t), pair) for t in times]
     axes.add_collection(PolyCollection(shadows, facecolors="#dbe8f4", edgecolors="none", zorder=1))
@@ -80,7 +81,7 @@ def _tube(axes: Axes, funnel: Funnel, pair: tuple[int, int], goal: Goal) -> None
     axes.plot(*path.T, color=INK, lw=LINE, label="nominal", zorder=4)
     axes.plot(*path[0], "o", color=INK, ms=5, mfc="white", label="start", zorder=5)
     axes.plot(*path[-1], "o", color=INK, ms=5, label="end", zorder=5)
-    end = Funnel(
+    end = ContinuousFunnel(
         funnel.x, np.array([goal.P] * len(funnel.t)), np.ones(len(funnel.t)), "", ""
     ).outline(funnel.tf, pair)
     shifted = end + (goal.centre - funnel.nominal(funnel.tf))[list(pair)]
@@ -90,7 +91,7 @@ def _tube(axes: Axes, funnel: Funnel, pair: tuple[int, int], goal: Goal) -> None
     axes.autoscale_view()
 
 
-def _tube_over_time(axes: Axes, funnel: Funnel, i: int) -> None:
+def _tube_over_time(axes: Axes, funnel: ContinuousFunnel, i: int) -> None:
     times = np.linspace(funnel.t0, funnel.tf, 400)
     middle, width = funnel.x(times)[:, i], _half_widths(funnel, times)[:, i]
     axes.fill_between(times, middle - width, middle + width, color="#dbe8f4", lw=0, label="tube")
@@ -102,7 +103,7 @@ def _tube_over_time(axes: Axes, funnel: Funnel, i: int) -> None:
 def _volume(axes: Axes, design: FunnelDesign) -> None:
     times = np.linspace(design.funnel.t0, design.funnel.tf, 300)
     for funnel, color, label in (
-        (design.first, GREY, "first guess, not proved"),
+        (design.found.first, GREY, "first guess, not proved"),
         (design.funnel, BLUE, "proved"),
     ):
         volumes = [funnel.volume(float(t)) for t in times]
@@ -113,7 +114,7 @@ def _volume(axes: Axes, design: FunnelDesign) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
-def _widths(axes: Axes, funnel: Funnel) -> None:
+def _widths(axes: Axes, funnel: ContinuousFunnel) -> None:
     times = np.linspace(funnel.t0, funnel.tf, 300)
     widths = _half_widths(funnel, times)
     for i in range(funnel.n):
@@ -127,20 +128,20 @@ def _widths(axes: Axes, funnel: Funnel) -> None:
 
 
 def _margin(axes: Axes, design: FunnelDesign) -> None:
-    pieces, funnel = design.proved.pieces, design.funnel
+    pieces, funnel = design.found.proved.pieces, design.funnel
     h = np.diff(funnel.t)[pieces.interval] / 2.0**pieces.level
     start = funnel.t[pieces.interval] + pieces.index * h
-    axes.hlines(design.proved.margins, start, start + h, color=BLUE, lw=2)
-    if np.max(design.proved.margins) > DECADE * np.min(design.proved.margins):
+    axes.hlines(design.found.proved.margins, start, start + h, color=BLUE, lw=2)
+    if np.max(design.found.proved.margins) > DECADE * np.min(design.found.proved.margins):
         axes.set_yscale("log")
     else:
-        axes.set_ylim(0, 1.1 * float(np.max(design.proved.margins)))
+        axes.set_ylim(0, 1.1 * float(np.max(design.found.proved.margins)))
         axes.ticklabel_format(axis="y", scilimits=(-2, 3))
     axes.set_xlabel("time [s]")
     axes.set_ylabel("certified -dV/dt on the boundary [1/s]")
 
 
-def _half_widths(funnel: Funnel, times: FloatArray) -> FloatArray:
+def _half_widths(funnel: ContinuousFunnel, times: FloatArray) -> FloatArray:
     """(times, n) the largest |x_i - x0_i| in the tube."""
     shapes = np.array([funnel.shape(float(t)) for t in times])
     return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(shapes), axis1=1, axis2=2)))

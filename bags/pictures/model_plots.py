@@ -9,12 +9,12 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Fit, History, Model, Validation, simulate_trial
 from nlsid_core.identification.prediction import history
 from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation
 from nlsid_core.models.monotone_equation import solve_increasing
-from nlsid_core.trajectory import Dataset, Trajectory
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
@@ -46,8 +46,10 @@ def simulations(fit: Fit[Model], test: Dataset, output: int) -> Figure:
         axes.plot(t, y[rows_drawn], color=INK, lw=LINE, label="measured")
         if beside is not None:
             other = _bounded(simulate_trial(beside.model, trial)[rows_drawn, output], y)
-            axes.plot(t, other, color=ORANGE, lw=LINE, ls="--", label=beside.method)
-        axes.plot(t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=chosen.method)
+            axes.plot(t, other, color=ORANGE, lw=LINE, ls="--", label=beside.method.title)
+        axes.plot(
+            t, simulated[trial.name][rows_drawn], color=BLUE, lw=LINE, label=chosen.method.title
+        )
         drawn = "" if len(t) == len(trial) else f", {len(t)} of {len(trial)} samples"
         axes.set_title(f"{trial.name}{drawn}", fontsize=9, loc="left")
     for axes in panels[len(trials) :]:

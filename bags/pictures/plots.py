@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bags.monitoring.replay import Replay
-from nlsid_core import _json
-from nlsid_core.monitor import Reading, Status
+from nlsid_core import files
+from nlsid_core.running.reading import Reading, Status
 
 INK, BLUE, ORANGE, RED, GREY = "#222222", "#1f6fb4", "#d9822b", "#c23b3b", "#9aa0a6"
 LINE = 1.2
@@ -33,11 +33,11 @@ def png(figure: Figure) -> bytes:
 
 def write_png(path: Path, figure: Figure) -> None:
     """The figure as a PNG file, whole or not at all."""
-    _json.write_atomically(path, png(figure))
+    files.write_atomically(path, png(figure))
 
 
 def margins(replays: Sequence[Replay]) -> Figure:
-    """Per replayed bag: measured output in the tube above, margin and budget spent below."""
+    """Per replayed bag: measured output in the tube above, margin and assumption used below."""
     columns = min(len(replays), 4)
     rows = -(-len(replays) // columns)
     figure = Figure(figsize=(3.1 * columns + 0.6, 3.6 * rows), layout="constrained")
@@ -57,7 +57,7 @@ def margins(replays: Sequence[Replay]) -> Figure:
         lower.set_xlabel("time [s]", fontsize=8)
         if index % columns == 0:
             upper.set_ylabel(f"{replay.axis} [{replay.unit}]", fontsize=8)
-            lower.set_ylabel("margin, budget spent", fontsize=8)
+            lower.set_ylabel("margin, assumption used", fontsize=8)
     for kind in (0, 1):
         _same_limits([axes for axes in panels[kind::2].flat if axes.get_visible()])
     tidy([axes for axes in panels.flat if axes.get_visible()])
@@ -75,21 +75,31 @@ def margins(replays: Sequence[Replay]) -> Figure:
 def _tube(axes: Axes, replay: Replay) -> None:
     judged = [r for r in replay.readings if r.status is not Status.UNKNOWN]
     t = np.array([r.t for r in judged])
-    nominal = np.array([r.nominal for r in judged])
+    nominal = np.array([_output(r.nominal) for r in judged])
     width = replay.half_width
     axes.fill_between(
         t, nominal - width, nominal + width, color=BLUE, alpha=0.18, lw=0, label="proved tube"
     )
     axes.plot(t, nominal, color=BLUE, lw=LINE, label="nominal")
     everything = replay.readings
-    axes.plot([r.t for r in everything], [r.measured for r in everything], color=INK, lw=LINE,
-              label="measured")  # fmt: skip
+    measured = [_output(r.measured) for r in everything]
+    axes.plot([r.t for r in everything], measured, color=INK, lw=LINE, label="measured")
     bad = [r for r in judged if r.status is not Status.INSIDE]
     axes.plot(
-        [r.t for r in bad], [r.measured for r in bad], ".", color=RED, ms=3, label="not inside"
+        [r.t for r in bad],
+        [_output(r.measured) for r in bad],
+        ".",
+        color=RED,
+        ms=3,
+        label="not inside",
     )
     since = f" from {bad[0].t:.3f} s" if bad else ""
     axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
+
+
+def _output(values: Sequence[float]) -> float:
+    """The one output that a linear tube is about; NaN where nothing was measured."""
+    return values[0] if values else float("nan")
 
 
 def _margin(axes: Axes, replay: Replay) -> None:
@@ -97,7 +107,7 @@ def _margin(axes: Axes, replay: Replay) -> None:
     t = [r.t for r in judged]
     axes.axhline(0.0, color=RED, lw=0.8)
     axes.plot(t, [r.margin for r in judged], color=BLUE, lw=LINE, label="margin")
-    axes.plot(t, [r.budget_spent for r in judged], color=ORANGE, lw=LINE, label="budget spent")
+    axes.plot(t, [r.assumption for r in judged], color=ORANGE, lw=LINE, label="assumption used")
     lowest = min((r.margin for r in judged), default=0.0)
     axes.set_ylim(max(-1.0, min(0.0, lowest)) - 0.08, 1.3)
 

@@ -7,8 +7,9 @@ from html import escape
 from pathlib import Path
 
 from bags.monitoring.replay import Replay
-from nlsid_core import _json
-from nlsid_core.errors import DataError
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model
 from nlsid_core.models import (
     DifferenceEquation,
@@ -16,7 +17,6 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
 )
-from nlsid_core.trajectory import Dataset
 
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto;
@@ -48,7 +48,7 @@ def write_report(
     robot: str,
 ) -> None:
     """Write the page; needs the extra `report`."""
-    _json.write_atomically(
+    files.write_atomically(
         path, page(fit, train, test, validation=validation, robot=robot).encode()
     )
 
@@ -136,8 +136,8 @@ def _row(candidate: Candidate[Model], fit: Fit[Model], columns: Sequence[str]) -
         else '<span class="not">not proved</span>'
     )
     cells = [
-        escape(candidate.method),
-        *(f"{fit.errors[name][candidate.method]:.2f} %" for name in columns),
+        escape(candidate.method.title),
+        *(percent(fit.errors[name][candidate.method.name]) for name in columns),
         f"{candidate.seconds * 1e3:.0f} ms",
         proved,
     ]

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from bags.pictures.plots import BLUE, LINE, ORANGE, png, svg
 from bags.signals.grid import seconds
 from bags.signals.reader import Samples
-from nlsid_core._json import write_atomically
 from nlsid_core.errors import DataError
+from nlsid_core.files import write_atomically
 
 DRAWN = 20_000  # points a panel; of more, the least and the largest of each stretch are drawn
 

@@ -9,15 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
-from nlsid_core._types import FloatArray
-from nlsid_core.discrete_funnel import DiscreteFunnel
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
 from nlsid_core.models import Signal
 from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.reading import Status, TrackingReading
-from nlsid_core.tracking_monitor import disturbance_of
-from nlsid_core.tracking_policy import TrackingPolicy
-from nlsid_core.trajectory import Dataset
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.assumption import disturbance_of
+from nlsid_core.running.reading import Reading, Status
 
 TUBE = "#c9deef"
 NOISE_BAND = 2.0  # standard deviations of the sensors
@@ -64,7 +64,7 @@ def draw_free_run(model: MeasuredState, validation: Dataset) -> Figure:
     return figure
 
 
-def draw_motion(model: MeasuredState, policy: TrackingPolicy) -> Figure:
+def draw_motion(model: MeasuredState, policy: SampledPolicy) -> Figure:
     """Nominal states and inputs over time in the box of the model's data."""
     n, p = len(model), len(model.u)
     figure, panels = _grid(n + p)
@@ -81,7 +81,7 @@ def draw_motion(model: MeasuredState, policy: TrackingPolicy) -> Figure:
 
 
 def draw_funnel(
-    model: MeasuredState, policy: TrackingPolicy, funnel: DiscreteFunnel, runs: Dataset
+    model: MeasuredState, policy: SampledPolicy, funnel: SampledFunnel, runs: Dataset
 ) -> Figure:
     """Tube, inlet and goal around the motion, its inputs, half-widths, and the disturbance.
 
@@ -120,14 +120,14 @@ def draw_funnel(
     return figure
 
 
-def feedback_reach(policy: TrackingPolicy, funnel: DiscreteFunnel) -> FloatArray:
+def feedback_reach(policy: SampledPolicy, funnel: SampledFunnel) -> FloatArray:
     """(N, p) the largest |K_k x̄| in the tube: what the feedback may add to the nominal input."""
     rows = policy.K @ np.linalg.inv(funnel.S[:-1])
     return np.asarray(np.linalg.norm(rows, axis=2) * funnel.radius[:-1, None])
 
 
 def draw_watched(
-    model: MeasuredState, funnel: DiscreteFunnel, bags: Sequence[Sequence[TrackingReading]]
+    model: MeasuredState, funnel: SampledFunnel, bags: Sequence[Sequence[Reading]]
 ) -> Figure:
     """Runs in the tube, their margin, and their disturbance over its bound, verdicts by colour.
 
@@ -149,7 +149,7 @@ def draw_watched(
     disturbance.axhline(1.0, color=INK, lw=0.8)
     for run in runs:
         judged = [r for r in run if r.status is not Status.UNKNOWN]
-        rows = [(*r.deviation, r.margin, r.disturbance) for r in judged]
+        rows = [(*r.deviation, r.margin, r.assumption) for r in judged]
         for axes, values in zip(panels, np.array(rows).T, strict=False):
             _by_verdict(axes, judged, values)
     margin.set_ylim(max(LEAST_MARGIN, min(-0.05, margin.dataLim.y0 * 1.05)), 1.05)
@@ -168,13 +168,13 @@ def draw_watched(
     return figure
 
 
-def _runs(readings: Sequence[TrackingReading]) -> list[Sequence[TrackingReading]]:
+def _runs(readings: Sequence[Reading]) -> list[Sequence[Reading]]:
     """Apart where time begins again."""
     again = [i for i in range(1, len(readings)) if readings[i].t < readings[i - 1].t]
     return [readings[a:b] for a, b in pairwise([0, *again, len(readings)])]
 
 
-def _by_verdict(axes: Axes, readings: Sequence[TrackingReading], values: FloatArray) -> None:
+def _by_verdict(axes: Axes, readings: Sequence[Reading], values: FloatArray) -> None:
     """Each status in its colour; a stretch begins at the sample before it, so that lines join."""
     t = np.array([r.t for r in readings])
     for status, colour in COLOURS.items():
@@ -199,8 +199,8 @@ def _half_widths(axes: Axes, model: MeasuredState, t: FloatArray, widths: FloatA
 def _disturbance(
     axes: Axes,
     model: MeasuredState,
-    policy: TrackingPolicy,
-    funnel: DiscreteFunnel,
+    policy: SampledPolicy,
+    funnel: SampledFunnel,
     runs: Dataset,
 ) -> None:
     a, t = funnel.assumption, _times(policy)
@@ -231,11 +231,11 @@ def _grid(count: int) -> tuple[Figure, list[Axes]]:
     return figure, every[:count]
 
 
-def _times(policy: TrackingPolicy) -> FloatArray:
+def _times(policy: SampledPolicy) -> FloatArray:
     return np.arange(len(policy) + 1) * policy.period
 
 
-def _nominal(axes: Axes, policy: TrackingPolicy, values: FloatArray) -> None:
+def _nominal(axes: Axes, policy: SampledPolicy, values: FloatArray) -> None:
     axes.plot(_times(policy)[: len(values)], values, color=INK, lw=1.5, label="nominal")
 
 

@@ -3,7 +3,7 @@
 Bags are untrusted. Whatever is wrong with one leaves here as a BagError that names the bag.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -11,12 +11,14 @@ from typing import Final, NamedTuple
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.batch import Batch
+from bags.recordings.definitions import Definition
 from bags.recordings.folders import COMPRESSED, bag_files
 from bags.recordings.mcap_file import MAGIC
 from bags.recordings.message_types import are_same, types_in_bag
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.part import CUSTOM_DATA
-from bags.recordings.storage import Channel, McapStorage, RosbagsStorage, Storage
+from bags.recordings.quality import Profile
+from bags.recordings.storage import Channel, McapStorage, RosbagsStorage, Storage, defined
 from nlsid_core.errors import BagError
 
 RECOVER: Final = "`nlsid bag recover`"
@@ -38,10 +40,16 @@ class Bag:
     A bag is a rosbag2 folder (MCAP or sqlite3, split or not), a single .mcap, or a ROS 1 .bag.
     Raises BagError if there is no such bag, if it is damaged or not a bag, or if it is unfinished.
     With `unfinished=True` the last is no error: the messages there are can be read, and `ending`
-    says why there may be more.
+    says why there may be more. definitions: of types that the bag itself does not define.
     """
 
-    def __init__(self, path: Path | str, *, unfinished: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        unfinished: bool = False,
+        definitions: Mapping[str, Definition] | None = None,
+    ) -> None:
         self.path = Path(path)
         self._described = bag_files(self.path)
         self.files: tuple[Path, ...] = self._described.files
@@ -55,6 +63,9 @@ class Bag:
         else:
             whole = self._described.compressed
             self._storage = RosbagsStorage([self.path] if whole else self.files)
+        self._storage.channels = [
+            defined(channel, definitions or {}) for channel in self._storage.channels
+        ]
         self.ending = self._storage.ending or self.ending
         if self.ending is not None and not unfinished:
             self.close()
@@ -118,6 +129,14 @@ class Bag:
         if not all(are_same(types[0], other) for other in types):
             raise BagError(f"{self.path}: {topic} has parts with different definitions of its type")
         return found[0].msgtype, types[0]
+
+    def offered(self, topic: str) -> tuple[Profile, ...]:
+        """What each publisher of `topic` offered; empty where the bag does not say.
+
+        metadata.yaml goes before the files, as it does for rosbag2.
+        """
+        found = [p for c in self.channels if c.topic == topic for p in c.offered]
+        return tuple(dict.fromkeys(self._described.offered.get(topic) or found))
 
     def count(self, topic: str) -> int:
         """How many messages the bag says it has on `topic`."""

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 
 BATCH_BYTES: Final = 4 * 2**20
 BATCH_MESSAGES: Final = 4096

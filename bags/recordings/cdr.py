@@ -18,7 +18,7 @@ from rosbags.interfaces.typing import FieldDesc
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.batch import Batch
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
 NUMBERS: Final = {

@@ -7,7 +7,8 @@ from typing import Any, Final
 
 import yaml
 
-from nlsid_core._json import write_atomically
+from bags.recordings.quality import KEY, Profile
+from nlsid_core.files import write_atomically
 
 METADATA: Final = "metadata.yaml"
 METADATA_VERSION: Final = 9  # the rosbag2 metadata of ROS 2 Jazzy
@@ -25,11 +26,12 @@ class FileDescription:
 
 @dataclass(frozen=True)
 class TopicDescription:
-    """A topic's type, the serialisation of its messages, and its type's RIHS01 hash."""
+    """A topic's type, how its messages are serialised, its type's RIHS01 hash, what was offered."""
 
     msgtype: str
     encoding: str
     type_hash: str
+    offered: tuple[Profile, ...] = ()
 
 
 def write_metadata(
@@ -57,7 +59,7 @@ def write_metadata(
                     "name": name,
                     "type": topic.msgtype,
                     "serialization_format": topic.encoding,
-                    "offered_qos_profiles": [],
+                    KEY: [profile.document() for profile in topic.offered],
                     "type_description_hash": topic.type_hash,
                 },
                 "message_count": whole.counts[name],

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import yaml
 
+from bags.recordings.quality import KEY, Profile, offered
 from nlsid_core.errors import BagError
 
 METADATA: Final = "metadata.yaml"
@@ -30,6 +31,7 @@ class BagFiles:
     compressed: bool = False
     counts: dict[str, int] | None = None
     encodings: dict[str, str] = field(default_factory=dict)
+    offered: dict[str, tuple[Profile, ...]] = field(default_factory=dict)
     custom: dict[str, str] = field(default_factory=dict)
     finished: bool = True
 
@@ -113,11 +115,14 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         raise _bad(file, "relative_file_paths is not a list of names")
     counts: dict[str, int] = {}
     encodings: dict[str, str] = {}
+    profiles: dict[str, tuple[Profile, ...]] = {}
     try:
         for entry in metadata["topics_with_message_count"] or ():
             topic = str(entry["topic_metadata"]["name"])
             counts[topic] = counts.get(topic, 0) + int(entry["message_count"])
             encodings[topic] = str(entry["topic_metadata"]["serialization_format"])
+            found = offered(entry["topic_metadata"].get(KEY))
+            profiles[topic] = (*profiles.get(topic, ()), *found)
     except (KeyError, TypeError, ValueError) as error:
         raise _bad(file, f"topics_with_message_count: {type(error).__name__} {error}") from error
     custom = metadata.get("custom_data") or {}
@@ -130,6 +135,7 @@ def _described(path: Path, metadata: dict[str, Any]) -> BagFiles:
         compressed=bool(metadata.get("compression_format")),
         counts=counts,
         encodings=encodings,
+        offered=profiles,
         custom={str(key): str(value) for key, value in custom.items()},
     )
 

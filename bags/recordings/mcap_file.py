@@ -34,7 +34,7 @@ from bags.recordings.mcap_records import (
     walk_channels,
     walk_messages,
 )
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 MAGIC: Final = b"\x89MCAP0\r\n"

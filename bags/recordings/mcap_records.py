@@ -18,7 +18,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from bags.recordings.batch import Batch
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message

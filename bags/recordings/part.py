@@ -11,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 from bags.recordings.definitions import standard_definition
 from bags.recordings.description import FileDescription
 from bags.recordings.output import Output, Reserve
+from bags.recordings.quality import KEY, Profile, offered_text
 from bags.recordings.storage import FORMATS, Channel
 from nlsid_core.errors import BagError
 
@@ -29,13 +30,14 @@ COMPRESSIONS: Final = {
 
 @dataclass(frozen=True)
 class Topic:
-    """How a topic's messages are written; schema: its encoding and text."""
+    """How a topic's messages are written; schema: its encoding and text. offered: see `quality`."""
 
     name: str
     msgtype: str
     encoding: str
     schema: tuple[str, str]
     metadata: Mapping[str, str]
+    offered: tuple[Profile, ...] = ()
 
 
 def topic_like(channel: Channel) -> Topic:
@@ -44,7 +46,14 @@ def topic_like(channel: Channel) -> Topic:
     if not channel.definition.data and channel.encoding == "cdr":
         with suppress(BagError):  # not a standard type either: copied without its definition
             schema = "ros2msg", standard_definition(channel.msgtype).text
-    return Topic(channel.topic, channel.msgtype, channel.encoding, schema, channel.metadata)
+    return Topic(
+        channel.topic,
+        channel.msgtype,
+        channel.encoding,
+        schema,
+        channel.metadata,
+        channel.offered,
+    )
 
 
 class Part:
@@ -95,7 +104,10 @@ class Part:
             encoding, text = topic.schema
             self._schemas[key] = self._mcap.register_schema(topic.msgtype, encoding, text.encode())
         self._channels[topic.name] = self._mcap.register_channel(
-            topic.name, topic.encoding, self._schemas[key], dict(topic.metadata)
+            topic.name,
+            topic.encoding,
+            self._schemas[key],
+            {**topic.metadata, KEY: offered_text(topic.offered)},
         )
         self.counts[topic.name] = 0
 

@@ -53,7 +53,7 @@ def repair(bag: Path) -> int:
             for channel in storage.channels:
                 type_hash = channel.metadata.get(TYPE_HASH, "")
                 topics[channel.topic] = TopicDescription(
-                    channel.msgtype, channel.encoding, type_hash
+                    channel.msgtype, channel.encoding, type_hash, channel.offered
                 )
             if finished is None:
                 (scratch / file.name).replace(file)

@@ -3,7 +3,7 @@
 import heapq
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -17,9 +17,11 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from bags.recordings.batch import Batch, BatchBuilder
+from bags.recordings.definitions import Definition
 from bags.recordings.mcap_file import McapFile
 from bags.recordings.mcap_records import Block
 from bags.recordings.message_types import ros2_definition, types_in_bag
+from bags.recordings.quality import KEY, LATCHED, Profile, offered, profile_of
 from nlsid_core.errors import BagError
 
 FORMATS: Final = {
@@ -34,6 +36,7 @@ class Channel:
     """One recorded stream of messages; a topic has one, or several if it was recorded in parts.
 
     key: its place in `Storage.channels`. count: messages it has. metadata: the recorder's own.
+    offered: what its publishers offered, as far as the file says so.
     """
 
     key: int
@@ -43,6 +46,7 @@ class Channel:
     definition: MessageDefinition
     count: int
     metadata: Mapping[str, str] = field(default_factory=dict)
+    offered: tuple[Profile, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,14 @@ class Raw:
     log_ns: int
     publish_ns: int
     data: bytes
+
+
+def defined(channel: Channel, definitions: Mapping[str, Definition]) -> Channel:
+    """The channel, with the given definition of its type where its file has none."""
+    given = definitions.get(channel.msgtype)
+    if given is None or channel.definition.format != MessageDefinitionFormat.NONE:
+        return channel
+    return replace(channel, definition=MessageDefinition(MessageDefinitionFormat.MSG, given.text))
 
 
 class Storage(Protocol):
@@ -112,6 +124,7 @@ class McapStorage:
                     definition=_definition(schema),
                     count=found.counts.get(channel_id, 0),
                     metadata=channel.metadata,
+                    offered=offered(channel.metadata.get(KEY, "")),
                 )
             )
         self._keys.append(keys)
@@ -258,15 +271,27 @@ def reading(path: Path) -> Iterator[None]:
 
 def _channel(key: int, connection: Connection, *, ros1: bool) -> Channel:
     encoding, definition = "cdr", connection.msgdef
+    profiles: tuple[Profile, ...] = ()
     if isinstance(connection.ext, ConnectionExtRosbag2):
         encoding = connection.ext.serialization_format
+        profiles = tuple(profile_of(found) for found in connection.ext.offered_qos_profiles)
+    elif connection.ext.latching:
+        profiles = (LATCHED,)
     if ros1:
         try:
             definition = ros2_definition(connection.msgtype, definition)
         except BagError:
             encoding = "ros1"  # of a type that cannot be translated; the others can be read
     msgtype = _type_name(connection.msgtype)
-    return Channel(key, connection.topic, msgtype, encoding, definition, connection.msgcount)
+    return Channel(
+        key,
+        connection.topic,
+        msgtype,
+        encoding,
+        definition,
+        connection.msgcount,
+        offered=profiles,
+    )
 
 
 def _definition(schema: Any) -> MessageDefinition:

@@ -14,6 +14,7 @@ from bags.recordings.description import TopicDescription, write_metadata
 from bags.recordings.message_types import are_same, types_in_bag
 from bags.recordings.output import Reserve
 from bags.recordings.part import TYPE_HASH, Part, Topic, topic_like
+from bags.recordings.quality import Profile
 from bags.recordings.storage import Channel
 from nlsid_core.errors import BagError
 
@@ -107,11 +108,13 @@ class BagWriter:
         *,
         definition: Definition | None = None,
         like: Channel | None = None,
+        offered: tuple[Profile, ...] = (),
     ) -> None:
         """Announce a topic, so that the bag lists it even if no message comes.
 
         `definition`: what defines its type, `like`: the channel of another bag that it is a copy
-        of, with its own definition; without either the type is a standard one. Raises BagError for
+        of, with its own definition; without either the type is a standard one. `offered`: the
+        quality of service of its publishers, if it is no copy. Raises BagError for
         a type that is not known and for a second type on one topic.
         """
         if topic in self._topics:
@@ -125,8 +128,9 @@ class BagWriter:
             return
         if like is None:
             defined = definition or standard_definition(msgtype)
-            metadata = {"offered_qos_profiles": "[]", TYPE_HASH: defined.type_hash}
-            added = Topic(topic, msgtype, "cdr", ("ros2msg", defined.text), metadata)
+            metadata = {TYPE_HASH: defined.type_hash}
+            schema = ("ros2msg", defined.text)
+            added = Topic(topic, msgtype, "cdr", schema, metadata, offered)
         else:
             added = replace(topic_like(like), name=topic)
             self._like[topic] = like
@@ -213,7 +217,9 @@ class BagWriter:
                 if not part.closed:
                     part.finish()
             topics = {
-                name: TopicDescription(t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""))
+                name: TopicDescription(
+                    t.msgtype, t.encoding, t.metadata.get(TYPE_HASH, ""), t.offered
+                )
                 for name, t in self._topics.items()
             }
             files = [part.description for part in self._parts]

@@ -14,7 +14,7 @@ import numpy as np
 
 from bags.recordings.message_types import standard_types
 from bags.recordings.writer import BagWriter
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, NlsidError
 
 TRIALS: Final = 41

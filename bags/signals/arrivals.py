@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from bags.recordings.definitions import Definition
+from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 
 GAP: Final = 1.5  # mean periods: a longer interval between stamps is a gap
@@ -98,15 +99,26 @@ class Recent:
         while self._arrivals[0].log_time_ns < oldest:
             self._arrivals.popleft()
 
-    def save(self, path: Path, *, definitions: Mapping[str, Definition] | None = None) -> int:
+    def save(
+        self,
+        path: Path,
+        *,
+        definitions: Mapping[str, Definition] | None = None,
+        offered: Mapping[str, tuple[Profile, ...]] | None = None,
+    ) -> int:
         """Write a bag of what is remembered; how many messages. Raises BagError if it exists.
 
         definitions: of the topics' types by topic; those that are not in it have standard types.
+        offered: the quality of service of each topic's publishers, where it is known.
         """
+        profiles = offered or {}
         with BagWriter(path, custom={SNAPSHOT: f"{self.seconds:g} s"}) as bag:
             for topic, definition in (definitions or {}).items():
-                bag.add_topic(topic, definition.msgtype, definition=definition)
+                said = profiles.get(topic, ())
+                bag.add_topic(topic, definition.msgtype, definition=definition, offered=said)
             for arrival in self._arrivals:
+                said = profiles.get(arrival.topic, ())
+                bag.add_topic(arrival.topic, arrival.msgtype, offered=said)
                 bag.write(
                     arrival.topic,
                     arrival.msgtype,

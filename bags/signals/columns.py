@@ -15,7 +15,7 @@ from bags.recordings.batch import Batch
 from bags.recordings.cdr import Gatherer, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.signal import SignalPath, Step
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
 STAMP: Final = (
@@ -56,7 +56,7 @@ def stream_columns(
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
         topics.setdefault(signal.topic, {})[name] = signal
-    readers = {topic: _TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
+    readers = {topic: TopicReader(bag, topic, wanted) for topic, wanted in topics.items()}
     total = sum(c.count for c in bag.channels if c.topic in readers)
     done = 0
     for channel, batch in bag.batches(list(readers)):
@@ -101,8 +101,8 @@ def expand_paths(bag: Bag, paths: Sequence[SignalPath]) -> list[SignalPath]:
     return expanded
 
 
-class _TopicReader:
-    """Turns batches of one topic into columns."""
+class TopicReader:
+    """Turns batches of one topic into columns; BagError for signals that are not on it."""
 
     def __init__(self, bag: Bag, topic: str, signals: Mapping[str, SignalPath]) -> None:
         msgtype, types = bag.types_on(topic)
@@ -113,12 +113,14 @@ class _TopicReader:
         self._signals = signals
         self._stamped = is_stamped(msgtype, types)
         self._done = 0
-        self._targets = {n: s.targets(msgtype, types) for n, s in signals.items()}
+        self._kind = msgtype, types
+        self._targets = {n: s.targets(msgtype, types) for n, s in signals.items() if not s.framed}
         targets: list[tuple[Step, ...]] = list(STAMP) if self._stamped else []
         targets += [target for group in self._targets.values() for target in group]
         self._gatherer = Gatherer(msgtype, types, targets)
 
     def read(self, batch: Batch) -> Columns:
+        """The columns of a batch; BagError if a message cannot be read or an array changed."""
         try:
             numbers = self._gatherer.gather(batch)
         except UnreadableMessageError as error:
@@ -130,11 +132,19 @@ class _TopicReader:
         stamp_ns = None
         if self._stamped:
             stamp_ns = numbers[0].astype(np.int64) * 10**9 + numbers[1].astype(np.int64)
-        values = {}
+        values = {name: self._framed(batch, s) for name, s in self._signals.items() if s.framed}
         for name, group in self._targets.items():
             values[name] = self._signals[name].combine(numbers[at : at + len(group)])
             at += len(group)
         return Columns(self._topic, batch.log_ns, batch.publish_ns, stamp_ns, values)
+
+    def _framed(self, batch: Batch, signal: SignalPath) -> FloatArray:
+        """Read by decoding: which message of an array is meant differs from message to message."""
+        try:
+            found = [signal.value(decode(batch.data(k), *self._kind)) for k in range(len(batch))]
+        except BagError as error:
+            raise BagError(f"{self._where}: {error}") from error
+        return np.array(found)
 
 
 def _check(bag: Bag, path: SignalPath) -> None:

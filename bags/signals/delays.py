@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import correlate, correlation_lags
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
 
 

@@ -1,14 +1,21 @@
 """A signal with what is to be done to it, `/imu:orientation.yaw|unwrap|derivative(0.2 s)`.
 
-The path is what `bags.signals.signal` reads; each operation after a `|` acts on the whole recording
-of the signal, from left to right:
+The path is what `bags.signals.signal` reads. Operations after a `|` change the numbers,
+from left to right, and use no later sample, so that a monitor gives the same numbers:
 
 - `unit(U)`: the recorded number is in U. `to(U)`: convert it to U.
 - `unwrap`: an angle in rad without jumps of a turn.
-- `derivative(T s)`: d/dt by the stated filter, see `derivative`.
+- `derivative(T s)`: the slope over the last T s, see `derivative`.
+
+Three more say when the signal is sampled (`bags.signals.sampling`) and change no number:
+
+- `clock(log)`: its stamps are the times of logging (live: of arrival), not the header's.
+- `hold(T s)`: a sample takes the latest value, if that is at most T s old.
+- `linear(T s)`: a sample is interpolated between values at most T s apart.
 """
 
 import re
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,10 +25,14 @@ from rosbags.typesys.store import Typestore
 from bags.recordings.names import did_you_mean
 from bags.signals.signal import ANGLES, QUATERNION, SignalPath, numeric_paths
 from bags.signals.units import UNITS, conversion, implied_unit, per_second
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
-OPERATIONS: Final = ("unit", "to", "unwrap", "derivative")
+OPERATIONS: Final = ("unit", "to", "unwrap", "derivative", "clock", "hold", "linear")
+TIMED: Final = ("derivative", "hold", "linear")  # these take a time
+SAMPLING: Final = ("clock", "hold", "linear")
+SIGNAL_CLOCKS: Final = ("header", "log")
+TURN: Final = 2.0 * np.pi
 MIN_SAMPLES: Final = 3  # two give a slope without any smoothing
 BLOCK: Final = 2**20  # samples of neighbourhoods laid side by side at once
 
@@ -31,7 +42,7 @@ _SECONDS: Final = re.compile(r"(\d+(?:\.\d*)?(?:e-?\d+)?)\s*(ms|s)", re.ASCII)
 
 @dataclass(frozen=True)
 class Operation:
-    """One step after the path: its name and its argument, a unit or a time in s."""
+    """One step after the path: its name and its argument, a unit (or clock) or a time in s."""
 
     name: str
     unit: str = ""
@@ -52,11 +63,13 @@ class Expression:
     @classmethod
     def parse(cls, text: str) -> "Expression":
         """Read `path|operation|...`; BagError says what is wrong with it."""
-        path, *operations = text.split("|")
-        return cls(
-            SignalPath.parse(path.rstrip() if operations else path),
-            tuple(_operation(part, text) for part in operations),
-        )
+        path, *parts = text.split("|")
+        signal = SignalPath.parse(path.rstrip() if parts else path)
+        operations = tuple(_operation(part, text) for part in parts)
+        names = [operation.name for operation in operations]
+        if names.count("clock") > 1 or sum(names.count(name) for name in ("hold", "linear")) > 1:
+            raise BagError(f"'{text}' says twice when the signal is sampled")
+        return cls(signal, operations)
 
     def __str__(self) -> str:
         return "|".join(map(str, (self.path, *self.operations)))
@@ -64,6 +77,29 @@ class Expression:
     def of(self, path: SignalPath) -> "Expression":
         """The same operations on another path."""
         return replace(self, path=path)
+
+    def operation(self, *names: str) -> Operation | None:
+        """The one operation of these names, None if there is none."""
+        return next((found for found in self.operations if found.name in names), None)
+
+    @property
+    def clock(self) -> str:
+        """`header` or `log`; empty if the text does not say."""
+        found = self.operation("clock")
+        return "" if found is None else found.unit
+
+    @property
+    def numbers(self) -> "Expression":
+        """The expression without what says when it is sampled."""
+        kept = tuple(found for found in self.operations if found.name not in SAMPLING)
+        return replace(self, operations=kept)
+
+    def sampled(self, name: str, *, unit: str = "", window: float = 0.0) -> "Expression":
+        """With one more operation that says when it is sampled, unless it says that already."""
+        kinds = ("clock",) if name == "clock" else ("hold", "linear")
+        if self.operation(*kinds) is not None:
+            return self
+        return replace(self, operations=(*self.operations, Operation(name, unit, window)))
 
     def unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the result ("" if nothing implies one); BagError if one cannot be converted.
@@ -82,7 +118,10 @@ class Expression:
         return unit
 
     def apply(self, values: FloatArray, stamp_ns: IntArray, unit: str) -> FloatArray:
-        """(N,) results from (N,) recorded values in `unit` at `stamp_ns` (N,), increasing."""
+        """(N,) results from (N,) recorded values in `unit` at `stamp_ns` (N,), increasing.
+
+        NaN where a derivative has too few samples before it.
+        """
         for operation in self.operations:
             if operation.name == "unit":
                 unit = operation.unit
@@ -90,14 +129,31 @@ class Expression:
                 factor, shift = self._conversion(unit, operation.unit)
                 values, unit = values * factor + shift, operation.unit
             elif operation.name == "unwrap":
-                values = np.unwrap(values)
-            else:
+                turns = np.concatenate([[0.0], np.cumsum(_turns(np.diff(values)))])
+                values = values - TURN * turns[: len(values)]
+            elif operation.name == "derivative":
                 try:
                     values = derivative(values, stamp_ns, operation.window)
                 except BagError as error:
                     raise BagError(f"{self}: {error}") from error
                 unit = per_second(unit)
         return values
+
+    def running(self, unit: str) -> "Running":
+        """The same, one message after the other, of numbers in `unit`."""
+        steps: list[_Scaled | _Unwrapped | _Slope] = []
+        for operation in self.operations:
+            if operation.name == "unit":
+                unit = operation.unit
+            elif operation.name == "to":
+                steps.append(_Scaled(*self._conversion(unit, operation.unit)))
+                unit = operation.unit
+            elif operation.name == "unwrap":
+                steps.append(_Unwrapped())
+            elif operation.name == "derivative":
+                steps.append(_Slope(operation.window))
+                unit = per_second(unit)
+        return Running(steps)
 
     def recorded_unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the number at the path, before any operation."""
@@ -110,39 +166,112 @@ class Expression:
             raise BagError(f"{self}: {error}") from error
 
 
+class Running:
+    """An expression's operations on one message after the other: bit for bit what `apply` gives."""
+
+    def __init__(self, steps: "list[_Scaled | _Unwrapped | _Slope]") -> None:
+        self._steps = steps
+
+    @property
+    def remembers(self) -> bool:
+        """Whether a result depends on earlier messages, so that they have to come in order."""
+        return any(not isinstance(step, _Scaled) for step in self._steps)
+
+    def update(self, stamp_ns: int, value: float) -> float:
+        """The result for the next message, NaN if too few came before it."""
+        for step in self._steps:
+            value = step.update(stamp_ns, value)
+        return value
+
+
+@dataclass
+class _Scaled:
+    factor: float
+    shift: float
+
+    def update(self, _stamp_ns: int, value: float) -> float:
+        return value * self.factor + self.shift
+
+
+class _Unwrapped:
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._turns = 0.0
+
+    def update(self, _stamp_ns: int, value: float) -> float:
+        if self._last is not None:
+            self._turns += float(_turns(np.array(value - self._last)))
+        self._last = value
+        return value - TURN * self._turns
+
+
+class _Slope:
+    def __init__(self, window: float) -> None:
+        self._window_ns = round(window * 1e9)
+        self._first_ns: int | None = None
+        self._near: deque[tuple[int, float]] = deque()
+
+    def update(self, stamp_ns: int, value: float) -> float:
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        near = self._near
+        near.append((stamp_ns, value))
+        while near[0][0] < stamp_ns - self._window_ns:
+            near.popleft()
+        if stamp_ns - self._first_ns < self._window_ns or len(near) < MIN_SAMPLES:
+            return float("nan")
+        stamps = np.array([stamp for stamp, _ in near], dtype=np.int64)
+        values = np.array([value for _, value in near], dtype=np.float64)
+        return float(_slopes(stamps[None] - stamp_ns, values[None])[0])
+
+
 def derivative(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatArray:
-    """(N,) per s: at each stamp the slope of the least-squares line through its neighbourhood.
+    """(N,) per s: at each stamp the slope of the least-squares line through the last `window` s.
 
-    The neighbourhood is the samples within window/2 s on either side, so the filter has no delay;
-    at a uniform rate it passes a frequency f with gain 3 (sin φ - φ cos φ)/φ³, φ = π f·window
-    (-3 dB at 0.58/window, first zero at 1.43/window). It does without a uniform rate. Near the ends
-    the neighbourhood is one-sided: there it is a line through that side, delayed by its half.
+    It uses nothing later, so a monitor can have it at once, and is delayed by window/2: at a
+    uniform rate it passes a frequency f with gain 3 (sin φ - φ cos φ)/φ³, φ = π f·window (-3 dB at
+    0.58/window, first zero at 1.43/window). It does without a uniform rate. NaN until the window
+    is full, and where it has fewer than 3 samples.
 
-    Raises BagError if stamps do not increase, or where fewer than 3 samples are within the window.
+    Raises BagError if stamps do not increase, or if no window has 3 samples.
 
     Source: A. Savitzky, M. Golay, Anal. Chem. 36 (1964) 1627, first derivative, order 2, for
     samples that need not be equidistant.
     """
     if len(values) and (np.diff(stamp_ns) <= 0).any():
         raise BagError("stamps do not increase, so there is no derivative")
-    half_ns = round(window * 0.5e9)
-    low = np.searchsorted(stamp_ns, stamp_ns - half_ns, side="left")
-    high = np.searchsorted(stamp_ns, stamp_ns + half_ns, side="right")
-    if len(few := np.flatnonzero(high - low < MIN_SAMPLES)):
+    window_ns = round(window * 1e9)
+    low = np.searchsorted(stamp_ns, stamp_ns - window_ns, side="left")
+    count = np.arange(1, len(stamp_ns) + 1) - low
+    usable = (count >= MIN_SAMPLES) & (stamp_ns - stamp_ns[:1] >= window_ns)
+    if not usable.any():
+        most = int(count.max(initial=0))
         raise BagError(
-            f"{high[few[0]] - low[few[0]]} samples within {window:g} s of message {few[0]}, "
-            f"a slope needs {MIN_SAMPLES}; take a longer window"
+            f"at most {most} samples within {window:g} s, a slope needs {MIN_SAMPLES} of them in "
+            "a window that lies inside the recording; take another window"
         )
-    slopes = np.empty(len(values))
-    for count in np.unique(high - low):
-        rows = np.flatnonzero(high - low == count)
-        for block in np.array_split(rows, 1 + len(rows) * count // BLOCK):
-            near = low[block, None] + np.arange(count)
-            t = (stamp_ns[near] - stamp_ns[block, None]) / 1e9
-            t -= t.mean(axis=1, keepdims=True)
-            rise = values[near] - values[block, None]
-            slopes[block] = (t * rise).sum(axis=1) / (t * t).sum(axis=1)
+    slopes = np.full(len(values), np.nan)
+    for width in np.unique(count[usable]):
+        rows = np.flatnonzero(usable & (count == width))
+        for block in np.array_split(rows, 1 + len(rows) * width // BLOCK):
+            near = low[block, None] + np.arange(width)
+            slopes[block] = _slopes(stamp_ns[near] - stamp_ns[block, None], values[near])
     return slopes
+
+
+def _slopes(before_ns: IntArray, values: FloatArray) -> FloatArray:
+    """(rows,) per s: slopes of the lines through `values` (rows, count) at `before_ns` from now."""
+    t = before_ns / 1e9
+    t -= t.mean(axis=1, keepdims=True)
+    rise = values - values[:, -1:]
+    slopes: FloatArray = (t * rise).sum(axis=1) / (t * t).sum(axis=1)
+    return slopes
+
+
+def _turns(step: FloatArray) -> FloatArray:
+    """Whole turns by which an angle jumped in each `step`; none for NaN."""
+    turns: FloatArray = np.nan_to_num(np.rint(step / TURN))
+    return turns
 
 
 def _operation(part: str, text: str) -> Operation:
@@ -156,13 +285,15 @@ def _operation(part: str, text: str) -> Operation:
         if argument:
             raise BagError(f"'{part}' in '{text}': unwrap takes no argument")
         return Operation(name)
-    if name == "derivative":
+    if name == "clock":
+        if argument not in SIGNAL_CLOCKS:
+            raise BagError(f"'{part}' in '{text}': clock(header) or clock(log)")
+        return Operation(name, unit=argument)
+    if name in TIMED:
         seconds = _SECONDS.fullmatch(argument)
         window = float(seconds[1]) * UNITS[seconds[2]].scale if seconds else 0.0
         if not 0.0 < window < 1e6:
-            raise BagError(
-                f"'{part}' in '{text}': state the filter's window, e.g. derivative(0.2 s)"
-            )
+            raise BagError(f"'{part}' in '{text}': state a time, e.g. {name}(0.2 s)")
         return Operation(name, window=window)
     if name == "to" and argument not in UNITS:
         near = did_you_mean(argument, UNITS)

@@ -1,8 +1,4 @@
-"""Put recorded signals on one time grid: a response and the excitation that acted on it.
-
-The rule, which `bags.signals.pairing` follows live: a response keeps its own stamp, and the
-excitation of a sample is the latest command stamped at or before it (zero-order hold).
-"""
+"""Recorded signals as trajectories on one time grid, by the rules of `bags.signals.sampling`."""
 
 import json
 import logging
@@ -11,21 +7,30 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final, overload
+from typing import Any, Final, overload
 
 import numpy as np
 
-from bags.signals.reader import Samples, bag_origin, read_signals, stamp_text
-from bags.signals.timing import segments
-from nlsid_core._json import canonical
-from nlsid_core._types import FloatArray, IntArray, Json
-from nlsid_core.errors import DataError
-from nlsid_core.trajectory import Dataset, Trajectory
-
-JITTER_TOLERANCE: Final = (
-    0.05  # of the period: a loop's usual scatter; interpolating would filter it
+from bags.recordings.definitions import Definition
+from bags.signals.expressions import Expression
+from bags.signals.reader import (
+    HEADER_STAMP,
+    LOG_TIME,
+    Samples,
+    bag_origin,
+    read_signals,
+    stamp_text,
 )
+from bags.signals.sampling import Sample, Sampler, one_clock, sampled_path
+from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import BagError, DataError, apart
+from nlsid_core.files import canonical
+from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
+
+PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
 DEFAULT_MAX_GAP: Final = 1.5  # periods: no sample may be missing
+MOST_FILLED: Final = 0.05  # of the samples: with more, the data are invented rather than recorded
 MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
@@ -44,79 +49,206 @@ def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
     return (stamp_ns - origin_ns) / 1e9
 
 
-def to_trajectory(
+def to_trajectories(
     responses: Sequence[Samples],
     excitations: Sequence[Samples],
     *,
     period: float | None = None,
     max_gap: float | None = None,
-    tolerance: float = JITTER_TOLERANCE,
+    split_gaps: bool = False,
     name: str = "",
     group: str = "",
     digest: str = "",
     provenance: str = "",
-) -> Trajectory:
-    """One trajectory on the grid of the first response, t = 0 at its first sample.
+) -> list[Trajectory]:
+    """The samples of `bags.signals.sampling` as trajectories on a uniform grid, t = 0 at the first.
 
-    period: s (None: the median step of the first response). A response whose stamps all lie within
-    `tolerance` periods of the grid, one on each point, is used as it is; any other is interpolated
-    linearly between samples at most `max_gap` s apart (None: 1.5 periods, so none may be missing).
-    A command is held for at most `max_gap` too. Responses before the first command or more than
-    `max_gap` after the last are left out, and logged.
+    period: s (None: the median step of the first response). max_gap: s (None: 1.5 periods, so no
+    sample may be missing). Responses that are samples as they come are used as they are, one on
+    each point of the grid, where they follow each other in a period give or take GRID_TOLERANCE,
+    as the monitor takes them; a point without one, in a gap of at most `max_gap`, is filled in on
+    the line between its neighbours, and counted (`filled` in the provenance). A command without a
+    limit of its own, `|hold(T s)`, is held for at most `max_gap`.
 
-    Raises DataError, saying where, if stamps repeat, a gap is too long, the response is sampled at
-    another period than asked for, or fewer than two samples are left.
+    Samples without every signal are left out at the start and the end, and logged. Between them
+    they raise DataError, or with `split_gaps` end one trajectory and begin the next.
+
+    Raises DataError, saying where, if stamps repeat, a gap is too long, a response that is not
+    resampled is not sampled at the period, or fewer than two samples are left.
     """
     label = name or "signals"
     if not responses or not excitations:
         raise DataError(f"{label}: needs at least one response and one excitation")
     for samples in responses:
         _refuse_repeated_stamps(samples, label)
+    signals = [Expression.parse(samples.path) for samples in responses]
+    on_grid = signals[0].operation("hold", "linear") is not None
     base = responses[0].stamp_ns
-    period_ns = _period_ns(base, period, tolerance, f"{label}: {responses[0].path}")
+    where = f"{label}: {responses[0].path}"
+    period_ns = _period_ns(base, period, where, on_grid=on_grid)
     gap_ns = round(DEFAULT_MAX_GAP * period_ns if max_gap is None else max_gap * 1e9)
-    for samples in responses:
-        _refuse_gaps(samples, gap_ns, label)
-
-    first = max(samples.stamp_ns[0] for samples in [*responses, *excitations])
-    last = min(
-        *(samples.stamp_ns[-1] for samples in responses),
-        *(samples.stamp_ns[-1] + gap_ns for samples in excitations),
-    )
-    kept = base[(base >= first) & (base <= last)]
-    if len(kept) < 2:
-        raise DataError(
-            f"{label}: responses and excitations overlap in {len(kept)} samples; the first common "
-            f"stamp is {stamp_text(int(first))}, the last {stamp_text(int(last))}"
-        )
-    if len(kept) < len(base):
+    held = [
+        Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9)
+        for samples in excitations
+    ]
+    sampler = Sampler(signals, held, period=period_ns / 1e9)
+    found = list(_sampled(sampler, [*responses, *excitations]))
+    complete = [k for k, sample in enumerate(found) if not sample.missing]
+    if len(complete) < 2:
+        raise DataError(_no_overlap(label, responses, excitations, len(complete)))
+    last = complete[-1]
+    left_out = sampler.incomplete + len(found) - last - 1
+    if left_out and not split_gaps:
         log.warning(
             "%s: %d of %d samples left out, where a signal is missing at the start or the end",
             label,
-            len(base) - len(kept),
-            len(base),
+            left_out,
+            sampler.incomplete + len(found),
         )
-    origin = int(kept[0])
-    grid = origin + period_ns * np.arange(1 + round((int(kept[-1]) - origin) / period_ns))
-    on_grid = _on_grid(base, grid, period_ns, tolerance)
-    if on_grid is None:
-        grid = grid[grid <= kept[-1]]
-    sampled_at = grid if on_grid is None else base[on_grid]
-    return Trajectory(
-        t=seconds(grid, origin),
-        y=np.column_stack([_sample(s, grid, period_ns, tolerance) for s in responses]),
-        u=np.column_stack([_hold(s, sampled_at, gap_ns, label) for s in excitations]),
-        y_names=tuple(samples.path for samples in responses),
-        u_names=tuple(samples.path for samples in excitations),
-        y_units=tuple(samples.unit for samples in responses),
-        u_units=tuple(samples.unit for samples in excitations),
-        y_paths=tuple(samples.path for samples in responses),
-        u_paths=tuple(samples.path for samples in excitations),
-        name=name,
-        group=group,
-        digest=digest,
-        provenance=provenance,
+    runs = [found[: last + 1]]
+    if split_gaps:
+        runs = [run for run in _whole_runs(runs[0], gap_ns) if len(run) >= MIN_STRETCH]
+        if not runs:
+            raise DataError(f"{label}: no stretch of {MIN_STRETCH} samples without a gap")
+    return [
+        _trajectory(
+            run,
+            sampler,
+            excitations,
+            period_ns=period_ns,
+            gap_ns=gap_ns,
+            label=label,
+            labels={
+                "y_units": tuple(samples.unit for samples in responses),
+                "u_units": tuple(samples.unit for samples in excitations),
+                "y_paths": tuple(samples.path for samples in responses),
+                "u_paths": tuple(samples.path for samples in excitations),
+                "name": name if len(runs) == 1 else f"{name}.{k}",
+                "group": group if len(runs) == 1 else "",
+                "digest": digest,
+                "provenance": provenance,
+            },
+        )
+        for k, run in enumerate(runs, start=1)
+    ]
+
+
+def _sampled(sampler: Sampler, signals: Sequence[Samples]) -> Iterator[Sample]:
+    """What the sampler gives for a whole recording, fed in the order of the stamps.
+
+    Of equal stamps the excitations come first, as the latest command at a stamp counts.
+    """
+    which = np.repeat(np.arange(len(signals)), [len(samples) for samples in signals])
+    stamps = np.concatenate([samples.stamp_ns for samples in signals])
+    values = np.concatenate([samples.values for samples in signals])
+    order = np.lexsort((-which, stamps))
+    columns = (which[order].tolist(), stamps[order].tolist(), values[order].tolist())
+    for k, stamp_ns, value in zip(*columns, strict=True):
+        yield from sampler.feed(k, stamp_ns, value)
+    yield from sampler.flush()
+
+
+def _whole_runs(found: Sequence[Sample], gap_ns: int) -> Iterator[list[Sample]]:
+    """Runs of samples with every signal and with at most `gap_ns` between neighbours."""
+    run: list[Sample] = []
+    for sample in found:
+        if sample.missing or (run and sample.stamp_ns - run[-1].stamp_ns > gap_ns):
+            if run:
+                yield run
+            run = []
+        if not sample.missing:
+            run.append(sample)
+    if run:
+        yield run
+
+
+def _trajectory(
+    run: Sequence[Sample],
+    sampler: Sampler,
+    excitations: Sequence[Samples],
+    *,
+    period_ns: int,
+    gap_ns: int,
+    label: str,
+    labels: dict[str, Any],
+) -> Trajectory:
+    for sample in run:
+        if sample.missing:
+            raise DataError(
+                f"{label}: {sample.missing}, at {stamp_text(sample.stamp_ns)} "
+                f"({sum(bool(s.missing) for s in run)} of {len(run)} samples are not complete); "
+                "split_gaps leaves out such stretches"
+            )
+    stamps = np.array([sample.stamp_ns for sample in run], dtype=np.int64)
+    y = np.array([sample.y for sample in run])
+    u = np.array([sample.u for sample in run])
+    filled = 0
+    if not sampler.on_grid:
+        where = f"{label}: {sampler.responses[0]}"
+        _refuse_gaps(stamps, gap_ns, where)
+        points = _points(stamps, period_ns, where)
+        grid = np.arange(points[-1][0] + 1)
+        at, rows = (np.array(column) for column in zip(*points, strict=True))
+        filled = len(grid) - len(rows)
+        y = np.column_stack([np.interp(grid, at, column) for column in y[rows].T])
+        u = u[rows]
+        if filled:
+            before = np.searchsorted(at, grid, side="right") - 1
+            at_ns = stamps[rows[before]] + period_ns * (grid - at[before])
+            u = np.column_stack([_held(samples, at_ns) for samples in excitations])
+            log.warning("%s: %d of %d samples filled in between others", where, filled, len(grid))
+    t = seconds(period_ns * np.arange(len(y)), 0)
+    if filled:
+        origin = json.loads(labels["provenance"] or "{}") | {"filled": filled}
+        labels = labels | {"provenance": canonical(origin).decode()}
+    names = {"y_names": labels["y_paths"], "u_names": labels["u_paths"]}
+    return Trajectory(t=t, y=y, u=u, **names, **labels)
+
+
+def _points(stamps: IntArray, period_ns: int, where: str) -> list[tuple[int, int]]:
+    """(point of the grid, sample on it); the grid follows the samples, as the monitor does.
+
+    A sample more than GRID_TOLERANCE periods off the grid from the last one is on no point.
+    DataError if that leaves more than MOST_FILLED of the points empty.
+    """
+    points = [(0, 0)]
+    worst, last_ns = 0.0, int(stamps[0])
+    for row, stamp_ns in enumerate(stamps.tolist()):
+        steps = (stamp_ns - last_ns) / period_ns
+        whole = round(steps)
+        if whole < 1 or abs(steps - whole) > GRID_TOLERANCE:
+            worst = max(worst, abs(steps - max(whole, 1))) if row else 0.0
+            continue
+        points.append((points[-1][0] + whole, row))
+        last_ns = stamp_ns
+    empty = 1 + points[-1][0] - len(points)
+    off = len(stamps) - len(points)
+    if off and max(empty, off) > MOST_FILLED * (1 + points[-1][0]):
+        raise DataError(
+            f"{where}: {off} of {len(stamps)} samples are up to {100 * worst:.0f} % of a period "
+            f"off a grid of {period_ns / 1e9:g} s; set grid.resample to linear or last"
+        )
+    return points
+
+
+def _held(samples: Samples, at_ns: IntArray) -> FloatArray:
+    """The latest command at or before each time; the sampler has refused those held too long."""
+    return samples.values[np.searchsorted(samples.stamp_ns, at_ns, side="right") - 1]
+
+
+def _no_overlap(
+    label: str, responses: Sequence[Samples], excitations: Sequence[Samples], complete: int
+) -> str:
+    signals = [*responses, *excitations]
+    first = max(int(samples.stamp_ns[0]) for samples in signals)
+    last = min(int(samples.stamp_ns[-1]) for samples in signals)
+    said = (
+        f"{label}: responses and excitations overlap in {complete} samples; the first common "
+        f"stamp is {stamp_text(first)}, the last {stamp_text(last)}"
     )
+    if len({samples.path.partition(":")[0] for samples in responses}) > 1:
+        said += "; responses on several topics need one stamp each sample, or grid.resample"
+    return said
 
 
 def read_dataset(
@@ -126,26 +258,33 @@ def read_dataset(
     excitations: Sequence[str],
     period: float | None = None,
     max_gap: float | None = None,
-    tolerance: float = JITTER_TOLERANCE,
-    clock: str | None = None,
+    clock: str = "header",
+    resample: str = "none",
+    hold: float | None = None,
     sort: bool = False,
     drop_duplicates: bool = False,
     split_gaps: bool = False,
     unfinished: bool = False,
+    definitions: Mapping[str, Definition] | None = None,
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Dataset:
     """The signals (see `bags.signals.expressions`) of several bags, one trajectory a bag.
 
     A trajectory has the bag's name and digest, and as group its custom datum `repeat_group`. Its
-    provenance is the bag's digest, files and custom data, the signals and the options. For the grid
-    see `to_trajectory`, for clock, sort, drop_duplicates and unfinished `read_signals`.
+    provenance is the bag's digest, files and custom data, the signals and the options.
 
-    split_gaps: a bag in which a response is missing, or NaN, for more than `max_gap` gives one
+    clock: `header` or `log`; resample: `none`, `last` or `linear`; hold: s. They are written into
+    the signals' paths (`sampled_path`), so that a model knows how its samples are made; what they
+    and period and max_gap mean is in `bags.signals.sampling` and `to_trajectories`. For sort,
+    drop_duplicates and unfinished see `read_signals`.
+
+    split_gaps: a bag in which a signal is missing, or NaN, for more than `max_gap` gives one
     trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
-    are no repeats, and `skipped_samples` counts what is in none of them. executor: reads
-    bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)` is
-    called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectory` and
+    are no repeats, and `skipped_samples` counts what is in none of them. definitions: of message
+    types that the bags do not define (`bags.recordings.definitions`). executor:
+    reads bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)`
+    is called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectories` and
     `Dataset` do.
     """
     paths = [Path(bag) for bag in bags]
@@ -155,15 +294,16 @@ def read_dataset(
     options = {
         "period": period,
         "max_gap": max_gap,
-        "tolerance": tolerance,
         "clock": clock,
+        "resample": resample,
+        "hold": hold,
         "sort": sort,
         "drop_duplicates": drop_duplicates,
         "split_gaps": split_gaps,
         "unfinished": unfinished,
     }
     signals = {"responses": list(responses), "excitations": list(excitations)}
-    read = partial(_read_trials, signals=signals, options=options)
+    read = partial(_read_trials, signals=signals, options=options, definitions=definitions)
     trajectories: list[Trajectory] = []
     found = (map if executor is None else executor.map)(read, paths, names)
     for done, trials in enumerate(found, start=1):
@@ -174,43 +314,61 @@ def read_dataset(
 
 
 def _read_trials(
-    path: Path, name: str, *, signals: Mapping[str, list[str]], options: Json
+    path: Path,
+    name: str,
+    *,
+    signals: Mapping[str, list[str]],
+    options: Json,
+    definitions: Mapping[str, Definition] | None,
 ) -> list[Trajectory]:
     """The trajectories of one bag."""
+    rule = {key: options[key] for key in ("clock", "resample", "hold", "max_gap")}
+    texts = {
+        role: [sampled_path(text, **rule, response=role == "responses") for text in paths]
+        for role, paths in signals.items()
+    }
+    named = [text for paths in texts.values() for text in paths]
+    if several := [text for text in named if Expression.parse(text).path.every]:
+        raise BagError(f"{several[0]} is several signals; name one element of it for each")
+    wanted = one_clock([Expression.parse(text) for text in named])
     read = read_signals(
         path,
-        [*signals["responses"], *signals["excitations"]],
-        clock=options["clock"],
+        named,
         sort=options["sort"],
         drop_duplicates=options["drop_duplicates"],
         unfinished=options["unfinished"],
-        gaps_in=signals["responses"] if options["split_gaps"] else (),
+        gaps_in=texts["responses"] if options["split_gaps"] else (),
+        definitions=definitions,
     )
+    _refuse_other_clocks(path, read, wanted)
     origin = bag_origin(path, unfinished=options["unfinished"])
-    responses = [read[response] for response in signals["responses"]]
-    excitations = [read[excitation] for excitation in signals["excitations"]]
-    parts = [(responses, excitations)]
-    if options["split_gaps"]:
-        parts = list(_stretches(responses, excitations, options["max_gap"]))
-        if not parts:
-            raise DataError(f"{name}: no stretch of {MIN_STRETCH} samples without a gap")
-    provenance = canonical({"bag": origin, "signals": signals, "options": options}).decode()
-    trials = [
-        to_trajectory(
-            *part,
-            period=options["period"],
-            max_gap=options["max_gap"],
-            tolerance=options["tolerance"],
-            name=name if len(parts) == 1 else f"{name}.{k}",
-            group=origin["custom"].get(REPEAT_GROUP, "") if len(parts) == 1 else "",
-            digest=origin["digest"],
-            provenance=provenance,
-        )
-        for k, part in enumerate(parts, start=1)
-    ]
+    responses = [read[text] for text in texts["responses"]]
+    trials = to_trajectories(
+        responses,
+        [read[text] for text in texts["excitations"]],
+        period=options["period"],
+        max_gap=options["max_gap"],
+        split_gaps=options["split_gaps"],
+        name=name,
+        group=origin["custom"].get(REPEAT_GROUP, ""),
+        digest=origin["digest"],
+        provenance=canonical({"bag": origin, "signals": signals, "options": options}).decode(),
+    )
     if options["split_gaps"]:
         return _with_skipped(trials, responses[0])
     return trials
+
+
+def _refuse_other_clocks(path: Path, read: Mapping[str, Samples], wanted: str) -> None:
+    """BagError if a signal has no stamps of the clock that is wanted for all of them."""
+    clock = HEADER_STAMP if wanted == "header" else LOG_TIME
+    if all(samples.clock == clock for samples in read.values()):
+        return
+    said = "; ".join(f"{text} has a {samples.clock}" for text, samples in read.items())
+    raise BagError(
+        f"{path}: not every signal has a {clock}, and times of two clocks cannot be paired: "
+        f"{said}; set `clock: log` to pair all of them by the times at which they were logged"
+    )
 
 
 def _with_skipped(trials: list[Trajectory], base: Samples) -> list[Trajectory]:
@@ -235,34 +393,6 @@ def skipped_samples(dataset: Dataset) -> int:
     return sum(bags.values())
 
 
-def _stretches(
-    responses: Sequence[Samples], excitations: Sequence[Samples], max_gap: float | None
-) -> Iterator[tuple[list[Samples], list[Samples]]]:
-    """The signals cut where a response is missing; stretches of a few samples are left out."""
-    starts: list[int] = []
-    stops: list[int] = []
-    for samples in responses:
-        steps = np.diff(samples.stamp_ns)
-        gap = DEFAULT_MAX_GAP * np.median(steps) / 1e9 if max_gap is None else max_gap
-        runs = segments(samples.stamp_ns, gap)
-        starts += [int(samples.stamp_ns[first]) for first, _ in runs[1:]]
-        stops += [int(samples.stamp_ns[end - 1]) for _, end in runs[:-1]]
-    starts = [min(int(s.stamp_ns[0]) for s in responses), *sorted(starts)]
-    stops = [*sorted(stops), max(int(s.stamp_ns[-1]) for s in responses)]
-    for start, stop in zip(starts, stops, strict=True):
-        cut = [_between(samples, start, stop, held=False) for samples in responses]
-        if min(map(len, cut)) >= MIN_STRETCH:
-            yield cut, [_between(samples, start, stop, held=True) for samples in excitations]
-
-
-def _between(samples: Samples, start: int, stop: int, *, held: bool) -> Samples:
-    """The samples from start to stop; with `held`, also the one in force at the start."""
-    low = int(np.searchsorted(samples.stamp_ns, start, side="right" if held else "left"))
-    low = max(0, low - 1) if held else low
-    high = int(np.searchsorted(samples.stamp_ns, stop, side="right"))
-    return replace(samples, stamp_ns=samples.stamp_ns[low:high], values=samples.values[low:high])
-
-
 def require_excitation(dataset: Dataset) -> None:
     """DataError if an input is constant over the whole dataset: nothing follows from it."""
     for column, name in enumerate(dataset.trajectories[0].u_names):
@@ -275,17 +405,20 @@ def require_excitation(dataset: Dataset) -> None:
             )
 
 
-def _period_ns(stamp_ns: IntArray, period: float | None, tolerance: float, label: str) -> int:
+def _period_ns(stamp_ns: IntArray, period: float | None, label: str, *, on_grid: bool) -> int:
     if len(stamp_ns) < 2:
         raise DataError(f"{label} has {len(stamp_ns)} sample; a sample time needs two")
     median = float(np.median(np.diff(stamp_ns)))
     if period is None:
         return round(median)
-    if not abs(median / 1e9 - period) <= tolerance * period:
-        raise DataError(
-            f"{label} is sampled every {median / 1e9:g} s, asked for was {period:g} s; record at "
-            "one rate, or state the period of this one"
-        )
+    if not abs(median / 1e9 - period) <= PERIOD_TOLERANCE * period:
+        said = f"{label} is sampled every {median / 1e9:g} s, asked for was {period:g} s"
+        if not on_grid:
+            raise DataError(
+                f"{said}; state the period of this one, or set grid.resample to linear or last"
+            )
+        if not median / 1e9 <= period:
+            raise DataError(f"{said}; no rule makes more samples than there are")
     return round(period * 1e9)
 
 
@@ -299,51 +432,13 @@ def _refuse_repeated_stamps(samples: Samples, label: str) -> None:
         )
 
 
-def _refuse_gaps(samples: Samples, gap_ns: int, label: str) -> None:
-    steps = np.diff(samples.stamp_ns)
+def _refuse_gaps(stamp_ns: IntArray, gap_ns: int, where: str) -> None:
+    steps = np.diff(stamp_ns)
     if len(wide := np.flatnonzero(steps > gap_ns)):
         worst = int(wide[np.argmax(steps[wide])])
+        gap, most = apart(float(steps[worst]) / 1e9, gap_ns / 1e9)
         raise DataError(
-            f"{label}: {samples.path}: a gap of {steps[worst] / 1e9:g} s after message {worst} at "
-            f"{stamp_text(int(samples.stamp_ns[worst]))}; at most {gap_ns / 1e9:g} s was asked for "
-            f"({len(wide)} such gaps)"
+            f"{where}: a gap of {gap} s after sample {worst} at "
+            f"{stamp_text(int(stamp_ns[worst]))}; at most {most} s was asked for "
+            f"({len(wide)} such gaps); split_gaps leaves them out"
         )
-
-
-def _on_grid(
-    stamp_ns: IntArray, grid: IntArray, period_ns: int, tolerance: float
-) -> IntArray | None:
-    """Index of the sample on each grid point, or None if any point lacks its one sample."""
-    points = np.rint((stamp_ns - grid[0]) / period_ns).astype(np.int64)
-    inside = np.flatnonzero((points >= 0) & (points < len(grid)))
-    if not np.array_equal(points[inside], np.arange(len(grid))):
-        return None
-    if np.abs(stamp_ns[inside] - grid).max() > tolerance * period_ns:
-        return None
-    return inside
-
-
-def _sample(samples: Samples, grid: IntArray, period_ns: int, tolerance: float) -> FloatArray:
-    """The response on the grid: its own samples where they lie on it, else interpolated."""
-    on_grid = _on_grid(samples.stamp_ns, grid, period_ns, tolerance)
-    if on_grid is not None:
-        return samples.values[on_grid]
-    origin = int(grid[0])
-    interpolated = np.interp(
-        seconds(grid, origin), seconds(samples.stamp_ns, origin), samples.values
-    )
-    return np.asarray(interpolated, dtype=np.float64)
-
-
-def _hold(samples: Samples, at_ns: IntArray, gap_ns: int, label: str) -> FloatArray:
-    """The latest command stamped at or before each of `at_ns`; DataError if held too long."""
-    latest = np.searchsorted(samples.stamp_ns, at_ns, side="right") - 1
-    age = at_ns - samples.stamp_ns[latest]
-    k = int(np.argmax(age))
-    if age[k] > gap_ns:
-        raise DataError(
-            f"{label}: {samples.path}: no command for {age[k] / 1e9:g} s after message {latest[k]} "
-            f"at {stamp_text(int(samples.stamp_ns[latest[k]]))}; at most {gap_ns / 1e9:g} s was "
-            "asked for"
-        )
-    return samples.values[latest]

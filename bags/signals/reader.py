@@ -1,7 +1,7 @@
 """Read signals from a bag: numbers with the stamps of the messages they came in."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -10,10 +10,11 @@ import numpy as np
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
 from bags.signals.columns import Columns, Progress, expand_paths, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.timing import without_duplicates
-from nlsid_core._types import FloatArray, IntArray, Json
+from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
 
 HEADER_STAMP: Final = "header stamp"
@@ -53,15 +54,18 @@ def read_signals(
     drop_duplicates: bool = False,
     unfinished: bool = False,
     gaps_in: Sequence[str] = (),
+    definitions: Mapping[str, Definition] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Samples]:
     """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
 
-    clock: which times are the stamps (None: header stamps, log time for types without a header).
+    clock: which times are the stamps of the signals whose text has no `|clock(...)` (None: header
+    stamps, log time for types without a header).
     sort: put messages in the order of their stamps instead of refusing stamps that go back.
     drop_duplicates: of messages with one stamp keep the first.
     unfinished: read what there is of a recording that was not closed.
     gaps_in: those of `paths` whose messages without a finite number are left out, not refused.
+    definitions: of message types that the bag does not define.
     `[*]` gives one entry per element. Every path is checked against the types in the bag before a
     message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
     if a topic or field does not exist or is no number; if a topic has no messages; if a value is
@@ -69,30 +73,42 @@ def read_signals(
     """
     if clock is not None and clock not in CLOCKS:
         raise BagError(f"no clock '{clock}'; there are: {', '.join(CLOCKS)}")
-    with Bag(bag, unfinished=unfinished) as source:
-        wanted: dict[str, Expression] = {}
-        for text in paths:
-            expression = Expression.parse(text)
-            for path in expand_paths(source, [expression.path]):
-                name = str(expression.of(path)) if expression.path.every else text
-                wanted[name] = expression.of(path)
+    named = {"header": HEADER_STAMP, "log": LOG_TIME, "": clock}
+    with Bag(bag, unfinished=unfinished, definitions=definitions) as source:
+        wanted = expanded(source, paths)
         kinds = {e.path.topic: source.types_on(e.path.topic) for e in wanted.values()}
         for expression in wanted.values():
             _checked_unit(source, expression, *kinds[expression.path.topic])
         columns = read_columns(
             source, {name: e.path for name, e in wanted.items()}, progress=progress
         )
-        topics = {}
-        for topic, found in columns.items():
-            topics[topic] = _Topic(source, found, clock, sort=sort)
-            topics[topic].check_stamps(source.count(topic))
-            if drop_duplicates:
-                topics[topic].drop_duplicates()
+        topics: dict[tuple[str, str | None], _Topic] = {}
         samples = {}
         for name, expression in wanted.items():
-            recorded = topics[expression.path.topic].samples(name, gaps=name in gaps_in)
-            samples[name] = _applied(source, expression, recorded, kinds[expression.path.topic])
+            topic = expression.path.topic
+            key = topic, named[expression.clock]
+            if key not in topics:
+                topics[key] = _Topic(source, columns[topic], key[1], sort=sort)
+                topics[key].check_stamps(source.count(topic))
+                if drop_duplicates:
+                    topics[key].drop_duplicates()
+            gaps = name in gaps_in or expression.path.framed
+            recorded = topics[key].samples(name, gaps=gaps)
+            samples[name] = _applied(source, expression, recorded, kinds[topic], gaps=gaps)
     return samples
+
+
+def expanded(bag: Bag, texts: Sequence[str]) -> dict[str, Expression]:
+    """The signals by their texts, those with `[*]` replaced by one for each element.
+
+    Raises BagError if a path does not fit the bag, or if there is no message to count in.
+    """
+    found: dict[str, Expression] = {}
+    for text in texts:
+        signal = Expression.parse(text)
+        for path in expand_paths(bag, [signal.path]):
+            found[str(signal.of(path)) if signal.path.every else text] = signal.of(path)
+    return found
 
 
 def bag_digest(bag: Path | str) -> str:
@@ -136,11 +152,16 @@ def _checked_unit(source: Bag, expression: Expression, msgtype: str, types: Type
 
 
 def _applied(
-    source: Bag, expression: Expression, recorded: Samples, kind: tuple[str, Typestore]
+    source: Bag,
+    expression: Expression,
+    recorded: Samples,
+    kind: tuple[str, Typestore],
+    *,
+    gaps: bool,
 ) -> Samples:
-    """The recorded numbers after the expression's operations."""
+    """The recorded numbers after the expression's operations, from the first that has a result."""
     unit = expression.unit(*kind)
-    if not expression.operations:
+    if not expression.numbers.operations:
         return replace(recorded, unit=unit)
     try:
         values = expression.apply(
@@ -148,7 +169,16 @@ def _applied(
         )
     except BagError as error:
         raise BagError(f"{source.path}: {error}") from error
-    return replace(recorded, values=values, unit=unit)
+    finite = np.isfinite(values)
+    kept = finite if gaps else np.arange(len(values)) >= int(np.argmax(finite))
+    if not (finite[kept].all() and kept.any()):
+        missing = int(np.flatnonzero(kept & ~finite)[0])
+        raise BagError(
+            f"{source.path}: {expression} has no value at message {missing}, "
+            f"{stamp_text(int(recorded.stamp_ns[missing]))}: too few samples before it; take a "
+            "longer window, or cut the bag at the gap"
+        )
+    return replace(recorded, stamp_ns=recorded.stamp_ns[kept], values=values[kept], unit=unit)
 
 
 class _Topic:

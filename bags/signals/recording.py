@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from bags.recordings.definitions import Definition
+from bags.recordings.quality import Profile
 from bags.recordings.writer import BagWriter
 from bags.signals.arrivals import Arrival, Regularity, Sequence
 
@@ -34,10 +35,12 @@ class Recording:
         self._sequence.setdefault(topic, Sequence())
         self._regularity.setdefault(topic, Regularity())
 
-    def add_topic(self, topic: str, definition: Definition) -> None:
-        """Announce a topic; BagError if it holds another type already."""
+    def add_topic(
+        self, topic: str, definition: Definition, offered: tuple[Profile, ...] = ()
+    ) -> None:
+        """Announce a topic and what its publishers offer; BagError if it holds another type."""
         self.expect(topic)
-        self.bag.add_topic(topic, definition.msgtype, definition=definition)
+        self.bag.add_topic(topic, definition.msgtype, definition=definition, offered=offered)
 
     def add(self, arrival: Arrival, stamp_ns: int, number: int | None = None) -> None:
         """Take a message; `stamp_ns` is what its regularity is judged by, `number` its publisher's

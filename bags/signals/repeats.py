@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from scipy.signal import correlate
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 
 SAME: Final = 0.98  # correlation from which two stretches are one excitation; noise lowers it
 LEAST_PERIOD: Final = 8  # samples; a shorter one is the signal's own smoothness

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from bags.signals.reader import Samples, stamp_text
-from nlsid_core._types import FloatArray, IntArray
-from nlsid_core.errors import DataError
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.errors import DataError, apart
 
 Method = Literal["hold", "linear", "cubic"]
 METHODS: Final[tuple[Method, ...]] = ("hold", "linear", "cubic")
@@ -71,9 +71,10 @@ def _refuse_missing(
     gap = np.where(on_sample, 0, (at_ns if hold else after) - stamp_ns[before])
     worst = int(np.argmax(gap)) if len(gap) else 0
     if len(gap) and gap[worst] > max_gap * 1e9:
+        found, most = apart(float(gap[worst]) / 1e9, max_gap)
         raise DataError(
-            f"{samples.path}: a gap of {gap[worst] / 1e9:g} s after "
-            f"{stamp_text(int(stamp_ns[before[worst]]))}; at most {max_gap:g} s was asked for"
+            f"{samples.path}: a gap of {found} s after "
+            f"{stamp_text(int(stamp_ns[before[worst]]))}; at most {most} s was asked for"
         )
 
 

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import DataError
 
 SEGMENTS: Final = 50  # of the recording, each giving its least latency to the line of the drift

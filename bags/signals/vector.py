@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from rosbags.typesys.store import Typestore
 
+from bags.signals.expressions import Expression
 from bags.signals.signal import SignalPath
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError
 
 
@@ -20,8 +21,8 @@ class SignalVector:
 
     @classmethod
     def parse(cls, texts: Iterable[str]) -> "SignalVector":
-        """Read each `topic:field.path[index]`; BagError if they are not all on one topic."""
-        paths = tuple(SignalPath.parse(text) for text in texts)
+        """Read where each expression is; BagError if they are not all on one topic."""
+        paths = tuple(Expression.parse(text).path for text in texts)
         topics = {path.topic for path in paths}
         if len(topics) != 1:
             raise BagError(

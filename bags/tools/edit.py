@@ -1,14 +1,17 @@
 """New bags from old ones: a part of one, several as one, one in parts."""
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from bags.recordings.bag import Bag, Message
+from bags.recordings.definitions import Definition
+from bags.recordings.quality import Profile
 from bags.recordings.storage import Channel
 from bags.recordings.writer import BagWriter
 from bags.signals.columns import Progress
@@ -27,14 +30,16 @@ def cut(
     end: float | None = None,
     topics: Sequence[str] | None = None,
     unfinished: bool = False,
+    definitions: Mapping[str, Definition] | None = None,
     progress: Progress | None = None,
 ) -> int:
     """Copy the messages logged from `start` to before `end` s after the first (None: to the last).
 
-    Only those on `topics` (None: on all). Returns how many there were; raises BagError for a bag
+    Only those on `topics` (None: on all). definitions: of types that the bag does not define; the
+    copy does. Returns how many there were; raises BagError for a bag
     that cannot be read, for a topic that is not there, if nothing is left, and if `out` exists.
     """
-    with Bag(path, unfinished=unfinished) as bag:
+    with Bag(path, unfinished=unfinished, definitions=definitions) as bag:
         for topic in topics or ():
             if topic not in bag.topics:
                 raise BagError(f"{path} has no topic {topic}; it has: {', '.join(bag.topics)}")
@@ -71,7 +76,8 @@ def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress | 
                 if custom.setdefault(key, value) != value:
                     custom[key] = f"{custom[key]}; {value}"
         writer = stack.enter_context(BagWriter(out, custom=custom))
-        streams = [_with_channels(bag, None) for bag in bags]
+        profiles = _offered(bags)
+        streams = [_with_channels(bag, None, profiles) for bag in bags]
         merged = heapq.merge(*streams, key=lambda entry: entry[0].log_time_ns)
         total = sum(channel.count for bag in bags for channel in bag.channels)
         return _copy(merged, writer, progress, total)
@@ -145,8 +151,22 @@ def _first_ns(bag: Bag) -> int:
     return first.log_time_ns
 
 
-def _with_channels(bag: Bag, topics: Sequence[str] | None) -> Iterator[tuple[Message, Channel]]:
-    channels = {channel.topic: channel for channel in bag.channels}
+def _offered(bags: Sequence[Bag]) -> dict[str, tuple[Profile, ...]]:
+    """What the publishers of each topic offered, those of all bags together."""
+    found: dict[str, tuple[Profile, ...]] = {}
+    for bag in bags:
+        for topic in bag.topics:
+            found[topic] = tuple(dict.fromkeys((*found.get(topic, ()), *bag.offered(topic))))
+    return found
+
+
+def _with_channels(
+    bag: Bag,
+    topics: Sequence[str] | None,
+    profiles: Mapping[str, tuple[Profile, ...]] | None = None,
+) -> Iterator[tuple[Message, Channel]]:
+    profiles = _offered([bag]) if profiles is None else profiles
+    channels = {c.topic: replace(c, offered=profiles[c.topic]) for c in bag.channels}
     for message in bag.messages(topics):
         yield message, channels[message.topic]
 

@@ -8,7 +8,7 @@ import io
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -16,12 +16,14 @@ from typing import Any, Final, Protocol
 import numpy as np
 
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
 from bags.signals.columns import Columns, Progress, expand_paths, stream_columns
+from bags.signals.expressions import Expression, Running
 from bags.signals.grid import seconds
-from bags.signals.reader import read_signals
+from bags.signals.reader import expanded, read_signals
 from bags.signals.resample import Method, resample
 from bags.signals.signal import SignalPath, numeric_paths
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 FORMATS: Final = ("csv", "npz", "parquet")
@@ -45,24 +47,25 @@ def export_topics(
     form: str,
     signals: Sequence[str] | None = None,
     unfinished: bool = False,
+    definitions: Mapping[str, Definition] | None = None,
     progress: Progress | None = None,
 ) -> Exported:
-    """One table per topic in the new folder `out`: times in ns and the signals in their own unit.
+    """One table per topic in the new folder `out`: times in ns, the signals after their operations.
 
-    signals: which (None: every number in every message whose type can be read, but for arrays whose
-    length changes). Raises BagError as `read_signals` does for damage, and if `out` exists.
+    A derivative is NaN until its window is full. signals: which (None: every number in every
+    message whose type can be read, but for arrays whose length changes). Raises BagError as
+    `read_signals` does for damage, and if `out` exists.
     """
     _check_format(form)
     out = Path(out)
     if out.exists():
         raise BagError(f"{out} exists already; name another folder or move it away")
-    with Bag(path, unfinished=unfinished) as bag:
+    with Bag(path, unfinished=unfinished, definitions=definitions) as bag:
         left_out: list[str] = []
         if signals:
-            wanted = expand_paths(bag, [SignalPath.parse(text) for text in signals])
+            columns = {str(found): found for found in expanded(bag, signals).values()}
         else:
-            wanted = _every_number(bag, left_out)
-        columns = {str(signal): signal for signal in wanted}
+            columns = {str(path): Expression(path) for path in _every_number(bag, left_out)}
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as folder:
             folder_path = Path(folder) / out.name
@@ -82,10 +85,14 @@ def export_grid(
     method: Method = "linear",
     hold: Sequence[str] = (),
     max_gap: float,
+    clock: str = "header",
+    unfinished: bool = False,
+    definitions: Mapping[str, Definition] | None = None,
 ) -> dict[str, float]:
     """One table on a common grid of `period` s: t in s since the first common stamp, and signals.
 
     hold: the signals (of `signals`) that are commands; the others are resampled by `method`.
+    clock: `header` or `log`, for all of them.
     Returns each signal's error bound (see `resample`). Raises BagError and DataError as
     `read_signals` and `resample` do, and if `out` exists.
     """
@@ -93,7 +100,13 @@ def export_grid(
     out = Path(out)
     if out.exists():
         raise BagError(f"{out} exists already; name another file or move it away")
-    read = read_signals(path, signals)
+    stamped = "log time" if clock == "log" else None
+    read = read_signals(
+        path, signals, clock=stamped, unfinished=unfinished, definitions=definitions
+    )
+    if len({samples.clock for samples in read.values()}) > 1:
+        said = "; ".join(f"{name} has a {samples.clock}" for name, samples in read.items())
+        raise BagError(f"{path}: times of two clocks cannot share a grid: {said}; set --clock log")
     if unknown := set(hold) - read.keys():
         raise BagError(f"hold: {min(unknown)} is not one of the signals")
     first = max(int(s.stamp_ns[0]) for s in read.values())
@@ -151,7 +164,7 @@ def _steady(bag: Bag, path: SignalPath) -> list[SignalPath]:
 
 def _write_topics(
     bag: Bag,
-    columns: Mapping[str, SignalPath],
+    columns: Mapping[str, Expression],
     folder: Path,
     form: str,
     progress: Progress | None,
@@ -159,7 +172,10 @@ def _write_topics(
     writers: dict[str, TableWriter] = {}
     rows: dict[str, int] = {}
     try:
-        for part in stream_columns(bag, columns, progress=progress):
+        paths = {name: signal.path for name, signal in columns.items()}
+        operations = _Operations(bag, columns)
+        for recorded in stream_columns(bag, paths, progress=progress):
+            part = operations.on(recorded)
             name = f"{part.topic.strip('/').replace('/', '__')}.{form}"
             if name not in writers:
                 writers[name] = _WRITERS[form](folder / name)
@@ -169,6 +185,32 @@ def _write_topics(
         for writer in writers.values():
             writer.close()
     return rows
+
+
+class _Operations:
+    """What is to be done to the signals of each topic, part by part."""
+
+    def __init__(self, bag: Bag, columns: Mapping[str, Expression]) -> None:
+        self._running: dict[str, Running] = {}
+        self._signals = columns
+        for name, signal in columns.items():
+            if signal.numbers.operations:
+                kind = bag.types_on(signal.path.topic)
+                signal.unit(*kind)
+                self._running[name] = signal.numbers.running(signal.recorded_unit(*kind))
+
+    def on(self, part: Columns) -> Columns:
+        values = {name: self._value(name, part) for name in part.values}
+        return replace(part, values=values)
+
+    def _value(self, name: str, part: Columns) -> FloatArray:
+        recorded = part.values[name]
+        if name not in self._running:
+            return recorded
+        logged = part.stamp_ns is None or self._signals[name].clock == "log"
+        stamps = part.log_ns if logged or part.stamp_ns is None else part.stamp_ns
+        rows = zip(stamps.tolist(), recorded.tolist(), strict=True)
+        return np.array([self._running[name].update(*row) for row in rows])
 
 
 def _table(part: Columns) -> dict[str, IntArray | FloatArray]:

@@ -4,8 +4,9 @@ Each check gives findings; the worst of them is the verdict. The thresholds are 
 their reasons; none of them proves anything, they say where to look.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Final
@@ -14,17 +15,20 @@ import numpy as np
 from scipy.signal import welch
 
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
 from bags.signals.columns import expand_paths, read_columns
-from bags.signals.delays import delay
-from bags.signals.reader import HEADER_STAMP, Samples, read_signals
+from bags.signals.delays import Delay, delay
+from bags.signals.expressions import Expression
+from bags.signals.grid import to_trajectories
+from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
 from bags.signals.repeats import find_period, same_excitation
+from bags.signals.sampling import sampled_path
 from bags.signals.signal import SignalPath
 from bags.signals.timing import clock_relation
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
 
 JITTER_LOOK: Final = 0.05  # of the period: up to here samples are used as they are (the grid's)
-JITTER_BAD: Final = 0.5  # samples may change places
 GAP: Final = 1.5  # periods: a sample is missing
 SATURATED: Final = 0.02  # of the samples at one end of the range, in runs
 LEVELS_FEW: Final = 8  # distinct values of a response: quantised to less than its dynamics
@@ -33,6 +37,7 @@ BAND_LOOK: Final = 0.4  # of the sampling rate: power above is close to being al
 LINES_FEW: Final = 3  # frequency lines with power: no more than one or two sinusoids
 RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
 LONGEST_DELAY: Final = 5.0  # s
+LONGEST_HELD: Final = 1e5  # s: to see what there is, whatever limit a configuration sets
 
 
 class Level(IntEnum):
@@ -66,68 +71,125 @@ class Fitness:
 
 
 def check_fitness(
-    bags: Sequence[Path | str], *, excitations: Sequence[str], responses: Sequence[str]
+    bags: Sequence[Path | str],
+    *,
+    excitations: Sequence[str],
+    responses: Sequence[str],
+    clock: str = "header",
+    definitions: Mapping[str, Definition] | None = None,
 ) -> list[Fitness]:
     """Check each bag for itself, and the bags against each other for repeats of one excitation.
 
-    What a bag is refused for elsewhere (damage, NaN, no such topic) is a finding here.
+    clock: `header` or `log`, as in a configuration. definitions: of message types that the bags do
+    not define. What a bag is refused for elsewhere (damage, NaN, no such topic) is a finding here.
     """
     if not excitations or not responses:
         raise BagError("name at least one excitation and one response")
+    excitations, responses = (
+        [sampled_path(text, clock=clock, response=True) for text in texts]
+        for texts in (excitations, responses)
+    )
     results = []
     commands: list[tuple[str, FloatArray] | None] = []
     for path in map(Path, bags):
         findings: list[Finding] = []
         try:
-            findings += _clocks(path, [*excitations, *responses])
-            read = read_signals(path, [*excitations, *responses], sort=True)
+            with Bag(path, unfinished=True, definitions=definitions) as bag:
+                findings += _clocks(bag, [*excitations, *responses])
+                u_names, y_names = list(expanded(bag, excitations)), list(expanded(bag, responses))
+            names = [*u_names, *y_names]
+            read = read_signals(path, names, sort=True, definitions=definitions)
         except BagError as error:
             findings.append(Finding(Level.BAD, "readable", str(error)))
             results.append(Fitness(path, tuple(findings)))
             commands.append(None)
             continue
-        for samples in read.values():
+        commanded, measured = [read[n] for n in u_names], [read[n] for n in y_names]
+        for samples in measured:
             findings += _regularity(samples)
-        for text in excitations:
-            findings += _excitation(read[text])
-        for text in responses:
-            findings += _range(read[text])
-        findings += _delays([read[t] for t in excitations], [read[t] for t in responses])
+            findings += _range(samples)
+        for samples in commanded:
+            findings += _commands(samples)
+            findings += _excitation(samples)
+        findings += _samples(measured, commanded)
+        findings += _delays(commanded, measured)
         results.append(Fitness(path, tuple(findings)))
-        commands.append((path.name, read[excitations[0]].values))
+        commands.append((path.name, commanded[0].values))
     return [
         Fitness(found.bag, (*found.findings, *_repeats(k, commands)))
         for k, found in enumerate(results)
     ]
 
 
-def _clocks(path: Path, signals: Sequence[str]) -> list[Finding]:
-    with Bag(path, unfinished=True) as bag:
-        findings = []
-        if bag.ending is not None:
-            findings.append(Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}"))
-        texts = [text.partition("|")[0] for text in signals]
-        paths = expand_paths(bag, [SignalPath.parse(text) for text in texts])
-        offsets = {}
-        for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
-            if columns.stamp_ns is None:
-                what = f"{topic} has no header stamp; its log times carry the latency of recording"
-                findings.append(Finding(Level.LOOK, "clock", what))
-                continue
-            if not len(columns):
-                continue
-            if not columns.stamp_ns.any():
-                findings.append(Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0"))
-                continue
-            back = int((np.diff(columns.stamp_ns) < 0).sum())
-            if back:
-                findings.append(
-                    Finding(Level.BAD, "clock", f"{topic}: stamps go back in {back} places")
-                )
-            relation = clock_relation(columns.stamp_ns, columns.log_ns)
-            offsets[topic] = relation.offset
-            level = Level.LOOK if relation.drift else Level.GOOD
-            findings.append(Finding(level, "clock", f"{topic}: {relation}"))
+def _samples(responses: Sequence[Samples], excitations: Sequence[Samples]) -> list[Finding]:
+    """What identification would make of the signals: too few samples, or a constant command."""
+    clocks = {samples.clock for samples in (*responses, *excitations)}
+    if len(clocks) > 1:
+        what = "some signals have no header stamp: identify and check them with clock log"
+        return [Finding(Level.BAD, "samples", what)]
+    findings = []
+    held = [_ruled(samples, "hold") for samples in excitations]
+    try:
+        trials = to_trajectories(responses, held, split_gaps=True)
+    except (BagError, DataError) as error:
+        try:
+            lines = [_ruled(samples, "linear") for samples in responses]
+            trials = to_trajectories(lines, held, split_gaps=True)
+        except (BagError, DataError) as second:
+            return [Finding(Level.BAD, "samples", f"identification refuses them: {second}")]
+        what = f"only with grid.resample: linear or last; as they come: {error}"
+        findings.append(Finding(Level.LOOK, "samples", what))
+    longest = max(trials, key=len)
+    count = sum(map(len, trials))
+    stretches = "one stretch" if len(trials) == 1 else f"{len(trials)} stretches"
+    what = f"{count} samples of {longest.period:.4g} s in {stretches} without a gap"
+    findings.append(Finding(Level.GOOD, "samples", what))
+    u = np.concatenate([trial.u for trial in trials])
+    for column, samples in zip(u.T, excitations, strict=True):
+        if np.ptp(column) == 0.0 and np.ptp(samples.values) > 0.0:
+            what = f"{samples.path} is {column[0]:g} wherever every response was recorded"
+            findings.append(Finding(Level.BAD, "samples", what))
+    return findings
+
+
+def _ruled(samples: Samples, rule: str) -> Samples:
+    """The samples with a rule in their path that bridges whatever is missing."""
+    return replace(
+        samples, path=str(Expression.parse(samples.path).sampled(rule, window=LONGEST_HELD))
+    )
+
+
+def _clocks(bag: Bag, signals: Sequence[str]) -> list[Finding]:
+    findings = []
+    if bag.ending is not None:
+        findings.append(Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}"))
+    texts = [text.partition("|")[0] for text in signals]
+    paths = expand_paths(bag, [SignalPath.parse(text) for text in texts])
+    offsets = {}
+    logged = {e.path.topic for e in map(Expression.parse, signals) if e.clock == "log"}
+    for topic, columns in read_columns(bag, {str(p): p for p in paths}).items():
+        if topic in logged:
+            what = f"{topic} by its log times, which carry the latency of recording"
+            findings.append(Finding(Level.GOOD, "clock", what))
+            continue
+        if columns.stamp_ns is None:
+            what = f"{topic} has no header stamp; its log times carry the latency of recording"
+            findings.append(Finding(Level.LOOK, "clock", what))
+            continue
+        if not len(columns):
+            continue
+        if not columns.stamp_ns.any():
+            findings.append(Finding(Level.BAD, "clock", f"{topic}: every header stamp is 0"))
+            continue
+        back = int((np.diff(columns.stamp_ns) < 0).sum())
+        if back:
+            findings.append(
+                Finding(Level.BAD, "clock", f"{topic}: stamps go back in {back} places")
+            )
+        relation = clock_relation(columns.stamp_ns, columns.log_ns)
+        offsets[topic] = relation.offset
+        level = Level.LOOK if relation.drift else Level.GOOD
+        findings.append(Finding(level, "clock", f"{topic}: {relation}"))
     if offsets and max(offsets.values()) - min(offsets.values()) > 1.0:
         far = max(offsets, key=lambda topic: abs(offsets[topic]))
         what = f"the topics' stamps are of different clocks: {far} is {offsets[far]:+.3f} s off"
@@ -144,7 +206,7 @@ def _regularity(samples: Samples) -> list[Finding]:
     duplicates = int((steps == 0).sum())
     if duplicates:
         what = f"{name}: {duplicates} of {len(samples)} stamps repeat the one before"
-        findings.append(Finding(Level.BAD, "regularity", what))
+        findings.append(Finding(Level.LOOK, "regularity", what))
         steps = steps[steps > 0]
         if not len(steps):
             return findings
@@ -154,13 +216,33 @@ def _regularity(samples: Samples) -> list[Finding]:
         what = f"{name}: {int(gaps.sum())} gaps, the longest {np.max(steps):.3g} s"
         findings.append(Finding(Level.LOOK, "regularity", what))
     jitter = float(np.quantile(np.abs(steps[~gaps] - period), 0.95)) / period
-    level = Level.GOOD
-    if jitter > JITTER_LOOK:
-        level = Level.BAD if jitter > JITTER_BAD else Level.LOOK
+    level = Level.LOOK if jitter > JITTER_LOOK else Level.GOOD
     clock = "" if samples.clock == HEADER_STAMP else f" by {samples.clock}"
-    what = f"{name}: {1 / period:.4g} Hz{clock}, 95 % of steps within {100 * jitter:.2g} %"
+    what = f"{name}: {1 / period:.4g} Hz{clock}, 95 % of steps within {_percent(jitter)}"
     findings.append(Finding(level, "regularity", what))
     return findings
+
+
+def _commands(samples: Samples) -> list[Finding]:
+    """Commands are held until the next one: their stamps may come as they like."""
+    steps = np.diff(samples.stamp_ns) / 1e9
+    name = samples.path
+    if not len(steps):
+        return [Finding(Level.LOOK, "commands", f"{name} has one command")]
+    period = float(np.median(steps))
+    rate = f"{1 / period:.4g} Hz" if period > 0 else "several at one time"
+    clock = "" if samples.clock == HEADER_STAMP else f" by {samples.clock}"
+    what = f"{name}: {rate}{clock}, one held for at most {np.max(steps):.3g} s (grid.hold)"
+    findings = [Finding(Level.GOOD, "commands", what)]
+    repeats = int((steps == 0).sum())
+    if repeats:
+        what = f"{name}: {repeats} of {len(samples)} stamps repeat the one before; the last counts"
+        findings.append(Finding(Level.LOOK, "commands", what))
+    return findings
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
 def _excitation(samples: Samples) -> list[Finding]:
@@ -205,9 +287,11 @@ def _range(samples: Samples) -> list[Finding]:
 
 
 def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> list[Finding]:
+    """For each response the command that it follows most clearly."""
     findings = []
-    for u in excitations:
-        for y in responses:
+    for y in responses:
+        found: list[tuple[Delay, str]] = []
+        for u in excitations:
             period_ns = int(np.median(np.diff(y.stamp_ns))) if len(y) > 1 else 0
             start, end = max(u.stamp_ns[0], y.stamp_ns[0]), min(u.stamp_ns[-1], y.stamp_ns[-1])
             if period_ns <= 0 or end - start < 10 * period_ns:
@@ -218,14 +302,14 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> lis
             held = u.values[np.searchsorted(u.stamp_ns, at, side="right") - 1]
             heard = np.interp(at, y.stamp_ns, y.values)
             longest = min(LONGEST_DELAY, (end - start) / 4e9)
-            try:
-                found = delay(held, heard, period_ns / 1e9, longest)
-            except DataError:
-                continue  # constant: said already
-            level = Level.GOOD if abs(found.correlation) > RELATED else Level.LOOK
+            with suppress(DataError):  # constant: said already
+                found.append((delay(held, heard, period_ns / 1e9, longest), u.path))
+        if found:
+            best, command = max(found, key=lambda pair: abs(pair[0].correlation))
+            level = Level.GOOD if abs(best.correlation) > RELATED else Level.LOOK
             what = (
-                f"{y.path} follows {u.path} after {found.seconds:.3g} s "
-                f"(correlation {found.correlation:+.2f})"
+                f"{y.path} follows {command} after {best.seconds:.3g} s "
+                f"(correlation {best.correlation:+.2f})"
             )
             findings.append(Finding(level, "delay", what))
     return findings

@@ -16,13 +16,14 @@ from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
 from bags.signals.reader import stamp_text
 from bags.signals.signal import SignalPath, Step
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
-_COLUMN: Final = re.compile(r"(?P<table>[^\[\]]+?)(?:\[(?P<index>\d{1,6})\])?")
-
-Tables = Mapping[str, FloatArray]
+MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
+_COLUMN: Final = re.compile(
+    r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
+)
 
 
 @dataclass(frozen=True)
@@ -46,16 +47,83 @@ class Assignment:
         return cls(path, column.strip())
 
 
-def read_tables(files: Sequence[Path | str]) -> dict[str, FloatArray]:
-    """Every numeric array of the files: name -> (rows,) or (rows, columns).
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """Numeric arrays (rows,) or (rows, columns): by `file.name`, and by `name` if one file has it.
+
+    files: name of every array -> the files that have an array of that name.
+    """
+
+    arrays: Mapping[str, FloatArray]
+    files: Mapping[str, tuple[str, ...]]
+
+    def whole_name(self, table: str, file: str = "") -> str:
+        """`file.name` of a table; DataError if there is none, or several and none in `file`."""
+        if table in self.arrays:
+            return table
+        owners = self.files.get(table, ())
+        if len(owners) == 1 or file in owners:
+            return f"{file if file in owners else owners[0]}.{table}"
+        if owners:
+            choices = " or ".join(f"{owner}.{table}" for owner in owners)
+            raise DataError(f"'{table}' is in {len(owners)} files; name one of them: {choices}")
+        names = {
+            name if len(own) == 1 else f"{f}.{name}": f"{f}.{name}"
+            for name, own in self.files.items()
+            for f in own
+        }
+        shapes = listed(f"{n} {'x'.join(map(str, self.arrays[w].shape))}" for n, w in names.items())
+        raise DataError(f"no table '{table}'; there are: {shapes}{did_you_mean(table, names)}")
+
+    def file_of(self, column: str) -> str:
+        """The file that a column comes from."""
+        whole = self.whole_name(_parsed(column)[0])
+        return next(f for own in self.files.values() for f in own if whole.startswith(f"{f}."))
+
+    def column(self, text: str, file: str = "") -> FloatArray:
+        """`table`, `table[column]` or `table[row, :]`; DataError lists what there is.
+
+        file: whose table is meant where several files have one of that name.
+        """
+        table, row, index = _parsed(text)
+        values = self.arrays[self.whole_name(table, file)]
+        if values.ndim == 1 and row is None and index is None:
+            return values
+        if values.ndim != 2 or (row is None and index is None):
+            raise DataError(
+                f"'{text}' has shape {values.shape}; name one column, {table}[0], or where time "
+                f"runs along the rows one row, {table}[0, :]"
+            )
+        number, count = (row, values.shape[0]) if index is None else (index, values.shape[1])
+        assert number is not None
+        if number >= count:
+            what = "rows" if index is None else "columns"
+            raise DataError(f"'{text}': the table has {what} 0 to {count - 1}")
+        found: FloatArray = values[number] if index is None else values[:, number]
+        return found
+
+
+def _parsed(text: str) -> tuple[str, int | None, int | None]:
+    """(table, row, column) of a column's text."""
+    match = _COLUMN.fullmatch(text)
+    if match is None:
+        return text, None, None
+    row, index = match["row"], match["index"]
+    return match["table"], None if row is None else int(row), None if index is None else int(index)
+
+
+def read_tables(files: Sequence[Path | str]) -> Tables:
+    """Every numeric array of the files.
 
     A CSV file without a header is one table by the file's name; with one, each column is a table by
-    its own name. In MAT (up to version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one;
-    nothing in them is evaluated. Names that two files share are `file.name`. Raises DataError for a
-    file that is none of these or holds no numbers.
+    its own name. In MAT (up to version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one,
+    those in a struct by `struct.field`; nothing in them is evaluated. A file is called by its stem,
+    with the folder before it where two have one stem. Raises DataError for a file that is none of
+    these or holds no numbers.
     """
-    tables: dict[str, FloatArray] = {}
-    for path in map(Path, files):
+    arrays: dict[str, FloatArray] = {}
+    owners: dict[str, tuple[str, ...]] = {}
+    for path, label in _labels([Path(file) for file in files]):
         if path.stat().st_size > MAX_TABLE_BYTES:
             raise DataError(f"{path}: more than {MAX_TABLE_BYTES} bytes; import it in parts")
         readers = {".csv": _csv, ".txt": _csv, ".dat": _csv, ".mat": _mat, ".h5": _hdf5}
@@ -67,8 +135,19 @@ def read_tables(files: Sequence[Path | str]) -> dict[str, FloatArray]:
         if not found:
             raise DataError(f"{path} holds no table of numbers")
         for name, table in found.items():
-            tables[f"{path.stem}.{name}" if name in tables else name] = table
-    return tables
+            arrays[f"{label}.{name}"] = table
+            owners[name] = (*owners.get(name, ()), label)
+    return Tables(arrays, owners)
+
+
+def _labels(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
+    """Each file with the shortest end of its path that no other has, without the suffix."""
+    whole = [path.resolve().with_suffix("").parts for path in paths]
+    for path, parts in zip(paths, whole, strict=True):
+        count = 1
+        while count < len(parts) and sum(o[-count:] == parts[-count:] for o in whole) > 1:
+            count += 1
+        yield path, "/".join(parts[-count:])
 
 
 def import_tables(
@@ -79,24 +158,29 @@ def import_tables(
     types: Mapping[str, str],
     period: float | None = None,
     time: str | None = None,
+    drop_repeats: bool = False,
     start_ns: int = 0,
     custom: Mapping[str, str] | None = None,
 ) -> dict[str, int]:
     """Write a bag with one message a row; topic -> how many there are.
 
     assignments: `signal=column` each; types: topic -> message type, a standard one. Rows are
-    `period` s apart, or stamped by the column `time` in s, from `start_ns` on; header stamp, log
-    time and publish time are equal. A topic has as many messages as the shortest of its columns.
-    What is not assigned is zero or empty. Raises BagError and DataError for what does not fit, and
-    if `out` exists.
+    `period` s apart, or stamped by the column `time` in s (of the file of the topic's columns,
+    where several files have it), from `start_ns` on; header stamp, log time and publish time are
+    equal. drop_repeats: of rows with one time keep the first. A topic has as many messages as the
+    shortest of its columns. What is not assigned is zero or empty. Raises BagError and DataError
+    for what does not fit, and if `out` exists.
     """
     if (period is None) == (time is None):
         raise BagError("state either the period of the rows or the column with their times")
     tables = read_tables(files)
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
+    sources: dict[str, str] = {}
     for text in assignments:
         parsed = Assignment.parse(text)
-        topics.setdefault(parsed.path.topic, {})[parsed.path] = column_of(tables, parsed.column)
+        column = tables.column(parsed.column)
+        topics.setdefault(parsed.path.topic, {})[parsed.path] = column
+        sources.setdefault(parsed.path.topic, tables.file_of(parsed.column))
     if unknown := set(types) - set(topics):
         raise BagError(f"nothing is assigned to {min(unknown)}, for which a type is given")
     streams = []
@@ -105,8 +189,14 @@ def import_tables(
             raise BagError(
                 f"no type for {topic}; state it, e.g. {topic}=sensor_msgs/msg/JointState"
             )
-        rows = min(map(len, columns.values()))
-        stamps = _stamps(rows, period, None if time is None else column_of(tables, time), start_ns)
+        rows = np.arange(min(map(len, columns.values())))
+        times = None if time is None else tables.column(time, sources[topic])
+        if times is not None and drop_repeats and len(times) >= len(rows):
+            kept = np.diff(times, prepend=-np.inf) > 0
+            rows = rows[kept[: len(rows)]]
+            times = times[rows]
+            columns = {path: column[rows] for path, column in columns.items()}
+        stamps = _stamps(len(rows), period, times, start_ns)
         streams.append(_Stream(topic, types[topic], columns, stamps))
     if not streams:
         raise BagError("nothing is assigned, so there is nothing to write")
@@ -117,29 +207,15 @@ def import_tables(
             for row, stamp in enumerate(stream.stamps)
         )
         for stamp, k, row in events:
-            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
             stream = streams[k]
-            writer.write(stream.topic, stream.msgtype, stream.message(row), **times)
+            writer.write(
+                stream.topic,
+                stream.msgtype,
+                stream.message(row),
+                log_time_ns=stamp,
+                publish_time_ns=stamp,
+            )
         return dict(writer.counts)
-
-
-def column_of(tables: Tables, name: str) -> FloatArray:
-    """The column `table[index]`, or `table` if it has one; DataError lists what there is."""
-    match = _COLUMN.fullmatch(name)
-    table = match["table"] if match else name
-    if table not in tables:
-        shapes = listed(f"{n} {'x'.join(map(str, t.shape))}" for n, t in tables.items())
-        raise DataError(f"no table '{table}'; there are: {shapes}{did_you_mean(table, tables)}")
-    values = tables[table]
-    if values.ndim == 1 and not (match and match["index"]):
-        return values
-    if values.ndim != 2 or not match or match["index"] is None:
-        raise DataError(f"'{name}' has shape {values.shape}; name one column, {table}[0]")
-    index = int(match["index"])
-    if index >= values.shape[1]:
-        raise DataError(f"'{name}': the table has columns [0] to [{values.shape[1] - 1}]")
-    column: FloatArray = values[:, index]
-    return column
 
 
 class _Stream:
@@ -181,7 +257,8 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
     stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
-            f"time does not increase after row {back[0]}: {stamp_text(stamps[back[0]])}"
+            f"time does not increase after row {back[0]}: {stamp_text(stamps[back[0]])} "
+            f"({len(back)} such rows); --drop-repeats keeps the first of rows with one time"
         )
     return stamps
 
@@ -212,7 +289,20 @@ def _mat(path: Path) -> dict[str, FloatArray]:
         return _hdf5(path)  # what SciPy says of version 7.3, which is HDF5
     except Exception as error:  # scipy raises what the bytes make it raise
         raise DataError(f"{path} is not a MAT file: {type(error).__name__}: {error}") from error
-    return {name: _column(value) for name, value in content.items() if _is_table(value)}
+    found: dict[str, FloatArray] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):  # what the file format keeps for itself
+            _collect(name, value, found)
+    return found
+
+
+def _collect(name: str, value: Any, found: dict[str, FloatArray], depth: int = 0) -> None:
+    """The numeric arrays in a MATLAB value, those of a struct by `name.field`."""
+    if _is_table(value):
+        found[name] = _column(value)
+    elif isinstance(value, np.ndarray) and value.size == 1 and depth < MAX_STRUCT_DEPTH:
+        for field in value.dtype.names or ():
+            _collect(f"{name}.{field}", value.flat[0][field], found, depth + 1)
 
 
 def _hdf5(path: Path) -> dict[str, FloatArray]:

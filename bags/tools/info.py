@@ -13,10 +13,11 @@ import numpy as np
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
 from bags.recordings.cdr import Gatherer, UnreadableMessageError
+from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
 from bags.signals.columns import STAMP, Progress
 from bags.signals.timing import ClockRelation, clock_relation
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
 GAP: Final = 5.0  # median intervals without a message
@@ -91,12 +92,17 @@ class BagInfo:
         return (last - first) / 1e9
 
 
-def bag_info(path: Path | str, *, progress: Progress | None = None) -> BagInfo:
+def bag_info(
+    path: Path | str,
+    *,
+    definitions: Mapping[str, Definition] | None = None,
+    progress: Progress | None = None,
+) -> BagInfo:
     """Read the whole bag once, an unfinished one as far as it goes.
 
     `progress` is called with messages done and to come. Raises BagError as `Bag` does.
     """
-    with Bag(path, unfinished=True) as bag:
+    with Bag(path, unfinished=True, definitions=definitions) as bag:
         found = {topic: _Collector(bag, topic, msgtype) for topic, msgtype in bag.topics.items()}
         total, done = sum(channel.count for channel in bag.channels), 0
         for channel, batch in bag.batches():

@@ -2,12 +2,12 @@
 
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bags.recordings.bag import Bag
 from bags.recordings.batch import Batch
-from bags.recordings.folders import bag_files
+from bags.recordings.folders import BagFiles, bag_files
 from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.storage import Channel, McapStorage, reading
 from bags.recordings.writer import BagWriter
@@ -41,9 +41,10 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
     lost: list[str] = []
     sums: dict[str, tuple[int, int]] = {}
     sizes = [file.stat().st_size for file in files]
-    with BagWriter(out, custom=_custom(path)) as writer:
+    described = _described(path)
+    with BagWriter(out, custom=described.custom) as writer:
         for k, file in enumerate(files):
-            for channel, batch in _messages(file, lost):
+            for channel, batch in _messages(file, lost, described):
                 try:
                     writer.add_topic(channel.topic, channel.msgtype, like=channel)
                     if batch is not None:
@@ -70,19 +71,23 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
-def _custom(path: Path) -> dict[str, str]:
+def _described(path: Path) -> BagFiles:
     try:
-        return dict(bag_files(path).custom)
-    except BagError:
-        return {}  # damaged metadata; an MCAP file carries its own
+        return bag_files(path)
+    except BagError:  # damaged metadata; an MCAP file carries its own
+        return BagFiles(path, (), "mcap")
 
 
-def _messages(file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch | None]]:
+def _messages(
+    file: Path, lost: list[str], described: BagFiles
+) -> Iterator[tuple[Channel, Batch | None]]:
     """Every channel once without a batch, then the batches."""
     if file.is_dir() or file.suffix in (".db3", ".bag"):
         with Bag(file, unfinished=True) as bag:
-            yield from ((channel, None) for channel in bag.channels)
-            yield from bag.batches()
+            channels = [_with_offered(channel, described) for channel in bag.channels]
+            yield from ((channel, None) for channel in channels)
+            for channel, batch in bag.batches():
+                yield channels[channel.key], batch
         return
     try:
         with reading(file):
@@ -95,12 +100,17 @@ def _messages(file: Path, lost: list[str]) -> Iterator[tuple[Channel, Batch | No
     if contents.ending is not None:
         rest = file.stat().st_size - contents.good_bytes
         lost.append(f"{file.name}: {contents.ending}; the last {rest} bytes hold no whole chunk")
+    channels = [_with_offered(channel, described) for channel in storage.channels]
     try:
-        yield from ((channel, None) for channel in storage.channels)
-        for key, batch in storage.batches(range(len(storage.channels))):
-            yield storage.channels[key], batch
+        yield from ((channel, None) for channel in channels)
+        for key, batch in storage.batches(range(len(channels))):
+            yield channels[key], batch
     finally:
         storage.close()
+
+
+def _with_offered(channel: Channel, described: BagFiles) -> Channel:
+    return replace(channel, offered=described.offered.get(channel.topic) or channel.offered)
 
 
 def _copy(

@@ -1,62 +1,200 @@
-"""The time-sampled relaxation, thesis (6.7): ρ(t) that holds at instants. It is not a proof.
+"""`SampledFunnel`: a tube around a nominal motion of a state model, and what it rests on."""
 
-Between the instants anything may happen, so what is found is at least as large as what is true.
-`Sampled` has no certificate and nothing that could become one: only `design_funnel` proves.
-"""
-
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike
-from nlsid_core.continuous import Funnel, Nominal, Policy, VectorField
-from nlsid_core.errors import DataError
-from nlsid_core.funnels.lstep import sections
-from nlsid_core.funnels.setting import Goal, prepare
-from nlsid_core.funnels.sweep import Progress, sweep_rho
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.funnels.factor import rounding_of
+from nlsid_core.funnels.linear import FORMAT
+
+KIND = "sampled"
+_AXES = {"S": 3, "A": 3, "tube": 1, "inlet": 1, "half_widths": 2, "roots": 1}
+FORMS = ("response", "peak", "energy", "fading")  # how the disturbance is bounded
+
+
+@dataclass(frozen=True)
+class DisturbanceAssumption:
+    """What the tube rests on: d_k = x̂_{k+1} - f(x̂_k, u_k), the observer's correction, stays small.
+
+    form `response`: r_{k+1} = A_k r_k + d_k, r_0 = 0, and |S_k r_k| ≤ bound. `peak`:
+    |S_{k+1} d_k| ≤ bound. `energy` and `fading`: E_{k+1} = rate·E_k + gain·|S_{k+1} d_k|²,
+    E_0 = 0, and √E_k ≤ bound; rate is 1 for `energy`, below 1 for `fading`. bound ≥ safety_factor ·
+    measured, measured being the largest over the commissioning runs `measured_on` (name, digest),
+    none of which the model was fitted on.
+    """
+
+    form: str
+    bound: float
+    measured: float
+    safety_factor: float
+    measured_on: tuple[tuple[str, str], ...]
+    rate: float = 1.0
+    gain: float = 1.0
+
+    @property
+    def widens(self) -> float:
+        """What is added to a radius for it: the bound, but for `peak`, which is in the radius."""
+        return 0.0 if self.form == "peak" else self.bound
 
 
 @dataclass(frozen=True, eq=False)
-class Sampled:
-    """A set that holds at sampled instants, which is no proof, and ∫ volume dt of every iterate."""
+class SampledFunnel:
+    """|S_k(x̂_k - x_k)| ≤ radius_k, k = 0 … N, around the nominal (x_k) of a policy.
 
-    funnel: Funnel
-    volumes: tuple[float, ...]
+    S: (N + 1, n, n), upper triangular, S'S the shape. A: (N, n, n), of the disturbance's response.
+    tube: (N + 1,) radii of what starts with |S_0 x̄_0| ≤ tube_0 do; inlet: (N + 1,) radii from
+    which the goal inlet_N is reached. Unless the form is `peak` the radius is tube + bound. Radii
+    are in the norm of S, without unit. half_widths: (N + 1, n) the largest |x̄_i| in the tube, in
+    the signals' units, rounded up; they are part of what is proved. roots, of an implicit model
+    only: (N + 1,), at sample k + 1 the next rates v are claimed to be within
+    |S_vv (v - v_{k+1})| ≤ roots_{k+1}, S_vv the block of the rates; farther ones are spurious.
+    `model` and `policy` are digests.
 
-    def __str__(self) -> str:
-        return (
-            f"NOT PROVED: holds at samples only, volume integral {self.volumes[-1]:.4g} over "
-            f"{self.funnel.t0:g} to {self.funnel.tf:g} s"
-        )
-
-
-def sample_funnel(
-    dynamics: VectorField | Callable[..., Any],
-    nominal: Nominal,
-    *,
-    goal: Goal | ArrayLike | None = None,
-    policy: Policy | None = None,
-    samples: int = 4,
-    Q: ArrayLike | None = None,
-    R: ArrayLike | None = None,
-    gain: str = "constant",
-    progress: Progress | None = None,
-) -> Sampled:
-    """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
-
-    Necessary for a funnel with this P(t), not sufficient: to compare with, or to see what could be
-    hoped for. The other arguments are those of `design_funnel`, and so is what it raises.
+    Raises ShapeError or DataError on numbers that do not fit.
     """
-    if samples < 2:
-        raise DataError(f"{samples} samples an interval: its two ends are the least")
-    setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
-    steps, policy = setting.steps, setting.policy
-    instants = sections(steps.field, policy, setting.P, count=samples)
-    margin = setting.margin(setting.rho_final)
-    rho, _ = sweep_rho(
-        steps, instants, margin=margin, rho_final=setting.rho_final, progress=progress
-    )
-    digest = _json.digest(policy.document())
-    funnel = Funnel(policy.x, setting.P, rho, policy.vector_field, digest)
-    return Sampled(funnel, (funnel.volume_integral(),))
+
+    S: FloatArray
+    A: FloatArray
+    tube: FloatArray
+    inlet: FloatArray
+    half_widths: FloatArray
+    assumption: DisturbanceAssumption
+    model: str
+    policy: str
+    roots: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        optional = () if self.roots is None else ("roots",)
+        for key in ("S", "A", "tube", "inlet", "half_widths", *optional):
+            values = np.array(getattr(self, key), dtype=np.float64)
+            if not np.isfinite(values).all():
+                raise DataError(f"funnel: {key} holds NaN or infinity")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        n = self.S.shape[-1] if self.S.ndim == 3 else 0
+        length = len(self.S)
+        parts = (self.S, self.A, self.tube, self.inlet, self.half_widths)
+        shapes = tuple(part.shape for part in parts)
+        if length < 2 or shapes != (
+            (length, n, n),
+            (length - 1, n, n),
+            (length,),
+            (length,),
+            (length, n),
+        ):
+            raise ShapeError(f"funnel: S, A, tube, inlet and half_widths do not fit: {shapes}")
+        if (np.tril(self.S, -1) != 0).any() or (np.diagonal(self.S, axis1=1, axis2=2) == 0).any():
+            raise DataError("funnel: S should be upper triangular with a nonzero diagonal")
+        if self.roots is not None and (self.roots.shape != (length,) or not (self.roots > 0).all()):
+            raise DataError(f"funnel: roots should be {length} positive radii")
+        if not ((self.tube > 0).all() and (self.inlet > 0).all() and self.tube[0] <= self.inlet[0]):
+            raise DataError("funnel: radii should be positive, and the tube start in the inlet")
+        if self.assumption.form not in FORMS or self.assumption.bound < 0:
+            raise DataError(f"funnel: unknown form '{self.assumption.form}' or negative bound")
+
+    def __len__(self) -> int:
+        """The number of steps N."""
+        return len(self.A)
+
+    @property
+    def radius(self) -> FloatArray:
+        """(N + 1,): |S_k x̄_k| in the tube, the disturbance's response included."""
+        return self.tube + self.margin
+
+    @property
+    def margin(self) -> float:
+        """What the disturbance adds to a radius."""
+        return self.assumption.widens
+
+    @property
+    def made_for(self) -> tuple[str, str]:
+        """The digests of the model and of the policy."""
+        return self.model, self.policy
+
+    @property
+    def last(self) -> float:
+        """The last sample that the proof covers."""
+        return len(self)
+
+    @cached_property
+    def rounding(self) -> FloatArray:
+        """(N + 1,) what rounding can hide of a size, of itself; DataError if that is too much."""
+        return rounding_of(self.S, "the funnel's S")
+
+    def norm(self, when: float, x_bar: FloatArray) -> float:
+        """|S_k x̄| of x̄ (n,) at sample `when`, rounded up."""
+        k = int(when)
+        return float(np.linalg.norm(self.S[k] @ x_bar)) * float(1.0 + self.rounding[k])
+
+    def size(self, when: float, deviation: FloatArray) -> float:
+        """How far out x̄ (n,) is at sample `when`: 1 on the boundary, rounded up."""
+        return self.norm(when, deviation) / float(self.tube[int(when)] + self.margin)
+
+    def start_size(self, x_bar: FloatArray) -> float:
+        """How far out of the tube's start x̄ (n,) is: 1 on its boundary, rounded up."""
+        return self.norm(0, x_bar) / float(self.tube[0])
+
+    def widths(self, when: float) -> FloatArray:
+        """(n,) the largest |x̄_i| in the tube at sample `when`, in the signals' units."""
+        return np.asarray(self.half_widths[int(when)])
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        a = self.assumption
+        roots = {} if self.roots is None else {"roots": self.roots.tolist()}
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "kind": KIND,
+            "set": "|S[k] (xhat - x[k])| <= tube[k] (+ bound, unless form peak)",
+            "model": self.model,
+            "policy": self.policy,
+            "assumption": {
+                "form": a.form,
+                "bound": a.bound,
+                "rate": a.rate,
+                "gain": a.gain,
+                "measured": a.measured,
+                "safety_factor": a.safety_factor,
+                "measured_on": [{"name": n, "digest": d} for n, d in a.measured_on],
+            },
+            "tube": self.tube.tolist(),
+            "inlet": self.inlet.tolist(),
+            "half_widths": self.half_widths.tolist(),
+            "S": self.S.tolist(),
+            "A": self.A.tolist(),
+            **roots,
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "funnel") -> "SampledFunnel":
+        """Raises DocumentError if the document is not a sampled funnel."""
+        files.header(document, FORMAT, source=source)
+        if document.get("kind") != KIND:
+            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        nested = files.member(document, "assumption", dict, source=source)
+        where = f"{source} assumption"
+        runs = files.member(nested, "measured_on", list, source=where)
+        arrays = {
+            key: files.array(document, key, (None,) * axes, source=source)
+            for key, axes in _AXES.items()
+            if key != "roots" or key in document
+        }
+        return cls(
+            assumption=DisturbanceAssumption(
+                form=files.member(nested, "form", str, source=where),
+                bound=files.number(nested, "bound", source=where),
+                rate=files.number(nested, "rate", source=where),
+                gain=files.number(nested, "gain", source=where),
+                measured=files.number(nested, "measured", source=where),
+                safety_factor=files.number(nested, "safety_factor", source=where),
+                measured_on=tuple(files.named_digests(runs, source=where)),
+            ),
+            model=files.member(document, "model", str, source=source),
+            policy=files.member(document, "policy", str, source=source),
+            **arrays,
+        )

@@ -5,39 +5,32 @@ from nlsid_core.identification.block_cascade import (
     CascadeFit,
     identify_block_cascade,
 )
-from nlsid_core.identification.cascade_proof import CascadeProof, prove_block_cascade
-from nlsid_core.identification.contraction import StateAffineProof, prove_state_affine
-from nlsid_core.identification.fit import (
-    CERTIFIED,
-    CERTIFIED_SEM,
-    FINAL,
-    FIRST,
-    LEAST_SQUARES,
-    METHODS,
-    RIE,
-    SEM,
-    UNBIASED_RIE,
-    Candidate,
-    Fit,
-    History,
-    Proof,
-    Step,
-    stated_rate,
-)
-from nlsid_core.identification.from_repeats import identify_from_repeats
-from nlsid_core.identification.identify import identify
-from nlsid_core.identification.implicit import ImplicitProof, prove_implicit
+from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
+from nlsid_core.identification.identify import Selection, Tried, identify, select
 from nlsid_core.identification.implicit_class import ImplicitClass
+from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
+from nlsid_core.identification.linear import LinearClass
 from nlsid_core.identification.linear_states import LinearStateClass
-from nlsid_core.identification.model_class import ModelClass, describe
+from nlsid_core.identification.methods import (
+    METHODS,
+    CertifiedRse,
+    CertifiedSem,
+    FirstRse,
+    LeastSquares,
+    Method,
+    ModelClass,
+    MomentRie,
+    Rie,
+    Rse,
+    Sem,
+    describe,
+)
 from nlsid_core.identification.moment_rie import MomentFit
 from nlsid_core.identification.moments import MonotoneClass
-from nlsid_core.identification.monotone_proof import MonotoneProof, prove_monotone_equation
+from nlsid_core.identification.monotone import identify_from_repeats
 from nlsid_core.identification.prediction import Model, predict, simulate_trial
-from nlsid_core.identification.regression import LinearClass
 from nlsid_core.identification.repeats import RepeatTest, compare_repeats
 from nlsid_core.identification.searches import methods_of
-from nlsid_core.identification.selection import Selection, Tried, select
 from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.identification.state_affine import StateAffineClass
 from nlsid_core.identification.validation import (
@@ -49,37 +42,35 @@ from nlsid_core.identification.validation import (
 )
 
 __all__ = [
-    "CERTIFIED",
-    "CERTIFIED_SEM",
-    "FINAL",
-    "FIRST",
-    "LEAST_SQUARES",
     "METHODS",
-    "RIE",
-    "SEM",
-    "UNBIASED_RIE",
     "BlockCascadeClass",
     "Candidate",
     "CascadeFit",
-    "CascadeProof",
+    "CertifiedRse",
+    "CertifiedSem",
+    "FirstRse",
     "Fit",
     "History",
     "ImplicitClass",
     "ImplicitProof",
+    "LeastSquares",
     "LinearClass",
     "LinearStateClass",
+    "Method",
     "Model",
     "ModelClass",
     "MomentFit",
+    "MomentRie",
     "MonotoneClass",
-    "MonotoneProof",
     "Proof",
     "RepeatTest",
     "Residual",
+    "Rie",
+    "Rse",
     "Selection",
+    "Sem",
     "StabilityProof",
     "StateAffineClass",
-    "StateAffineProof",
     "Step",
     "Tried",
     "Validation",
@@ -90,11 +81,8 @@ __all__ = [
     "identify_from_repeats",
     "methods_of",
     "predict",
-    "prove_block_cascade",
     "prove_implicit",
-    "prove_monotone_equation",
     "prove_stability",
-    "prove_state_affine",
     "select",
     "simulate_trial",
     "simulation_percent",

@@ -11,23 +11,26 @@ from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
-from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
 from nlsid_core.identification.cascade_fit import Parameters, Trial, minimise
-from nlsid_core.identification.cascade_proof import CascadeProof, prove_block_cascade
-from nlsid_core.identification.cascade_search import (
+from nlsid_core.identification.cascade_starts import (
     best_start,
     mean_square,
     with_intervals,
     with_phases,
 )
+from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.models import BlockCascade, Signal
-from nlsid_core.trajectory import Dataset
+from nlsid_core.options import require_one_of, require_whole
 
 STEPS = 40
 TOLERANCE = 1e-3  # relative gain of a step below which a choice of knots and phases is judged
 FINAL_STEPS, FINAL_TOLERANCE = 40, 1e-5
 MAX_PHASES_TRIED = 4
+MOST_STARTS, MOST_SAMPLES = 1000, 2**31
 START_COEFFICIENTS = 15  # of f, at the start
 
 Progress = Callable[[str, float], None]
@@ -52,12 +55,13 @@ class CascadeChoice:
 
 @dataclass(frozen=True)
 class BlockCascadeClass:
-    """Which block cascades, and from how many random starts.
+    """A filter, a static nonlinearity, a filter. Source: `theory-cascades-and-moments.md`.
 
-    orders: of the two filters; (n, 0) are Wiener, (0, n) Hammerstein models. phases, intervals
-    (ascending), smoothing: chosen on validation data; knots are refined while that helps. Several
-    phases presume an input without power near half the sampling frequency; validation decides.
-    start_samples: of each trial, for the starts. begin: how trials begin, "measured" (in motion,
+    orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models. phases
+    (each 1 to 4), intervals (of knots, ascending), smoothing: chosen on validation data; knots are
+    refined while that helps. Several phases presume an input without power near half the sampling
+    frequency; validation decides. starts: random ones, 1 to 1000, made from `seed`; start_samples:
+    of each trial, for the starts. begin: how trials begin, "measured" (in motion,
     `BlockCascade.simulate` from the first measured outputs) or "rest" (from zero states).
     """
 
@@ -67,22 +71,24 @@ class BlockCascadeClass:
     smoothing: tuple[float, ...] = (1e-8,)
     starts: int = 12
     start_samples: int = 10_000
+    seed: int = 0
     begin: Begin = "measured"
     kind: ClassVar[type[BlockCascade]] = BlockCascade
 
     def __post_init__(self) -> None:
-        if min(self.orders) < 0 or max(self.orders) < 1:
-            raise DataError(f"orders {self.orders} should be two, not negative, not both zero")
-        if self.starts < 1 or self.start_samples < 1:
-            raise DataError(f"starts {self.starts} and start_samples should be at least 1")
-        if self.begin not in get_args(Begin):
-            raise DataError(f"begin is '{self.begin}'; known: {', '.join(get_args(Begin))}")
+        if len(self.orders) != 2 or min(self.orders) < 0 or not 1 <= max(self.orders) <= MOST_LAGS:
+            allowed = f"two whole numbers from 0 to {MOST_LAGS}, not both zero"
+            raise OptionError("orders", self.orders, allowed)
         if not self.phases or not all(1 <= M <= MAX_PHASES_TRIED for M in self.phases):
-            raise DataError(f"phases {self.phases} should be between 1 and {MAX_PHASES_TRIED}")
+            raise OptionError("phases", self.phases, f"between 1 and {MAX_PHASES_TRIED} each")
         if not self.intervals or min(self.intervals) < 1:
-            raise DataError(f"intervals {self.intervals} should be at least 1 each")
-        if not self.smoothing or min(self.smoothing) < 0:
-            raise DataError(f"smoothing {self.smoothing} should not be negative")
+            raise OptionError("intervals", self.intervals, "at least 1 each")
+        if not self.smoothing or not min(self.smoothing) >= 0:
+            raise OptionError("smoothing", self.smoothing, "0 or more each")
+        require_whole(self, "starts", 1, MOST_STARTS)
+        require_whole(self, "start_samples", 1, MOST_SAMPLES)
+        require_whole(self, "seed", 0, MOST_SAMPLES)
+        require_one_of(self, "begin", get_args(Begin))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +96,7 @@ class CascadeFit:
     """The model, its proof, the choice that made it, and all choices that were tried."""
 
     model: BlockCascade
-    proof: CascadeProof
+    proof: StabilityProof
     chosen: CascadeChoice
     choices: tuple[CascadeChoice, ...]
     seconds: float
@@ -115,7 +121,6 @@ def identify_block_cascade(
     model_class: BlockCascadeClass,
     *,
     transient: int = 0,
-    rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
@@ -138,7 +143,7 @@ def identify_block_cascade(
         orders,
         smoothing=smoothing[0],
         starts=starts,
-        rng=rng,
+        rng=np.random.default_rng(model_class.seed),
     )
     total = len(phases) * len(intervals) * len(smoothing) + 2
     report(f"best of {starts} starts", 1 / total)
@@ -171,7 +176,7 @@ def identify_block_cascade(
     chosen, parameters = min(tried, key=_validation_error)
     report("minimised further", 1.0)
     model = _model(parameters, scales, train)
-    proof = prove_block_cascade(model)
+    proof = prove_stability(model)
     if proof is None:
         radius = max(float(np.abs(poles).max(initial=0.0)) for poles in model.poles)
         raise Infeasible(

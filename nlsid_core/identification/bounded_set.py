@@ -12,24 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import ShapeError
-from nlsid_core.identification.contraction import (
-    StateAffineProof,
-    box_inequalities,
-    companion,
-    leading_bounds,
+from nlsid_core.identification.inequalities import (
+    MatrixInequality,
+    centre,
+    minimise_linear,
     traceless,
 )
-from nlsid_core.identification.inequalities import MatrixInequality, centre, minimise_linear
-from nlsid_core.identification.matrix_proof import MatrixProof
+from nlsid_core.identification.leading_bounds import box_inequalities, leading_bounds
 from nlsid_core.identification.matrix_set import SLOWEST_RATE
+from nlsid_core.identification.stability import StabilityProof
 from nlsid_core.identification.state_affine import StateAffineRows
 from nlsid_core.models import StateAffineModel
 
 START_BOUNDS = (0.9, 1.1)  # of G_0 around the first iterate's start G = I
 START_SLACK = 0.05  # of those bounds, spent on the multipliers of the box
 GROWTH = 4.0  # of h from one iterate to the next, at most: with one lag nothing else bounds it
+STOP_MARGIN = 1e-10  # λ_min of r²P - A'PA, tr P = n, that counts as feasible
 TIGHT = 1e-4  # of h - ℓ, how tightly the bounds of G_0 are stated
 
 
@@ -59,21 +59,21 @@ class BoundedSet:
 
     @classmethod
     def of_proof(
-        cls,
-        problem: StateAffineRows,
-        model: StateAffineModel,
-        proof: StateAffineProof | MatrixProof,
+        cls, problem: StateAffineRows, model: StateAffineModel, proof: StabilityProof
     ) -> "BoundedSet":
         """A set that the model with its proof is strictly inside of."""
-        if isinstance(proof, MatrixProof):
-            raise ShapeError("the last step needs the proof by bounds of the leading coefficient")
-        bounds, multipliers = proof.bounds, proof.multipliers
-        if bounds is None or multipliers is None:  # a constant G_0 was proved without
-            found_bounds = leading_bounds(model)
-            if found_bounds is None:
-                raise ShapeError("the last step needs a positive leading coefficient")
-            bounds, multipliers = found_bounds
-        return cls(problem, proof.P, np.array(bounds), np.concatenate([bounds, *multipliers]))
+        found = leading_bounds(model)
+        if found is None:
+            raise ShapeError("the last step needs a positive leading coefficient")
+        bounds, multipliers = found
+        lagged = np.array([g.coefficients.sum() for g in model.G[1:]])
+        P = _common_storage([companion(lagged, q) for q in bounds])
+        return cls(
+            problem,
+            proof.P if P is None else P,
+            np.array(bounds),
+            np.concatenate([bounds, *multipliers]),
+        )
 
     def inequalities(self) -> tuple[MatrixInequality, ...]:
         """Both ends' contraction, both bounds on the box, growth, and nonnegative multipliers."""
@@ -147,3 +147,28 @@ def _centred(P: FloatArray, matrices: list[FloatArray]) -> FloatArray:
     inequalities = [MatrixInequality(F) for F in images]
     z = centre(inequalities, np.zeros(len(basis)))
     return np.asarray(start + np.tensordot(z, basis, axes=1))
+
+
+def _common_storage(matrices: list[FloatArray]) -> FloatArray | None:
+    """P, tr P = n, that maximises the least eigenvalue of r²P - A'PA over the matrices."""
+    n = len(matrices[0])
+    basis = traceless(n)
+    inequalities = []
+    for A in matrices:
+        images = [SLOWEST_RATE**2 * X - A.T @ X @ A for X in (np.eye(n), *basis)]
+        inequalities.append(MatrixInequality(np.array([*images, -np.eye(n)])))
+    objective = np.zeros(len(basis) + 1)
+    objective[-1] = -1.0
+    start = np.zeros(len(basis) + 1)
+    start[-1] = -1.0 + min(np.linalg.eigvalsh(i.F[0])[0] for i in inequalities)
+    z = minimise_linear(objective, inequalities, start, gap=0.1 * STOP_MARGIN)
+    if z[-1] < STOP_MARGIN:
+        return None
+    return np.asarray(np.eye(n) + np.tensordot(z[:-1], basis, axes=1))
+
+
+def companion(lagged: FloatArray, q: float) -> FloatArray:
+    """A(1/q) of x = [ȳ(t-1); …; ȳ(t-n)] for constants `lagged` = [G_1 … G_n]."""
+    A = np.diag(np.ones(len(lagged) - 1), -1)
+    A[0] -= lagged / q
+    return A

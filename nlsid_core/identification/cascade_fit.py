@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.signal import lfilter
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.models import Spline
 
 FIRST_DAMPING = 1e-1

@@ -9,14 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
-from nlsid_core.identification.bound import Bound, Point
+from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.bounded_set import BoundedSet
-from nlsid_core.identification.contraction import StateAffineProof, prove_state_affine
-from nlsid_core.identification.matrix_proof import MatrixProof
 from nlsid_core.identification.matrix_set import MatrixSet
-from nlsid_core.identification.newton import Descent, minimise
+from nlsid_core.identification.newton import Descent, Point, minimise
+from nlsid_core.identification.rse import Bound
 from nlsid_core.identification.simulation_error import SimulationError
+from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.identification.state_affine import StateAffineRows
 from nlsid_core.models import StateAffineModel
 
@@ -60,7 +59,7 @@ def certified_simulation_error(
 
 
 def descend_certified(
-    problem: StateAffineRows, model: StateAffineModel, proof: StateAffineProof | MatrixProof
+    problem: StateAffineRows, model: StateAffineModel, proof: StabilityProof
 ) -> StateAffineModel:
     """The last step: a local minimum of the simulation error itself inside the certified set.
 
@@ -81,7 +80,7 @@ def descend_certified(
             break
         theta, J = found.point.theta, found.point.J
         lower = problem.model(theta, found.point.p)
-        if prove_state_affine(lower) is None:
+        if prove_stability(lower) is None:
             break
         best = lower
         inside = inside.renewed(theta, found.extra)

@@ -2,35 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.prediction import Model
+from nlsid_core.identification.methods import M, Method
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
-from nlsid_core.trajectory import Dataset
-
-LEAST_SQUARES = "least squares"
-RIE = "robust identification error"
-UNBIASED_RIE = "robust identification error, bias of noise removed"
-FIRST = "robust simulation error, first iterate"
-FINAL = "robust simulation error, final iterate"
-CERTIFIED = "robust simulation error, stable for every input"
-SEM = "simulation error minimisation"
-CERTIFIED_SEM = "simulation error minimisation, stable for every input"
-
-METHODS = {
-    "least_squares": LEAST_SQUARES,
-    "rie": RIE,
-    "moment_rie": UNBIASED_RIE,
-    "rse_first": FIRST,
-    "rse": FINAL,
-    "rse_certified": CERTIFIED,
-    "sem": SEM,
-    "sem_certified": CERTIFIED_SEM,
-}
-
-M = TypeVar("M", bound=Model, covariant=True)
 
 
 class Proof(Protocol):
@@ -61,7 +39,7 @@ class Candidate(Generic[M]):
     transient: samples at the start of each trial that its scores leave out.
     """
 
-    method: str
+    method: Method
     model: M
     proof: Proof | None
     seconds: float
@@ -106,26 +84,26 @@ class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
     errors: simulation error in % by dataset name ("train", "validation", "test", those given) and
-    method.
+    name of the method. fit[name] is the candidate of the method called so.
     """
 
     candidates: tuple[Candidate[M], ...]
-    method: str
+    method: Method
     history: History
     errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __getitem__(self, method: str) -> Candidate[M]:
-        return next(c for c in self.candidates if c.method == method)
+        return next(c for c in self.candidates if c.method.name == method)
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The methods there is a candidate of."""
-        return tuple(candidate.method for candidate in self.candidates)
+        """The names of the methods there is a candidate of."""
+        return tuple(candidate.method.name for candidate in self.candidates)
 
     @property
     def chosen(self) -> Candidate[M]:
         """The candidate that was asked for."""
-        return self[self.method]
+        return self[self.method.name]
 
     @property
     def model(self) -> M:
@@ -136,7 +114,7 @@ class Fit(Generic[M]):
     def proof(self) -> Proof:
         """The chosen model's proof; Infeasible if an unproved model was allowed and chosen."""
         if self.chosen.proof is None:
-            raise Infeasible(f"the model of {self.method} has no proof of stability")
+            raise Infeasible(f"the model of {self.method.title} has no proof of stability")
         return self.chosen.proof
 
     def __str__(self) -> str:
@@ -144,8 +122,8 @@ class Fit(Generic[M]):
         header = f"  {'simulation error [%]':52s}" + "".join(f"{name:>12s}" for name in columns)
         rows: list[str] = []
         for c in self.candidates:
-            scores = "".join(f"{self.errors[name][c.method]:12.2f}" for name in columns)
+            scores = "".join(f"{self.errors[name][c.method.name]:12.2f}" for name in columns)
             state = f"proved, {stated_rate(c.proof)}" if c.proof else "not proved"
             mark = "*" if c.method == self.method else " "
-            rows.append(f"{mark} {c.method:52s}{scores}{c.seconds:9.3f} s  {state}")
+            rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
         return "\n".join([str(self.model), str(self.history), header, *rows])

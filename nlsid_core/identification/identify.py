@@ -1,90 +1,168 @@
-"""`identify`: a dataset in, one stable model with its proof and the comparators out."""
+"""`identify`: a dataset in, one stable model with its proof and the comparators out.
+
+`select` does so for several classes and keeps the one with the least error on validation data.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
 
-from nlsid_core.errors import DataError, Infeasible
-from nlsid_core.identification.fit import METHODS, Fit, M
-from nlsid_core.identification.model_class import ModelClass
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.identification.fit import Fit
+from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, alike, describe
 from nlsid_core.identification.searches import OFFERS, methods_of
 from nlsid_core.identification.trail import Progress, Task, silent
-from nlsid_core.trajectory import Dataset
 
 
 def identify(
     train: Dataset,
     model_class: ModelClass[M],
     *,
-    method: str | None = None,
-    comparators: Sequence[str] | None = None,
+    method: Method | None = None,
+    comparators: Sequence[Method] | None = None,
     validation: Dataset | None = None,
     test: Dataset | None = None,
-    iterations: int = 40,
     transient: int = 0,
     allow_unproved: bool = False,
-    accept_untested_repeats: bool = False,
-    rng: np.random.Generator | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Fit[M]:
     """Identify a model of the class, proved incrementally stable.
 
-    method: a key of METHODS that is for the class (`methods_of`; None: the first of them).
-    comparators: what else runs beside it (None: what is quick). `test` is only scored; so is
-    `validation`, but by it a block cascade chooses its phases and knots. iterations: at most, of
-    the robust simulation error. transient: samples at the start of every trial that are simulated
-    and not scored. accept_untested_repeats: remove bias without testing that repeats are repeats.
-    rng: of random starts (None: seed 0). executor: for moments of many bags. progress: called with
-    (what was done, fraction done).
+    method: one that is for the class (`methods_of`), such as `Rse(iterations=20)`; None: the first
+    of them. comparators: what else runs beside it; None: what is quick, with the options that it
+    shares with the method. `test` is only scored; so is `validation`, but by it a block cascade
+    chooses its phases and knots. transient: samples at the start of every trial that are simulated
+    and not scored. executor: shares work that splits, such as moments of many bags. progress:
+    called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
     """
     known = methods_of(model_class)
-    chosen = known[0] if method is None else method
-    for name in [chosen, *(comparators or ())]:
-        if name not in known:
-            raise DataError(_unknown(name, model_class, known))
+    chosen = known[0]() if method is None else method
+    for asked in (chosen, *(comparators or ())):
+        if type(asked) not in known:
+            raise DataError(_unknown(asked, model_class, known))
     datasets = {"train": train, "validation": validation, "test": test}
     scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
     _refuse_other_signals(scored)
     offer = OFFERS[type(model_class)]
-    quick = frozenset(offer.comparators) & {METHODS[name] for name in known}
+    quick = tuple(alike(kind, chosen) for kind in offer.comparators if kind in known)
     task = Task(
-        method=METHODS[chosen],
-        comparators=quick if comparators is None else frozenset(METHODS[m] for m in comparators),
+        method=chosen,
+        comparators=quick if comparators is None else tuple(comparators),
         validation=validation,
-        iterations=iterations,
         transient=transient,
-        accept_untested_repeats=accept_untested_repeats,
-        rng=np.random.default_rng(0) if rng is None else rng,
         executor=executor,
         progress=silent if progress is None else progress,
     )
     trail = offer.search(train, model_class, task)
-    made = [candidate.method for candidate in trail.candidates]
-    if task.method not in made:
-        raise DataError(f"'{chosen}' is not for these data; there are: {', '.join(made)}")
-    fit = Fit(tuple(trail.candidates), task.method, trail.history)
+    fit = Fit(tuple(trail.candidates), chosen, trail.history)
     if fit.chosen.proof is None and not allow_unproved:
         raise Infeasible(
-            f"no proof of stability for the model of {fit.method}; try fewer lags, more or richer "
-            "data, or a method that keeps a proof (rse_certified, moment_rie)"
+            f"no proof of stability for the model of {chosen.title}; try fewer lags, more or "
+            "richer data, or a method that keeps a proof (rse_certified, moment_rie)"
         )
     errors = {
-        name: {c.method: c.error_percent(dataset) for c in fit.candidates}
+        name: {c.method.name: c.error_percent(dataset) for c in fit.candidates}
         for name, dataset in scored.items()
     }
-    return Fit(fit.candidates, fit.method, fit.history, errors)
+    return Fit(fit.candidates, chosen, fit.history, errors)
 
 
-def _unknown(method: str, model_class: object, known: Sequence[str]) -> str:
-    if method not in METHODS:
-        return f"method is '{method}'; there are: {', '.join(METHODS)}"
+def select(
+    train: Dataset,
+    validation: Dataset,
+    classes: Sequence[ModelClass[M]],
+    *,
+    method: Method | None = None,
+    test: Dataset | None = None,
+    transient: int = 0,
+    allow_unproved: bool = False,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> "Selection[M]":
+    """Identify every class on `train` and keep the one with the least error on `validation`.
+
+    A class that does not fit the data or (unless `allow_unproved`) has no proof counts as
+    infinitely bad. Options are those of `identify`. Raises Infeasible if no class has a model.
+    """
+    report = silent if progress is None else progress
+    tried: list[Tried[M]] = []
+    for number, model_class in enumerate(classes):
+        report(describe(model_class), number / len(classes))
+        try:
+            fit = identify(
+                train,
+                model_class,
+                method=method,
+                comparators=(),
+                validation=validation,
+                test=test,
+                transient=transient,
+                allow_unproved=allow_unproved,
+                executor=executor,
+            )
+        except (DataError, SolverError) as refusal:
+            tried.append(Tried(model_class, None, str(refusal)))
+        else:
+            tried.append(Tried(model_class, fit))
+    report("done", 1.0)
+    if not tried:
+        raise DataError("no model class to select from")
+    best = min(tried, key=lambda entry: entry.error("validation"))
+    if best.fit is None:
+        reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
+        raise Infeasible(f"no class has a proved model: {reasons}")
+    return Selection(tuple(tried), best.model_class, best.fit)
+
+
+@dataclass(frozen=True, eq=False)
+class Tried(Generic[M]):
+    """One class: its fit, or the reason why there is none."""
+
+    model_class: ModelClass[M]
+    fit: Fit[M] | None
+    refusal: str = ""
+
+    def error(self, dataset: str) -> float:
+        """The chosen method's error in %; infinite where there is no fit."""
+        return float("inf") if self.fit is None else self.fit.errors[dataset][self.fit.method.name]
+
+
+@dataclass(frozen=True, eq=False)
+class Selection(Generic[M]):
+    """Everything that was tried, in order, and the class with the least validation error."""
+
+    tried: tuple[Tried[M], ...]
+    best: ModelClass[M]
+    fit: Fit[M]
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """Validation errors in % of the chosen method; infinite where none was found."""
+        return tuple(entry.error("validation") for entry in self.tried)
+
+    def __str__(self) -> str:
+        rows = [
+            f"{'*' if entry.model_class is self.best else ' '} {describe(entry.model_class):70s}"
+            + (entry.refusal or f"{entry.error('validation'):9.2f} %")
+            for entry in self.tried
+        ]
+        return "\n".join(["model class, validation error", *rows, str(self.fit)])
+
+
+def _unknown(asked: object, model_class: object, known: Sequence[type[Method]]) -> str:
+    if type(asked) not in METHODS.values():
+        there_are = ", ".join(kind.__name__ for kind in METHODS.values())
+        return f"{asked!r} is no method; there are: {there_are}"
     return (
-        f"'{method}' is not for this model class ({type(model_class).__name__}); it has: "
-        f"{', '.join(known)}"
+        f"{asked!r} is not for this model class ({type(model_class).__name__}); it has: "
+        f"{', '.join(kind.__name__ for kind in known)}"
     )
 
 

@@ -8,41 +8,45 @@ Source: thesis (2.4), (2.7).
 """
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
-from nlsid_core.certificate.implicit import SETS, Names
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
-from nlsid_core.identification.signal_scale import refuse_poor, signal_scale
+from nlsid_core.identification.implicit_sets import Names
+from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.regressors import refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel, Signal
 from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.trajectory import Dataset
 
 DELAYED = ("2.10", "2.11")  # the sets for more than one lag; the others have no known structure ã
 FARTHEST = 0.01  # weight of the outputs before the newest in the error that is bounded
 Box = tuple[tuple[float, float], ...]
+StableSet = Literal["2.10", "2.11", "2.12", "2.13", "2.19"]
 
 
 @dataclass(frozen=True)
 class ImplicitClass:
-    """Which models, and the set of stable ones to search.
+    """e(y(t)) = f(past outputs, inputs), and the set of stable models to search.
 
-    lags: n; delays: of the inputs in w (None: 0 … n). Measured states, x⁺ one sample ahead, are
-    lags 1 and delays (1,). set: of thesis Chapter 2, "2.10" to "2.13", "2.19" for linear models;
-    more than one lag needs "2.10" or "2.11". left_degree: of e, odd; right_degree: of f in x;
-    input_degree: of f in w, which is added, or with `coupled` multiplied to total degree
-    right_degree. box: (low, high) of every output, then every input, for stability on it; None:
-    everywhere. storage_degree: of the storage's metric in "2.10".
-    Raises DataError for a combination no model can satisfy.
+    lags: n, 1 to 100 samples; delays: of the inputs in w, each 0 to 100 samples (None: 0 … n).
+    Measured states, x⁺ one sample ahead, are lags 1 and delays (1,). set: of thesis Chapter 2,
+    "2.10" to "2.13", "2.19" for linear models; more than one lag needs "2.10" or "2.11".
+    left_degree: of e, odd, 1 to 9; right_degree: of f in x, 1 to 5; input_degree: of f in w, 1 to
+    5, which is added, or with `coupled` multiplied to total degree right_degree. box: (low, high)
+    of every output, then every input, in their units, for stability on it (None: everywhere).
+    storage_degree: of the storage's metric in "2.10", 0 to 4.
+    Raises OptionError, or DataError for a combination that no model can satisfy.
     """
 
     lags: int = 1
     delays: tuple[int, ...] | None = None
-    set: str = "2.11"
+    set: StableSet = "2.11"
     left_degree: int = 3
     right_degree: int = 1
     input_degree: int = 1
@@ -52,24 +56,22 @@ class ImplicitClass:
     kind: ClassVar[type[ImplicitModel]] = ImplicitModel
 
     def __post_init__(self) -> None:
-        if self.set not in SETS:
-            raise DataError(f"set '{self.set}' is unknown; there are: {', '.join(SETS)}")
-        if self.lags < 1 or any(d < 0 for d in self.delays or ()):
-            raise DataError(f"lags {self.lags} should be at least 1, delays {self.delays} not < 0")
+        require_whole(self, "lags", 1, MOST_LAGS)
+        require_delays(self, "delays", MOST_LAGS)
+        require_one_of(self, "set", get_args(StableSet))
         if self.lags > 1 and self.set not in DELAYED:
             raise DataError(f"set {self.set} is for 1 lag; {' and '.join(DELAYED)} are for more")
-        if self.left_degree < 1 or self.left_degree % 2 == 0:
-            raise DataError(f"left_degree {self.left_degree} should be odd: e is increasing")
-        if self.right_degree < 1 or self.input_degree < 1 or self.storage_degree < 0:
-            raise DataError("right_degree and input_degree should be at least 1, storage_degree 0")
+        require_one_of(self, "left_degree", (1, 3, 5, 7, 9))  # an even e would not be increasing
+        require_whole(self, "right_degree", 1, 5)
+        require_whole(self, "input_degree", 1, 5)
+        require_whole(self, "storage_degree", 0, 4)
+        require_ranges(self, "box")
         if self.storage_degree and self.set != "2.10":
             raise DataError(f"storage_degree is for set 2.10, not {self.set}")
         if self.set == "2.19" and (self.left_degree, self.right_degree, self.box) != (1, 1, None):
             raise DataError("set 2.19 is linear: left_degree 1, right_degree 1, no box")
         if self.box is None:
             self._refuse_growth()
-        elif any(not low < high for low, high in self.box):
-            raise DataError(f"the box {self.box} should hold (low, high) with low < high")
 
     def _refuse_growth(self) -> None:
         """Without a box f must not grow faster than the set allows."""

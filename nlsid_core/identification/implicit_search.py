@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import FloatArray
-from nlsid_core.certificate import conditions
-from nlsid_core.certificate.conditions import GAP, Inequality
-from nlsid_core.certificate.implicit import Names
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.implicit import ImplicitProof, prove_implicit, storage_template
+from nlsid_core.identification import conditions
+from nlsid_core.identification.conditions import GAP, Inequality
 from nlsid_core.identification.implicit_class import DELAYED, FARTHEST, ImplicitRows
+from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit, storage_template
+from nlsid_core.identification.implicit_sets import Names
 from nlsid_core.identification.stable_sets import constraint
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables

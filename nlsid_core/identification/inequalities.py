@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 
 CENTRED = 1e-6  # Newton decrement of -log det: the barrier has no unit
 NEWTON_STEPS = 100
@@ -80,3 +80,18 @@ def minimise_linear(
         if mu * size <= gap:
             return z
         mu *= MU_FALL
+
+
+def traceless(n: int) -> FloatArray:
+    """(n(n+1)/2 - 1, n, n): a basis of the symmetric matrices with trace zero."""
+    basis = []
+    for i in range(n):
+        for j in range(i, n):
+            X = np.zeros((n, n))
+            X[i, j] = X[j, i] = 1.0
+            if i == j:
+                if i == 0:
+                    continue
+                X[0, 0] = -1.0
+            basis.append(X)
+    return np.array(basis).reshape(-1, n, n)

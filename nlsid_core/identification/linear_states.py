@@ -11,17 +11,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
-from nlsid_core.identification.implicit import ImplicitProof, prove_implicit
 from nlsid_core.identification.implicit_class import with_signals
-from nlsid_core.identification.signal_scale import refuse_poor, signal_scale
+from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
+from nlsid_core.identification.regressors import refuse_poor, signal_scale
 from nlsid_core.identification.stable_sets import linear_models
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import variables
 from nlsid_core.sos import NormBound, Program, Solution, forms_of, solve, symmetric_template
-from nlsid_core.trajectory import Dataset
 
 DECREASE = 0.5  # δ that is proved, of the one the search asks for
 

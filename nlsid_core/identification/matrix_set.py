@@ -5,8 +5,7 @@ With x = [ȳ(t-1); …; ȳ(t-n)], ξ = [ȳ(t); x], V = |x|²_P and a multiplier 
 at every corner w of the input box: it is affine in G_0 … G_n, those in w, so it holds in between,
 and along differences of solutions it says V⁺ ≤ r²V. For a fixed M it is affine in the coefficients
 and P together, for fixed coefficients in P and M: the first is searched, then the second centred.
-Where a coefficient depends on w, M = [T, 0] as in the proof that such a model gets.
-Source: thesis Lemma 2.11, (4.1); `certificate.state_affine_matrix`.
+Source: thesis Lemma 2.11, (4.1); `stability` for the proof of one model, N = M'.
 """
 
 from dataclasses import dataclass
@@ -14,11 +13,10 @@ from itertools import product
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import ShapeError
-from nlsid_core.identification.contraction import StateAffineProof, traceless
-from nlsid_core.identification.inequalities import MatrixInequality, centre
-from nlsid_core.identification.matrix_proof import MatrixProof
+from nlsid_core.identification.inequalities import MatrixInequality, centre, traceless
+from nlsid_core.identification.stability import StabilityProof
 from nlsid_core.identification.state_affine import StateAffineRows
 from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values
@@ -65,20 +63,16 @@ class MatrixSet:
 
     @classmethod
     def of_proof(
-        cls,
-        problem: StateAffineRows,
-        model: StateAffineModel,
-        proof: StateAffineProof | MatrixProof,
+        cls, problem: StateAffineRows, model: StateAffineModel, proof: StabilityProof
     ) -> "MatrixSet":
-        """A set that the model is strictly inside of, if its proved rate is below the set's."""
-        n_y, P = len(problem.y_scale[0]), proof.P
+        """A set that the model is strictly inside of, if its proved rate is below the set's.
+
+        Raises ShapeError if the proof has no multiplier that serves the whole box.
+        """
+        if proof.multipliers is None or "N" not in proof.multipliers:
+            raise ShapeError("the last step needs a proof with one multiplier for the whole box")
         theta = np.concatenate([g.coefficients.ravel() for g in model.G])
-        if isinstance(proof, MatrixProof):
-            return cls(problem, P, np.pad(proof.T.T, ((0, 0), (0, len(P)))), theta)
-        lead = model.G[0].coefficients[0]
-        # Completes the square: what is left is r²P - A'PA and P₁₁ on the equation's residual.
-        M = np.linalg.solve(lead.T, np.pad(P[:n_y], ((0, 0), (0, n_y))))
-        return cls(problem, P, M, theta)
+        return cls(problem, proof.P, np.array(proof.multipliers["N"]).T, theta)
 
     @property
     def extra(self) -> FloatArray:
@@ -111,9 +105,8 @@ class MatrixSet:
         P = _symmetric(extra, size)
         scale = size / np.trace(P)
         P, M = scale * P, scale * self.M
-        moves, columns = traceless(size), n_y if _used(problem).any() else size + n_y
-        entries = np.eye(n_y * columns).reshape(-1, n_y, columns)
-        multipliers = np.pad(entries, ((0, 0), (0, 0), (0, size + n_y - columns)))
+        moves, columns = traceless(size), size + n_y
+        multipliers = np.eye(n_y * columns).reshape(-1, n_y, columns)
         n_P, n_M = len(moves), len(multipliers)
         positive = np.zeros((1 + n_P + n_M, size, size))
         positive[0], positive[1 : 1 + n_P] = P, moves

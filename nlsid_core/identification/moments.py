@@ -19,10 +19,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.models import MonotoneEquation
-from nlsid_core.trajectory import Trajectory
+from nlsid_core.options import require_delays, require_one_of, require_whole
 
 DEGREES = (1, 3)  # of e
 CONSTANT = 1e-10  # relative rms below which an input minus its mean is rounding
@@ -31,7 +33,11 @@ RANK_TOLERANCE = 1e-12  # relative eigenvalue of unit moments at which inputs re
 
 @dataclass(frozen=True)
 class MonotoneClass:
-    """Which monotone equations: n lags, the input's delays (None: 0 … n), degree of e (1 or 3)."""
+    """e(y) affine in past outputs and in inputs, e increasing. Source: thesis Section 3.5.
+
+    lags: n of the output, 1 to 100 samples; delays: of the inputs, each 0 to 100 samples (None:
+    0 … n). degree: of e, 1 or 3.
+    """
 
     lags: int
     delays: tuple[int, ...] | None = None
@@ -39,10 +45,9 @@ class MonotoneClass:
     kind: ClassVar[type[MonotoneEquation]] = MonotoneEquation
 
     def __post_init__(self) -> None:
-        if self.lags < 1 or any(d < 0 for d in self.delays or ()):
-            raise DataError(f"lags {self.lags} should be at least 1, delays {self.delays} not < 0")
-        if self.degree not in DEGREES:
-            raise DataError(f"degree {self.degree} of e; known: 1 and 3")
+        require_whole(self, "lags", 1, MOST_LAGS)
+        require_delays(self, "delays", MOST_LAGS)
+        require_one_of(self, "degree", DEGREES)
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""

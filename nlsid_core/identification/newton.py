@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import LinAlgError
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import SolverError
-from nlsid_core.identification.bound import Point, Root
+from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.inequalities import MatrixInequality
-from nlsid_core.identification.rows import Rows
 
 DECREMENT = 1e-12  # Newton decrement relative to J: 1e-6 relative accuracy of the minimiser
 PERFECT_FIT = 1e-18  # J relative to Σy²: noise-free data, what is left is rounding
@@ -40,6 +39,73 @@ FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near 
 MU_FALL = 0.01
 CENTRED = 0.1  # decrement relative to μ at which a point of the path is close enough
 MU_FALL_K, CENTRED_K = 0.01, 1.0  # the same two on the path of K, whose barrier is of low rank
+
+
+class Root(Protocol):
+    """A matrix L with J = |L⁻¹ε|², by what it solves."""
+
+    def half_solve(self, B: FloatArray, *, overwrite: bool = False) -> FloatArray:
+        """L⁻¹B for B (N,) or (N, m)."""
+        ...
+
+    def half_solve_transposed(self, B: FloatArray) -> FloatArray:
+        """L⁻ᵀB for B (N,) or (N, m)."""
+        ...
+
+    @property
+    def pivots(self) -> FloatArray:
+        """(N,): the pivots of the elimination of LL', or what stands for them."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """J at θ with the best p (n_p,), and the factors its derivatives are made of."""
+
+    theta: FloatArray
+    p: FloatArray
+    J: float
+    residual: FloatArray  # L⁻¹ε
+    x: FloatArray  # L⁻ᵀL⁻¹ε
+    factor: Root
+    projected: FloatArray  # L⁻¹Q
+    normal: tuple[FloatArray, bool]  # Cholesky factor of Q'K⁻¹Q
+
+    def curvature(self, V: FloatArray) -> FloatArray:
+        """2 |(I - Π) L⁻¹V|² for columns V (N, n)."""
+        solved = self.factor.half_solve(V)
+        inner = self.projected.T @ solved
+        square = solved.T @ solved - inner.T @ cho_solve(self.normal, inner, check_finite=False)
+        return np.asarray(2.0 * square)
+
+    def derivatives(self, errors: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradient and Hessian of ε'K⁻¹ε from ε_i and K_i x, columns (N, n)."""
+        gradient = 2.0 * errors.T @ self.x - slopes.T @ self.x
+        return gradient, self.curvature(errors - slopes)
+
+
+def project(rows: Rows, unknowns: FloatArray, theta: FloatArray, factor: Root) -> Point:
+    """The point of J = min_p |L⁻¹(errors θ - Q p)|²; LinAlgError if rounding decides it."""
+    both = np.empty((len(rows), 1 + rows.Q.shape[1]), order="F")  # as LAPACK takes it: no copy
+    both[:, 0], both[:, 1:] = rows.errors @ theta, rows.Q
+    return project_columns(both, unknowns, factor)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # an unstable candidate is refused below
+def project_columns(both: FloatArray, unknowns: FloatArray, factor: Root) -> Point:
+    """`project` for columns [errors θ, Q] of any rows; overwrites them."""
+    solved = factor.half_solve(both, overwrite=True)
+    left, projected = solved[:, 0], solved[:, 1:]
+    if not np.isfinite(left @ left):
+        raise LinAlgError("the errors overflow")
+    normal = cho_factor(projected.T @ projected, check_finite=False)
+    p = cho_solve(normal, projected.T @ left, check_finite=False)
+    residual = left - projected @ p
+    J = float(residual @ residual)
+    if not np.isfinite(J):
+        raise LinAlgError("K is positive definite to rounding only")
+    x = factor.half_solve_transposed(residual)
+    return Point(unknowns, p, J, residual, x, factor, projected, normal)
 
 
 class Objective(Protocol):

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.signal import lfilter
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.models import (
     BlockCascade,
@@ -16,7 +17,6 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
 )
-from nlsid_core.trajectory import Trajectory
 
 Model = DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation | ImplicitModel
 # [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)

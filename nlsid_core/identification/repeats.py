@@ -14,9 +14,9 @@ from statistics import NormalDist
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.trajectory import Dataset, Trajectory
 
 LEVEL = 1e-4  # probability of calling repeats different when they are not, per pair
 INPUT_TOLERANCE = 0.05  # difference of the inputs over their spread: more is another excitation

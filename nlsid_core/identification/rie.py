@@ -15,11 +15,10 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import LinAlgError
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import ShapeError
-from nlsid_core.identification.bound import Point, project_columns
 from nlsid_core.identification.inequalities import MatrixInequality
-from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.newton import Point, minimise, project_columns
 from nlsid_core.identification.state_affine import StateAffineRows
 from nlsid_core.models import StateAffineModel
 from nlsid_core.polynomial.values import monomial_values

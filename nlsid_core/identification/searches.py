@@ -6,34 +6,36 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.contraction import prove_state_affine
-from nlsid_core.identification.fit import (
-    CERTIFIED,
-    CERTIFIED_SEM,
-    FINAL,
-    FIRST,
-    LEAST_SQUARES,
-    METHODS,
-    RIE,
-    SEM,
-    UNBIASED_RIE,
-    History,
-    Proof,
-    Step,
-)
-from nlsid_core.identification.from_repeats import identify_from_repeats
+from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import ImplicitClass, build_implicit_rows
 from nlsid_core.identification.implicit_search import (
     implicit_equation_error,
     minimise_implicit_rie,
     prove_in_set,
 )
-from nlsid_core.identification.least_squares import least_squares
+from nlsid_core.identification.linear import (
+    LinearClass,
+    build_regression,
+    least_squares,
+    minimise_simulation_error,
+)
 from nlsid_core.identification.linear_states import LinearStateClass, identify_linear_states
+from nlsid_core.identification.methods import (
+    CertifiedRse,
+    CertifiedSem,
+    FirstRse,
+    LeastSquares,
+    Method,
+    MomentRie,
+    Rie,
+    Rse,
+    Sem,
+)
 from nlsid_core.identification.moment_rie import MomentFit, minimise_moment_rie
 from nlsid_core.identification.moments import (
     MonotoneClass,
@@ -41,14 +43,13 @@ from nlsid_core.identification.moments import (
     plain_moments,
     refuse_unexcited,
 )
-from nlsid_core.identification.monotone_comparators import (
+from nlsid_core.identification.monotone import (
+    identify_from_repeats,
     least_squares_equation,
     minimise_monotone_simulation_error,
 )
-from nlsid_core.identification.regression import LinearClass, build_regression
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
-from nlsid_core.identification.simulation_error import minimise_simulation_error
 from nlsid_core.identification.stability import prove_stability
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
@@ -64,7 +65,6 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
 )
-from nlsid_core.trajectory import Dataset
 
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
@@ -75,18 +75,18 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     """Difference equations of one input and one output."""
     regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
-    trail.add(LEAST_SQUARES, lambda: least_squares(regression))
+    trail.add(LeastSquares, lambda _: least_squares(regression))
     trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p))
-    trail.add(SEM, lambda: minimise_simulation_error(regression, least_squares(regression)))
+    trail.add(Sem, lambda _: minimise_simulation_error(regression, least_squares(regression)))
 
-    def last_step() -> DifferenceEquation:
-        *_, last = robust_simulation_error(regression.rows, iterations=task.iterations)
+    def last_step(method: CertifiedSem) -> DifferenceEquation:
+        *_, last = robust_simulation_error(regression.rows, iterations=method.iterations)
         start = regression.model(last.theta, last.p)
         if prove_stability(start) is None:
             raise Infeasible("the robust simulation error found no stable model to start from")
         return minimise_simulation_error(regression, start, stable=True)
 
-    trail.add(CERTIFIED_SEM, last_step)
+    trail.add(CertifiedSem, last_step)
     return trail
 
 
@@ -95,20 +95,20 @@ def state_affine(
 ) -> Trail[StateAffineModel]:
     """State-affine models, of several inputs and outputs."""
     problem = build_state_affine_rows(train, model_class)
-    trail: Trail[StateAffineModel] = Trail(task, prove_state_affine, BOUND)
-    trail.add(LEAST_SQUARES, lambda: state_affine_equation_error(problem))
-    trail.add(RIE, lambda: robust_identification_error(problem)[0])
+    trail: Trail[StateAffineModel] = Trail(task, prove_stability, BOUND)
+    trail.add(LeastSquares, lambda _: state_affine_equation_error(problem))
+    trail.add(Rie, lambda _: robust_identification_error(problem)[0])
     trail.follow(problem.rows, lambda i: problem.model(i.theta, i.p))
-    trail.add(CERTIFIED, lambda: _certified(problem, trail))
+    trail.add(CertifiedRse, lambda method: _certified(problem, trail, method))
 
-    def last_step() -> StateAffineModel:
-        start = _certified(problem, trail)
-        proof = prove_state_affine(start)
+    def last_step(method: CertifiedSem) -> StateAffineModel:
+        start = _certified(problem, trail, method)
+        proof = prove_stability(start)
         if proof is None:
             raise Infeasible("no proof for the last certified iterate, where the last step starts")
         return descend_certified(problem, start, proof)
 
-    trail.add(CERTIFIED_SEM, last_step)
+    trail.add(CertifiedSem, last_step)
     return trail
 
 
@@ -126,18 +126,17 @@ def block_cascade(
         task, lambda _: None, f"validation error, rms [{_unit(train)}]"
     )
 
-    def search() -> tuple[BlockCascade, Proof]:
+    def search(_: Sem) -> tuple[BlockCascade, Proof]:
         found = identify_block_cascade(
-            train, validation, model_class,
-            transient=task.transient, rng=task.rng, progress=task.progress,
-        )  # fmt: skip
+            train, validation, model_class, transient=task.transient, progress=task.progress
+        )
         *choices, last = found.choices
         steps = [Step(str(choice), choice.validation_rms) for choice in choices]
         steps.append(Step(f"{last}, minimised further", last.validation_rms))
         trail.history = History(trail.history.value, tuple(steps))
         return found.model, found.proof
 
-    trail.add_proved(SEM, search)
+    trail.add_proved(Sem, search)
     return trail
 
 
@@ -153,15 +152,14 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
         f"mean squared simulation error by the moments, at most [{_unit(train)}²]",
     )
 
-    def solved(method: str, fit: MomentFit) -> tuple[MonotoneEquation, Proof]:
-        if method == task.method:
-            trail.history = History(trail.history.value, (Step(method, fit.bound),))
+    def solved(method: Method, fit: MomentFit) -> tuple[MonotoneEquation, Proof]:
+        trail.solved(method, fit.bound)
         return fit.model, fit.proof
 
-    def without_bias() -> MomentFit:
+    def without_bias(method: MomentRie) -> MomentFit:
         return identify_from_repeats(
             train, model_class, transient=task.transient, executor=task.executor,
-            accept_untested_repeats=task.accept_untested_repeats,
+            accept_untested_repeats=method.accept_untested_repeats,
         )  # fmt: skip
 
     def biased() -> MomentFit:
@@ -170,12 +168,12 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     def equation_error() -> MonotoneEquation:
         return least_squares_equation(plain, model_class, template, offsets)
 
-    trail.add(LEAST_SQUARES, equation_error)
-    trail.add_proved(RIE, lambda: solved(RIE, biased()))
-    if train.repeats() or task.method == UNBIASED_RIE:
-        trail.add_proved(UNBIASED_RIE, lambda: solved(UNBIASED_RIE, without_bias()))
+    trail.add(LeastSquares, lambda _: equation_error())
+    trail.add_proved(Rie, lambda method: solved(method, biased()))
+    if train.repeats() or isinstance(task.method, MomentRie):
+        trail.add_proved(MomentRie, lambda method: solved(method, without_bias(method)))
     starts = (equation_error, lambda: biased().model)
-    trail.add(SEM, lambda: _best_minimum(starts, train))
+    trail.add(Sem, lambda _: _best_minimum(starts, train))
     return trail
 
 
@@ -203,14 +201,13 @@ def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[Im
         "mean squared simulation error in squared spreads of the outputs, at most",
     )
 
-    def search() -> tuple[ImplicitModel, Proof]:
+    def search(method: Rie) -> tuple[ImplicitModel, Proof]:
         found = minimise_implicit_rie(rows)
-        if task.method == RIE:
-            trail.history = History(trail.history.value, (Step(RIE, found.bound),))
+        trail.solved(method, found.bound)
         return found.model, found.proof
 
-    trail.add(LEAST_SQUARES, lambda: implicit_equation_error(rows))
-    trail.add_proved(RIE, search)
+    trail.add(LeastSquares, lambda _: implicit_equation_error(rows))
+    trail.add_proved(Rie, search)
     return trail
 
 
@@ -218,11 +215,11 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
     """Linear models of measured states, least squares over all stable ones."""
     trail: Trail[ImplicitModel] = Trail(task, lambda _: None, "equation error")
 
-    def search() -> tuple[ImplicitModel, Proof]:
+    def search(_: LeastSquares) -> tuple[ImplicitModel, Proof]:
         found = identify_linear_states(train)
         return found.model, found.proof
 
-    trail.add_proved(LEAST_SQUARES, search)
+    trail.add_proved(LeastSquares, search)
     return trail
 
 
@@ -231,31 +228,30 @@ class Offer:
     """The methods of a class, the default first, and those that run beside what is asked for."""
 
     search: Callable[[Dataset, Any, Task], Trail[Any]]
-    methods: tuple[str, ...]
-    comparators: tuple[str, ...]
+    methods: tuple[type[Method], ...]
+    comparators: tuple[type[Method], ...]
 
 
 OFFERS: dict[type, Offer] = {
     LinearClass: Offer(
-        linear, ("rse", "least_squares", "rse_first", "sem", "sem_certified"),
-        (LEAST_SQUARES, FIRST, FINAL, SEM),
+        linear, (Rse, LeastSquares, FirstRse, Sem, CertifiedSem), (LeastSquares, FirstRse, Rse, Sem)
     ),
     StateAffineClass: Offer(
         state_affine,
-        ("rse", "least_squares", "rie", "rse_first", "rse_certified", "sem_certified"),
-        (LEAST_SQUARES, RIE, FIRST, FINAL),
+        (Rse, LeastSquares, Rie, FirstRse, CertifiedRse, CertifiedSem),
+        (LeastSquares, Rie, FirstRse, Rse),
     ),
-    BlockCascadeClass: Offer(block_cascade, ("sem",), ()),
+    BlockCascadeClass: Offer(block_cascade, (Sem,), ()),
     MonotoneClass: Offer(
-        monotone, ("moment_rie", "rie", "least_squares", "sem"), (LEAST_SQUARES, RIE, UNBIASED_RIE)
+        monotone, (MomentRie, Rie, LeastSquares, Sem), (LeastSquares, Rie, MomentRie)
     ),
-    ImplicitClass: Offer(implicit, ("rie", "least_squares"), (LEAST_SQUARES, RIE)),
-    LinearStateClass: Offer(linear_states, ("least_squares",), ()),
-}  # fmt: skip
+    ImplicitClass: Offer(implicit, (Rie, LeastSquares), (LeastSquares, Rie)),
+    LinearStateClass: Offer(linear_states, (LeastSquares,), ()),
+}
 
 
-def methods_of(model_class: object) -> tuple[str, ...]:
-    """The methods (keys of METHODS) for models of this class, the default first.
+def methods_of(model_class: object) -> tuple[type[Method], ...]:
+    """The methods for models of this class, the default first.
 
     Raises DataError if it is no model class.
     """
@@ -263,11 +259,11 @@ def methods_of(model_class: object) -> tuple[str, ...]:
     if offer is None:
         names = ", ".join(known.__name__ for known in OFFERS)
         raise DataError(f"{model_class!r} is no model class; there are: {names}")
-    refused: set[str] = set()
+    refused: tuple[type[Method], ...] = ()
     if isinstance(model_class, StateAffineClass):
         most = CERTIFIABLE_AFFINE if model_class.lagged_degree else CERTIFIABLE_DEGREE
         if max(model_class.lagged_degree, model_class.leading_degree) > most:
-            refused = {"rse_certified", "sem_certified"}
+            refused = (CertifiedRse, CertifiedSem)
     return tuple(method for method in offer.methods if method not in refused)
 
 
@@ -283,18 +279,17 @@ def state_affine_equation_error(problem: StateAffineRows) -> StateAffineModel:
     return problem.model(theta, found[int(free.sum()) :])
 
 
-def _certified(problem: StateAffineRows, trail: Trail[StateAffineModel]) -> StateAffineModel:
+def _certified(
+    problem: StateAffineRows, trail: Trail[StateAffineModel], method: CertifiedRse | CertifiedSem
+) -> StateAffineModel:
     steps: list[Step] = []
-    for iterate in certified_simulation_error(problem, iterations=trail.task.iterations):
+    for iterate in certified_simulation_error(problem, iterations=method.iterations):
         steps.append(Step(f"certified iterate {len(steps) + 1}", iterate.J))
         last = iterate
-    if trail.task.method in (CERTIFIED, CERTIFIED_SEM):
+    if isinstance(trail.task.method, CertifiedRse | CertifiedSem):
         trail.history = History(trail.history.value, tuple(steps))
     return problem.model(last.point.theta, last.point.p)
 
 
 def _unit(train: Dataset) -> str:
     return train.trajectories[0].y_units[0]
-
-
-assert {method for offer in OFFERS.values() for method in offer.methods} == set(METHODS)

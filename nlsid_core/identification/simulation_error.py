@@ -14,23 +14,17 @@ import numpy as np
 from scipy.linalg import LinAlgError, cholesky_banded
 from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.banded import (
     Diagonals,
+    Rows,
     diagonals_of,
     lower_band,
     product,
     shift,
     times,
 )
-from nlsid_core.identification.bound import Point, Root, project
-from nlsid_core.identification.newton import Descent
-from nlsid_core.identification.regression import Regression
-from nlsid_core.identification.rows import Rows
-from nlsid_core.identification.stability import prove_stability
-from nlsid_core.models import DifferenceEquation
-
-SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
+from nlsid_core.identification.newton import Point, Root, project
 
 
 class SimulationError:
@@ -115,24 +109,3 @@ class Band:
         if info != 0:
             raise LinAlgError(f"triangular solve failed ({info})")
         return np.asarray(found.reshape(B.shape, order="F"))
-
-
-def minimise_simulation_error(
-    regression: Regression, start: DifferenceEquation, *, stable: bool = False
-) -> DifferenceEquation:
-    """A local minimum of Σ (y - ŷ)² from `start`'s lagged coefficients, never above it.
-
-    stable: search among stable models only, for a `start` that has a proof; the result has one
-    too, or is `start` itself. Otherwise nothing keeps the model stable.
-    """
-    inside = _is_stable if stable else None
-    theta = np.concatenate([[1.0], -start.a])
-    objective = SimulationError(regression.rows, inside=inside)
-    point = Descent(objective, (), len(theta)).to_minimum(theta).point
-    found = regression.model(point.theta, point.p)
-    return start if stable and prove_stability(found) is None else found
-
-
-def _is_stable(theta: FloatArray) -> bool:
-    """Every pole of g_0 y(t) + … + g_n y(t-n) is inside the unit circle, with room for a proof."""
-    return bool(theta[0] and (abs(np.roots(theta)) < SLOWEST_POLE).all())

@@ -1,6 +1,6 @@
 """Convex sets of stable models: each a constraint on the model and its certificate jointly.
 
-The conditions of `certificate.conditions` with unknowns in the model's polynomials and in the
+The conditions of `identification.conditions` with unknowns in the model's polynomials and in the
 storage, as constraints of a `sos.Program` with the objective. A domain (polynomials ≥ 0, also in
 the inputs) makes a condition local by the S-procedure. Variables of the second solution's gap are
 named with "~". Source: thesis Chapter 2; the lemma is named at each function.
@@ -9,9 +9,9 @@ named with "~". Source: thesis Chapter 2; the lemma is named at each function.
 from collections.abc import Sequence
 from dataclasses import replace
 
-from nlsid_core.certificate import conditions
-from nlsid_core.certificate.conditions import Domain, Inequality, Polynomials
 from nlsid_core.errors import ShapeError
+from nlsid_core.identification import conditions
+from nlsid_core.identification.conditions import Domain, Inequality, Polynomials
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.sos import SumOfSquares, matrix_sum_of_squares
 

@@ -4,32 +4,36 @@ Source: thesis (4.1)-(4.3).
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.identification.rows import Rows
+from nlsid_core.identification.banded import Rows
+from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.regressors import lagged, signal_scale
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.state_affine import OutOfRange
+from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
-from nlsid_core.trajectory import Dataset, Trajectory
 
-CONSTANT = 1e-10  # relative spread below which a signal is constant
+HIGHEST_DEGREE = 5  # of a coefficient; its terms grow with that power of the number of inputs
 RANK_TOLERANCE = 1e-13  # relative singular value of unit columns at which a basis repeats itself
 
 
 @dataclass(frozen=True)
 class StateAffineClass:
-    """Which state-affine models: n lags, the input's delays, polynomial degrees in w.
+    """Linear in the outputs, polynomial in the inputs w. Source: thesis (4.1).
 
-    leading_degree: of G_0, lagged_degree: of G_1 … G_n, right_degree: of p. delays: None is 0 … n.
-    u_range: (low, high) of each input, where the model is proved; None is the range in the data.
-    on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
+    lags: n, 1 to 100 samples; delays: of the inputs in w, each 0 … n samples (None: all of them).
+    leading_degree: of G_0 in w, lagged_degree: of G_1 … G_n, right_degree: of p, each 0 to 5.
+    input_range: (low, high) of each input in its unit, where the model is proved (None: the range
+    in the data). on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
     """
 
     lags: int
@@ -37,17 +41,17 @@ class StateAffineClass:
     leading_degree: int = 0
     lagged_degree: int = 0
     right_degree: int = 1
-    u_range: tuple[tuple[float, float], ...] | None = None
+    input_range: tuple[tuple[float, float], ...] | None = None
     on_out_of_range: OutOfRange = "clip"
     kind: ClassVar[type[StateAffineModel]] = StateAffineModel
 
     def __post_init__(self) -> None:
-        if self.lags < 1:
-            raise DataError(f"lags is {self.lags}; a difference equation has at least 1")
-        if min(self.leading_degree, self.lagged_degree, self.right_degree) < 0:
-            raise DataError("degrees should not be negative")
-        if any(not 0 <= d <= self.lags for d in self.delays or ()):
-            raise DataError(f"delays {self.delays} should be between 0 and {self.lags}")
+        require_whole(self, "lags", 1, MOST_LAGS)
+        require_delays(self, "delays", self.lags)
+        for key in ("leading_degree", "lagged_degree", "right_degree"):
+            require_whole(self, key, 0, HIGHEST_DEGREE)
+        require_ranges(self, "input_range")
+        require_one_of(self, "on_out_of_range", get_args(OutOfRange))
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""
@@ -118,15 +122,15 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
     short = [trial for trial in dataset if len(trial) <= n]
     if short:
         raise DataError(f"{short[0].name}: {len(short[0])} samples, {n} lags need more")
-    y_scale = _scale(np.concatenate([trial.y for trial in dataset]), "response")
+    y_scale = signal_scale(np.concatenate([trial.y for trial in dataset]), "response")
     u_all = np.concatenate([trial.u for trial in dataset])
-    u_scale = _scale(u_all, "excitation")
+    u_scale = signal_scale(u_all, "excitation")
     n_y, n_u = len(y_scale[0]), len(u_scale[0])
     window = model_class.window(n_u)
-    Y = np.concatenate([_lagged((t.y - y_scale[0]) / y_scale[1], n) for t in dataset])
+    Y = np.concatenate([lagged((t.y - y_scale[0]) / y_scale[1], n) for t in dataset])
     declared = _declared_range(u_all, model_class)
     clipped = [np.clip(t.u, declared[:, 0], declared[:, 1]) for t in dataset]
-    U = np.concatenate([_lagged((u - u_scale[0]) / u_scale[1], n) for u in clipped])
+    U = np.concatenate([lagged((u - u_scale[0]) / u_scale[1], n) for u in clipped])
     row = np.concatenate([np.arange(len(trial) - n) for trial in dataset])
     w = np.stack([U[:, d, i] for i, d in window], axis=1)
     left = tuple(
@@ -166,11 +170,11 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
 def _declared_range(u: FloatArray, model_class: StateAffineClass) -> FloatArray:
     """(n_u, 2) the class's range of inputs, or that of the data u (N, n_u)."""
     measured = np.column_stack([u.min(axis=0), u.max(axis=0)])
-    if model_class.u_range is None:
+    if model_class.input_range is None:
         return measured
-    declared = np.array(model_class.u_range, dtype=np.float64)
+    declared = np.array(model_class.input_range, dtype=np.float64)
     if declared.shape != measured.shape:
-        raise DataError(f"u_range has {len(declared)} inputs, the data {len(measured)}")
+        raise DataError(f"input_range has {len(declared)} inputs, the data {len(measured)}")
     beyond = (measured[:, 0] < declared[:, 0]) | (measured[:, 1] > declared[:, 1])
     if model_class.on_out_of_range == "refuse" and beyond.any():
         i = int(np.argmax(beyond))
@@ -208,16 +212,6 @@ def _block(
     return offsets, np.column_stack(weights), np.column_stack(errors)
 
 
-def _scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
-    mean, spread = values.mean(axis=0), values.std(axis=0)
-    for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
-        raise DataError(
-            f"the {role} {i} is constant ({mean[i]:g}) in all trials: nothing can be identified "
-            "from it"
-        )
-    return mean, spread
-
-
 def _refuse_rank(R: FloatArray, lags: int) -> None:
     singular = np.linalg.svd(R / np.linalg.norm(R, axis=0), compute_uv=False)
     rank = int((singular > RANK_TOLERANCE * singular[0]).sum())
@@ -226,12 +220,6 @@ def _refuse_rank(R: FloatArray, lags: int) -> None:
             f"the excitation does not excite {lags} lags: its polynomial basis of {len(R)} has "
             f"rank {rank}; use richer inputs, fewer lags or a lower degree"
         )
-
-
-def _lagged(signal: FloatArray, lags: int) -> FloatArray:
-    """(N - lags, lags + 1, columns): [:, k] holds signal(t - k), t = lags …."""
-    N = len(signal)
-    return np.stack([signal[lags - k : N - k] for k in range(lags + 1)], axis=1)
 
 
 def _signals(trial: Trajectory, letter: str) -> tuple[Signal, ...]:

@@ -14,13 +14,13 @@ from math import comb
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.models import Signal
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.models.trapezoidal import TrapezoidalModel
-from nlsid_core.trajectory import Dataset, Trajectory
 
 LARGEST_GRAM = 60  # order of a Gram matrix in the funnel of the model; beyond it steps take seconds
 USEFUL = 0.97  # a larger model has to bring the error below this part of the smaller one's

@@ -4,20 +4,20 @@ import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-import numpy as np
-
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
-from nlsid_core.identification.fit import FINAL, FIRST, Candidate, History, Proof, Step
+from nlsid_core.identification.banded import Rows
+from nlsid_core.identification.fit import Candidate, History, Proof, Step
+from nlsid_core.identification.methods import FirstRse, Method, Rse
 from nlsid_core.identification.prediction import Model
-from nlsid_core.identification.rows import Rows
 from nlsid_core.identification.rse import Iterate, robust_simulation_error
-from nlsid_core.trajectory import Dataset
 
 Progress = Callable[[str, float], None]
 T = TypeVar("T", bound=Model)
+W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
 
 
@@ -29,19 +29,19 @@ def silent(_what: str, _fraction: float) -> None:
 class Task:
     """method: the one asked for; comparators: what runs beside it. See `identify`."""
 
-    method: str
-    comparators: frozenset[str]
+    method: Method
+    comparators: tuple[Method, ...]
     validation: Dataset | None = None
-    iterations: int = 40
     transient: int = 0
-    accept_untested_repeats: bool = False
-    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
     executor: Executor | None = None
     progress: Progress = silent
 
-    def wants(self, method: str) -> bool:
-        """Whether it is asked for."""
-        return method == self.method or method in self.comparators
+    def wanted(self, kind: type[W]) -> W | None:
+        """The method of this kind that was asked for, with its options; None if none was."""
+        for method in (self.method, *self.comparators):
+            if isinstance(method, kind):
+                return method
+        return None
 
 
 class Trail(Generic[T]):
@@ -52,50 +52,56 @@ class Trail(Generic[T]):
         self.candidates: list[Candidate[T]] = []
         self.history = History(value)
 
-    def add(self, method: str, make: Callable[[], T]) -> None:
-        """Make one candidate, if it is asked for."""
+    def add(self, kind: type[W], make: Callable[[W], T]) -> None:
+        """Make the candidate of this kind of method, if it is asked for."""
 
-        def proved() -> tuple[T, Proof | None]:
-            model = make()
+        def proved(method: W) -> tuple[T, Proof | None]:
+            model = make(method)
             return model, self.prove(model)
 
-        self.add_proved(method, proved)
+        self.add_proved(kind, proved)
 
-    def add_proved(self, method: str, make: Callable[[], tuple[T, Proof | None]]) -> None:
+    def add_proved(self, kind: type[W], make: Callable[[W], tuple[T, Proof | None]]) -> None:
         """The same where the proof comes with the model."""
-        if not self.task.wants(method):
+        method = self.task.wanted(kind)
+        if method is None:
             return
-        self.task.progress(method, 0.1 * len(self.candidates))
+        self.task.progress(method.title, 0.1 * len(self.candidates))
         started = time.perf_counter()
         try:
-            model, proof = make()
+            model, proof = make(method)
         except NlsidError as reason:
-            if method == self.task.method:
+            if method is self.task.method:
                 raise
-            log.warning("no comparison with %s: %s", method, reason)
+            log.warning("no comparison with %s: %s", method.name, reason)
             return
         self._keep(method, model, proof, time.perf_counter() - started)
 
     def follow(self, rows: Rows, model: Callable[[Iterate], T]) -> None:
         """The iterates of the robust simulation error; the first and the last are candidates."""
-        task = self.task
-        if not (task.wants(FIRST) or task.wants(FINAL)):
+        first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
+        if first is None and final is None:
             return
-        iterations = task.iterations if task.wants(FINAL) else 1
+        iterations = 1 if final is None else final.iterations
         steps: list[Step] = []
         started, last = time.perf_counter(), None
         for last in robust_simulation_error(rows, iterations=iterations):
             steps.append(Step(f"iterate {len(steps) + 1}", last.J))
-            if len(steps) == 1 and task.wants(FIRST):
+            if len(steps) == 1 and first is not None:
                 seconds, found = time.perf_counter() - started, model(last)
-                self._keep(FIRST, found, self.prove(found), seconds)
+                self._keep(first, found, self.prove(found), seconds)
             done = 0.2 + 0.4 * len(steps) / iterations
-            task.progress(f"robust simulation error, iterate {len(steps)}", done)
+            self.task.progress(f"robust simulation error, iterate {len(steps)}", done)
         assert last is not None, "there is at least one iterate"
         self.history = History(self.history.value, tuple(steps))
-        if task.wants(FINAL):
+        if final is not None:
             seconds, found = time.perf_counter() - started, model(last)
-            self._keep(FINAL, found, self.prove(found), seconds)
+            self._keep(final, found, self.prove(found), seconds)
 
-    def _keep(self, method: str, model: T, proof: Proof | None, seconds: float) -> None:
+    def solved(self, method: Method, bound: float) -> None:
+        """The history of a fit that one program made, if it is the method asked for."""
+        if method is self.task.method:
+            self.history = History(self.history.value, (Step(method.title, bound),))
+
+    def _keep(self, method: Method, model: T, proof: Proof | None, seconds: float) -> None:
         self.candidates.append(Candidate(method, model, proof, seconds, self.task.transient))

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import (
     Model,
@@ -23,7 +24,6 @@ from nlsid_core.identification.prediction import (
     predict,
     simulate_trial,
 )
-from nlsid_core.trajectory import Dataset, Trajectory
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99

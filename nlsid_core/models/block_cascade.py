@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 from nlsid_core.models.spline import Spline
 
 KIND = "block_cascade"
@@ -121,7 +121,7 @@ class BlockCascade:
         """The JSON form; every number round-trips exactly."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "kind": KIND,
             "period": self.period,
             "y": self.y.document(),
@@ -138,24 +138,24 @@ class BlockCascade:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "BlockCascade":
         """Raises DocumentError if the document is not a block cascade."""
-        _json.header(document, FORMAT, VERSION, source=source)
-        kind = _json.member(document, "kind", str, source=source)
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
-        bags = _json.member(document, "bags", list, source=source)
+        bags = files.member(document, "bags", list, source=source)
         return cls(
-            a1=_json.array(document, "a1", (None,), source=source),
-            b1=_json.array(document, "b1", (None, None), source=source),
+            a1=files.array(document, "a1", (None,), source=source),
+            b1=files.array(document, "b1", (None, None), source=source),
             f=Spline.from_document(
-                _json.member(document, "f", dict, source=source), source=f"{source} f"
+                files.member(document, "f", dict, source=source), source=f"{source} f"
             ),
-            a2=_json.array(document, "a2", (None,), source=source),
-            b2=_json.array(document, "b2", (None, None), source=source),
-            period=_json.number(document, "period", source=source),
-            y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
-            u=Signal.from_document(_json.member(document, "u", dict, source=source), source=source),
-            training=_json.member(document, "training", str, source=source),
-            bags=tuple(_json.named_digests(bags, source=source)),
+            a2=files.array(document, "a2", (None,), source=source),
+            b2=files.array(document, "b2", (None, None), source=source),
+            period=files.number(document, "period", source=source),
+            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
+            u=Signal.from_document(files.member(document, "u", dict, source=source), source=source),
+            training=files.member(document, "training", str, source=source),
+            bags=tuple(files.named_digests(bags, source=source)),
         )
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 
 KIND = "difference_equation"
 
@@ -127,7 +127,7 @@ class DifferenceEquation:
         """The JSON form; every number round-trips exactly."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "kind": KIND,
             "equation": "y(t) = sum a[k-1] y(t-k) + sum b[j] u(t-j) + c",
             "period": self.period,
@@ -144,21 +144,21 @@ class DifferenceEquation:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "DifferenceEquation":
         """Raises DocumentError if the document is not a difference equation."""
-        _json.header(document, FORMAT, VERSION, source=source)
-        kind = _json.member(document, "kind", str, source=source)
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
-        a = _json.array(document, "a", (None,), source=source)
-        lo, hi = _json.array(document, "u_range", (2,), source=source)
-        bags = _json.member(document, "bags", list, source=source)
+        a = files.array(document, "a", (None,), source=source)
+        lo, hi = files.array(document, "u_range", (2,), source=source)
+        bags = files.member(document, "bags", list, source=source)
         return cls(
             a=a,
-            b=_json.array(document, "b", (len(a) + 1,), source=source),
-            c=_json.number(document, "c", source=source),
-            period=_json.number(document, "period", source=source),
-            y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
-            u=Signal.from_document(_json.member(document, "u", dict, source=source), source=source),
+            b=files.array(document, "b", (len(a) + 1,), source=source),
+            c=files.number(document, "c", source=source),
+            period=files.number(document, "period", source=source),
+            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
+            u=Signal.from_document(files.member(document, "u", dict, source=source), source=source),
             u_range=(float(lo), float(hi)),
-            training=_json.member(document, "training", str, source=source),
-            bags=tuple(_json.named_digests(bags, source=source)),
+            training=files.member(document, "training", str, source=source),
+            bags=tuple(files.named_digests(bags, source=source)),
         )

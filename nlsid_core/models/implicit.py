@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
 from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 
 KIND = "implicit"
 DIVERGED = 1e30  # a state whose powers would overflow
@@ -253,7 +253,7 @@ class ImplicitModel:
         """The JSON form; every number round-trips exactly."""
         document: Json = {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "kind": KIND,
             "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]",
             "period": self.period,
@@ -279,30 +279,30 @@ class ImplicitModel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "ImplicitModel":
         """Raises DocumentError if the document is not an implicit model."""
-        _json.header(document, FORMAT, VERSION, source=source)
-        kind = _json.member(document, "kind", str, source=source)
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
         states, inputs = (
-            _json.member(document, key, list, source=source) for key in ("states", "inputs")
+            files.member(document, key, list, source=source) for key in ("states", "inputs")
         )
         if not all(isinstance(name, str) for name in (*states, *inputs)):
             raise DocumentError(f"{source}: states and inputs should be names")
         n, m = len(states), len(inputs)
-        left = _json.member(document, "h", dict, source=source)
-        n_v = _json.array(left, "coefficients", (None, None), source=f"{source} h").shape[1]
+        left = files.member(document, "h", dict, source=source)
+        n_v = files.array(left, "coefficients", (None, None), source=f"{source} h").shape[1]
         if not 0 < n_v <= n:
             raise DocumentError(f"{source}: h should hold 1 to {n} polynomials, holds {n_v}")
 
         def part(key: str, variables: int, size: int) -> Polynomials:
-            member = _json.member(document, key, dict, source=source)
+            member = files.member(document, key, dict, source=source)
             return Polynomials.from_document(member, variables, (size,), source=f"{source} {key}")
 
         return cls(
             h=part("h", n_v + n + m, n_v),
             shift=part("shift", n + m, n - n_v) if n_v < n else _nothing(n + m),
-            monotonicity=_json.number(document, "monotonicity", source=source),
-            period=_json.number(document, "period", source=source),
+            monotonicity=files.number(document, "monotonicity", source=source),
+            period=files.number(document, "period", source=source),
             states=tuple(states),
             inputs=tuple(inputs),
             centre=part("centre", n_v, n_v) if "centre" in document else None,
@@ -312,21 +312,21 @@ class ImplicitModel:
 
 def _recorded(document: Json, source: str) -> dict[str, Any]:
     """The members of a model of recorded signals."""
-    signals = {key: _json.member(document, key, list, source=source) for key in ("y", "u")}
-    window = _json.array(document, "window", (None, 2), source=source)
+    signals = {key: files.member(document, key, list, source=source) for key in ("y", "u")}
+    window = files.array(document, "window", (None, 2), source=source)
     if (
         not all(isinstance(s, dict) for part in signals.values() for s in part)
         or (window % 1.0).any()
     ):
         raise DocumentError(f"{source}: 'y', 'u' should hold objects, 'window' integers")
-    bags = _json.member(document, "bags", list, source=source)
+    bags = files.member(document, "bags", list, source=source)
     return {
         key: tuple(Signal.from_document(s, source=source) for s in part)
         for key, part in signals.items()
     } | {
         "window": tuple((int(i), int(d)) for i, d in window),
-        "training": _json.member(document, "training", str, source=source),
-        "bags": tuple(_json.named_digests(bags, source=source)),
+        "training": files.member(document, "training", str, source=source),
+        "bags": tuple(files.named_digests(bags, source=source)),
     }
 
 

@@ -2,7 +2,7 @@
 
 from typing import TypeAlias
 
-from nlsid_core._types import Json
+from nlsid_core.arrays import Json
 from nlsid_core.models import trapezoidal
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.models.trapezoidal import TrapezoidalModel

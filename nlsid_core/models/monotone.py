@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import SolverError
 
 RESIDUAL = 1e-12  # of c(v) relative to its size: a few units of rounding

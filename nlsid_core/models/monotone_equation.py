@@ -12,10 +12,10 @@ from fractions import Fraction
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 
 KIND = "monotone_equation"
 NEWTON_STEPS = 100  # far from the solution a cubic takes a third off the distance a step
@@ -110,7 +110,7 @@ class MonotoneEquation:
         """The JSON form; every number round-trips exactly."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "kind": KIND,
             "period": self.period,
             "y": self.y.document(),
@@ -129,28 +129,28 @@ class MonotoneEquation:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "MonotoneEquation":
         """Raises DocumentError if the document is not a monotone equation."""
-        _json.header(document, FORMAT, VERSION, source=source)
-        kind = _json.member(document, "kind", str, source=source)
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
-        signals = _json.member(document, "u", list, source=source)
-        window = _json.array(document, "window", (None, 2), source=source)
+        signals = files.member(document, "u", list, source=source)
+        window = files.array(document, "window", (None, 2), source=source)
         if not all(isinstance(signal, dict) for signal in signals) or (window % 1.0).any():
             raise DocumentError(f"{source}: 'u' should hold objects, 'window' integers")
-        bags = _json.member(document, "bags", list, source=source)
+        bags = files.member(document, "bags", list, source=source)
         return cls(
-            e=_json.array(document, "e", (3,), source=source),
-            a=_json.array(document, "a", (None,), source=source),
-            b=_json.array(document, "b", (len(window),), source=source),
-            c=_json.number(document, "c", source=source),
+            e=files.array(document, "e", (3,), source=source),
+            a=files.array(document, "a", (None,), source=source),
+            b=files.array(document, "b", (len(window),), source=source),
+            c=files.number(document, "c", source=source),
             window=tuple((int(i), int(d)) for i, d in window),
-            y_offset=_json.number(document, "y_offset", source=source),
-            u_offset=_json.array(document, "u_offset", (len(signals),), source=source),
-            period=_json.number(document, "period", source=source),
-            y=Signal.from_document(_json.member(document, "y", dict, source=source), source=source),
+            y_offset=files.number(document, "y_offset", source=source),
+            u_offset=files.array(document, "u_offset", (len(signals),), source=source),
+            period=files.number(document, "period", source=source),
+            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
             u=tuple(Signal.from_document(signal, source=source) for signal in signals),
-            training=_json.member(document, "training", str, source=source),
-            bags=tuple(_json.named_digests(bags, source=source)),
+            training=files.member(document, "training", str, source=source),
+            bags=tuple(files.named_digests(bags, source=source)),
         )
 
 

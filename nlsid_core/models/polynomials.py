@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import FloatArray, IntArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.polynomial.values import monomial_values
 
@@ -58,10 +58,10 @@ class Polynomials:
         cls, document: Json, variables: int, shape: tuple[int, ...], *, source: str
     ) -> "Polynomials":
         """Raises DocumentError if parts are missing or do not fit."""
-        exponents = _json.array(document, "exponents", (None, variables), source=source)
+        exponents = files.array(document, "exponents", (None, variables), source=source)
         if (exponents % 1.0).any() or (abs(exponents) > MAX_DEGREE).any():
             raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
-        coefficients = _json.array(
+        coefficients = files.array(
             document, "coefficients", (len(exponents), *shape), source=source
         )
         return cls(exponents.astype(np.int64), coefficients)

@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 
-from nlsid_core import _json
-from nlsid_core._types import Json
+from nlsid_core import files
+from nlsid_core.arrays import Json
 
 FORMAT = "nlsid/model"
-VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -25,5 +24,5 @@ class Signal:
     def from_document(cls, document: Json, *, source: str) -> "Signal":
         """Raises DocumentError if a part is missing."""
         return cls(
-            *(_json.member(document, key, str, source=source) for key in ("name", "unit", "path"))
+            *(files.member(document, key, str, source=source) for key in ("name", "unit", "path"))
         )

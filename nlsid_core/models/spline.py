@@ -13,8 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core import _json
-from nlsid_core._types import FloatArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 
 # Coefficients of 1, s, s², s³ in the four uniform cubic B-splines, times 6.
@@ -107,7 +107,7 @@ class Spline:
         if strangers:
             raise DocumentError(f"{source}: unknown member '{min(strangers)}'")
         return cls(
-            low=_json.number(document, "low", source=source),
-            spacing=_json.number(document, "spacing", source=source),
-            coefficients=_json.array(document, "coefficients", (None,), source=source),
+            low=files.number(document, "low", source=source),
+            spacing=files.number(document, "spacing", source=source),
+            coefficients=files.array(document, "coefficients", (None,), source=source),
         )

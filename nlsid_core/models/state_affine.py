@@ -13,11 +13,11 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 
 KIND = "state_affine"
 OutOfRange = Literal["clip", "refuse"]
@@ -164,7 +164,7 @@ class StateAffineModel:
         """The JSON form; every number round-trips exactly."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": files.VERSION,
             "kind": KIND,
             "equation": "0 = sum G[k](w) ybar(t-k) + p(w), ybar = (y - y_offset)/y_scale",
             "period": self.period,
@@ -186,37 +186,37 @@ class StateAffineModel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "StateAffineModel":
         """Raises DocumentError if the document is not a state-affine model."""
-        _json.header(document, FORMAT, VERSION, source=source)
-        kind = _json.member(document, "kind", str, source=source)
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
         y, u = (_signals(document, key, source) for key in ("y", "u"))
-        window = _json.array(document, "window", (None, 2), source=source)
+        window = files.array(document, "window", (None, 2), source=source)
         if (window % 1.0).any():
             raise DocumentError(f"{source}: window should hold integers")
         n_w, n_y = len(window), len(y)
-        left = _objects(_json.member(document, "G", list, source=source), source)
-        right = _json.member(document, "p", dict, source=source)
-        bags = _json.member(document, "bags", list, source=source)
+        left = _objects(files.member(document, "G", list, source=source), source)
+        right = files.member(document, "p", dict, source=source)
+        bags = files.member(document, "bags", list, source=source)
         return cls(
             G=tuple(
                 Polynomials.from_document(g, n_w, (n_y, n_y), source=f"{source} G") for g in left
             ),
             p=Polynomials.from_document(right, n_w, (n_y,), source=f"{source} p"),
             window=tuple((int(i), int(d)) for i, d in window),
-            y_offset=_json.array(document, "y_offset", (n_y,), source=source),
-            y_scale=_json.array(document, "y_scale", (n_y,), source=source),
-            u_offset=_json.array(document, "u_offset", (len(u),), source=source),
-            u_scale=_json.array(document, "u_scale", (len(u),), source=source),
-            u_range=_json.array(document, "u_range", (len(u), 2), source=source),
-            period=_json.number(document, "period", source=source),
+            y_offset=files.array(document, "y_offset", (n_y,), source=source),
+            y_scale=files.array(document, "y_scale", (n_y,), source=source),
+            u_offset=files.array(document, "u_offset", (len(u),), source=source),
+            u_scale=files.array(document, "u_scale", (len(u),), source=source),
+            u_range=files.array(document, "u_range", (len(u), 2), source=source),
+            period=files.number(document, "period", source=source),
             y=y,
             u=u,
             on_out_of_range=cast(
-                OutOfRange, _json.member(document, "on_out_of_range", str, source=source)
+                OutOfRange, files.member(document, "on_out_of_range", str, source=source)
             ),
-            training=_json.member(document, "training", str, source=source),
-            bags=tuple(_json.named_digests(bags, source=source)),
+            training=files.member(document, "training", str, source=source),
+            bags=tuple(files.named_digests(bags, source=source)),
         )
 
 
@@ -238,5 +238,5 @@ def _objects(entries: list[object], source: str) -> list[Json]:
 
 
 def _signals(document: Json, key: str, source: str) -> tuple[Signal, ...]:
-    entries = _objects(_json.member(document, key, list, source=source), source)
+    entries = _objects(files.member(document, key, list, source=source), source)
     return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

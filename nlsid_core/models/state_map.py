@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core import _json
-from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, VERSION, Signal
+from nlsid_core.models.signal import FORMAT, Signal
 from nlsid_core.polynomial import Polynomial
 
 KIND = "state_map"
@@ -140,7 +140,7 @@ def write_fields(model: Any, kind: str, equation: str) -> Json:
     """The JSON form of a model with these fields."""
     return {
         "format": FORMAT,
-        "version": VERSION,
+        "version": files.VERSION,
         "kind": kind,
         "equation": equation,
         "period": model.period,
@@ -158,15 +158,15 @@ def write_fields(model: Any, kind: str, equation: str) -> Json:
 
 def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]:
     """The fields of a model of kind `expected`; DocumentError says what is wrong."""
-    _json.header(document, FORMAT, VERSION, source=source)
-    kind = _json.member(document, "kind", str, source=source)
+    files.header(document, FORMAT, source=source)
+    kind = files.member(document, "kind", str, source=source)
     if kind != expected:
         raise DocumentError(f"{source}: kind is '{kind}', expected '{expected}'")
     x, u = (_signals(document, key, source) for key in ("x", "u"))
-    exponents = _json.array(document, "exponents", (None, len(x) + len(u)), source=source)
+    exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
     if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():
         raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
-    bags = _json.member(document, "bags", list, source=source)
+    bags = files.member(document, "bags", list, source=source)
     sizes: dict[str, tuple[int | None, ...]] = {
         "coefficients": (len(exponents), None),
         "x_range": (len(x), 2),
@@ -174,19 +174,19 @@ def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]
         "noise": (len(x),),
         "disturbance": (len(x),),
     }
-    arrays = {key: _json.array(document, key, s, source=source) for key, s in sizes.items()}
+    arrays = {key: files.array(document, key, s, source=source) for key, s in sizes.items()}
     return {
         "exponents": exponents.astype(np.int64),
-        "period": _json.number(document, "period", source=source),
+        "period": files.number(document, "period", source=source),
         "x": x,
         "u": u,
-        "bags": tuple(_json.named_digests(bags, source=source)),
+        "bags": tuple(files.named_digests(bags, source=source)),
         **arrays,
     }
 
 
 def _signals(document: Json, key: str, source: str) -> tuple[Signal, ...]:
-    entries = _json.member(document, key, list, source=source)
+    entries = files.member(document, key, list, source=source)
     if not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DocumentError(f"{source}: '{key}' should list at least one signal")
     return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

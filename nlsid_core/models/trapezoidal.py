@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import ShapeError, SolverError
 from nlsid_core.models.signal import Signal
 from nlsid_core.models.state_map import read_fields, settle, write_fields

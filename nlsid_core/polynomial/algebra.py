@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
 from nlsid_core.polynomial.operations import OPERATORS, REFUSED
 from nlsid_core.polynomial.values import monomial_values

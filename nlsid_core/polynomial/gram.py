@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial.algebra import Polynomial
 

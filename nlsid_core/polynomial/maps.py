@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core._types import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import NotPolynomial, ShapeError
 from nlsid_core.polynomial.algebra import (
     Polynomial,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 
 
 def monomial_values(exponents: IntArray, points: FloatArray) -> FloatArray:

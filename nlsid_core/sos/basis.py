@@ -5,7 +5,7 @@ Source: Löfberg, "Pre- and post-processing sum-of-squares programs in practice"
 
 import numpy as np
 
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.polynomial import monomials
 
 

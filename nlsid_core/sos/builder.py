@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from nlsid_core import conic
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeSolution
 from nlsid_core.errors import DataError
 from nlsid_core.polynomial import Polynomial

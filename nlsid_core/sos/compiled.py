@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from nlsid_core import conic
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.conic import ConeProgram
 from nlsid_core.errors import DataError
 from nlsid_core.sos.builder import Builder, Layout, Values

@@ -14,10 +14,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from nlsid_core import conic
-from nlsid_core._types import FloatArray, IntArray
-from nlsid_core.certificate import decide_gram
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.errors import CertificateRejected, Infeasible
+from nlsid_core.errors import Infeasible
+from nlsid_core.kernel import Rejected
+from nlsid_core.kernel.exact import semidefinite
 from nlsid_core.polynomial import Gram, Polynomial
 from nlsid_core.sos.basis import gram_basis
 
@@ -57,8 +58,8 @@ def exact_gram(
         Q = _congruence(corrected, N)
         gram = Gram(basis, np.array(Q, dtype=object), p.names)
         try:
-            decide_gram(gram, strict=False)
-        except CertificateRejected:
+            semidefinite(Q, "the Gram matrix")
+        except Rejected:
             continue
         return gram
     raise Infeasible("no rational Gram matrix near the numerical one is positive semidefinite")

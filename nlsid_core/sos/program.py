@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import ConeSolution
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial import Gram, Polynomial
@@ -102,7 +102,7 @@ class Program:
 class Identity:
     """What a solved `SumOfSquares` says: p = gram + Σ multipliers·domain + Σ free·equalities.
 
-    Up to solver tolerance: `nlsid_core.certificate` decides whether it proves anything.
+    Up to solver tolerance: the kernel decides whether it proves anything.
     """
 
     p: Polynomial

@@ -6,7 +6,7 @@ remainder: p ≡ q on {g = 0} follows from equal remainders.
 
 import numpy as np
 
-from nlsid_core._types import IntArray
+from nlsid_core.arrays import IntArray
 from nlsid_core.errors import DataError
 from nlsid_core.polynomial import Polynomial
 

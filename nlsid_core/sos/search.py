@@ -2,7 +2,7 @@
 
 A solver's answer sits at the boundary of what is true, where rounding decides. So each search
 solves twice: for the optimum, then for an interior point a little below it, and returns only what
-`certificate` proves exactly.
+the kernel proves.
 """
 
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core import certificate
-from nlsid_core._types import Json
-from nlsid_core.certificate.documents import attraction_document, bound_document
+from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateRejected, Infeasible
 from nlsid_core.polynomial import Gram, Polynomial, monomials, variables
+from nlsid_core.proofs import decide
 from nlsid_core.sos.compiled import solve
 from nlsid_core.sos.program import Identity, Program, SumOfSquares, template
+from nlsid_core.sos.proofs import attraction_document, bound_document
 
 # Steps below the optimum, relative to 1 + |optimum|: the solver's tolerance is 1e-8.
 BACK_OFF = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
@@ -65,28 +65,19 @@ def lower_bound(
     for step in BACK_OFF:
         value = optimum - step * (1 + abs(optimum))
         identity = solve(program(value, None))["p"]
-        multipliers = tuple(positive_semidefinite(gram) for gram in identity.multipliers)
         try:
-            certificate.prove_lower_bound(
+            document = bound_document(
                 p,
                 value,
                 identity.gram,
                 domain=domain,
-                multipliers=multipliers,
+                multipliers=identity.multipliers,
                 equalities=equalities,
                 equality_multipliers=identity.equality_multipliers,
             )
-        except CertificateRejected:
+            decide(document, {})
+        except (CertificateRejected, Infeasible):
             continue
-        document = bound_document(
-            p,
-            value,
-            identity.gram,
-            domain=domain,
-            multipliers=multipliers,
-            equalities=equalities,
-            equality_multipliers=identity.equality_multipliers,
-        )
         return Bound(value, optimum, document)
     raise Infeasible(
         f"the bound {optimum:.9g} was found but none within {BACK_OFF[-1]:g} of it was proved; "
@@ -180,14 +171,12 @@ def _proved(
     decrease: Identity,
 ) -> Attraction:
     shape = solve(Program(V.names, (SumOfSquares(V, name="V"),)))["V"].gram
-    multiplier = positive_semidefinite(decrease.multipliers[0]) if decrease.multipliers else None
+    multiplier = decrease.multipliers[0] if decrease.multipliers else None
     try:
-        certificate.prove_attraction(
-            field, V, level, positive=shape, decrease=decrease.gram, multiplier=multiplier
+        document = attraction_document(
+            field, V, level, positive=shape, decrease=decrease.gram, multiplier_gram=multiplier
         )
+        decide(document, {})
     except CertificateRejected as error:
         raise Infeasible(f"what the solver found proves nothing: {error}") from error
-    document = attraction_document(
-        field, V, level, positive=shape, decrease=decrease.gram, multiplier=multiplier
-    )
     return Attraction(V, level, document)

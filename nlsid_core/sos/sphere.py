@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import blas, lapack, qr
 
 from nlsid_core import conic
-from nlsid_core._types import ArrayLike, BoolArray, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials

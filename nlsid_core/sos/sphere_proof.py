@@ -1,4 +1,4 @@
-"""From a solved sphere program to an identity that `certificate.prove_lower_bound` decides.
+"""From a solved sphere program to an identity that the kernel decides.
 
 With h = 1 - |z|² and d = g - m - v'Xv = μh, a small part η of the bound is turned into a strictly
 positive definite Gram matrix of (1, v):
@@ -16,7 +16,7 @@ from nlsid_core.polynomial import Gram, Polynomial, constant
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
 # η over the trace of X: the residual of the identity is 1e-15 of it, and the Cholesky factorisation
-# of the rigorous mode takes about 1e-13 more.
+# of `rigorous` takes about 1e-13 more.
 ROUNDING_ROOM = 4e-12
 
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from nlsid_core import conic
-from nlsid_core._types import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.polynomial import Gram, Polynomial, monomials
 from nlsid_core.sos.basis import parity_kernel
 from nlsid_core.sos.quotient import Quotient

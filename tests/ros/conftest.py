@@ -7,7 +7,7 @@ import pytest
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.samples import f1tenth
 
 

@@ -43,7 +43,7 @@ def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
         assert not robot.has_said("warning")
         texts, values = robot.said["funnel_monitor"][-1]
         assert texts.startswith("outside")
-        assert {"margin", "worst axis", "budget spent", "time to exit [s]"} <= values.keys()
+        assert {"margin", "worst axis", "assumption", "time to exit", "assuming"} <= values.keys()
         stop(monitor)
 
 

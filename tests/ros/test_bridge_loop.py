@@ -1,4 +1,4 @@
-"""Plant, controller, recorder and monitor as nodes on a discrete funnel of an identified model."""
+"""Plant, controller, recorder and monitor as nodes on a sampled funnel of an identified model."""
 
 from pathlib import Path
 

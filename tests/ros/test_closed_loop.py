@@ -16,10 +16,11 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
-from nlsid_core.monitor import Nominal, Status
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 
@@ -105,14 +106,14 @@ def run_loop(funnel: Path, bag: Path, *, push: float) -> Loop:
 def live_and_replayed(
     funnel: Path, bag: Path, loop: Loop
 ) -> tuple[list[tuple[float, ...]], list[tuple[float, ...]]]:
-    """(margin, budget, nominal, measured) of every judged sample, heard live and replayed."""
-    replay = replay_bag(documents.load_proved_funnel(funnel), bag, nominal=Nominal.PROFILE)
+    """The numbers (margin, ...) of every judged sample, heard live and replayed."""
+    replay = replay_bag(documents.load_proved_funnel(funnel), bag, centre=Centre.PROFILE)
     judged = {
-        stamp_ns: (reading.margin, reading.budget_spent, reading.nominal, reading.measured)
+        stamp_ns: tuple(reading.numbers.values())
         for stamp_ns, reading in zip(replay.stamps_ns, replay.readings, strict=True)
         if reading.status is not Status.UNKNOWN
     }
-    live = {s: v[:4] for s, v in loop.margins.items() if not math.isnan(v[0])}
+    live = {s: v[:-1] for s, v in loop.margins.items() if not math.isnan(v[0])}
     common = sorted(judged.keys() & live.keys())
     assert len(common) >= 0.9 * len(live) > 0
     return [live[s] for s in common], [judged[s] for s in common]

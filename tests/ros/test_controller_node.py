@@ -16,12 +16,12 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.monitoring.announcement import Run
-from nlsid_core import _json
+from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
 
 pytestmark = ros_test
 
@@ -99,8 +99,8 @@ def test_commands_come_at_the_models_rate_and_the_start_is_announced_latched(
     robot.track()
     robot.node.create_subscription(String, "/tracking_controller/run", runs.append, qos.DOCUMENT)
     robot.spin_until(lambda: len(runs) == 1)
-    run = Run.from_document(_json.parse_document(runs[0].data, source="run"))
-    assert run.funnel == _json.digest(_json.load_document(funnel))
+    run = Run.from_document(files.parse_document(runs[0].data, source="run"))
+    assert run.funnel == files.digest(files.load_document(funnel))
     stamps = np.array([stamp for stamp, _ in robot.commands])
     assert run.start_ns > stamps[0]
     assert (run.start_ns - stamps[0]) % PERIOD_NS == PERIOD_NS // 4, "a quarter period ahead"
@@ -137,21 +137,12 @@ def test_a_funnel_replaced_in_mid_run_stops_it(stage: Callable[..., Stage], funn
     robot.expect_ramp_down("the funnel was replaced")
 
 
-def test_limits_hold_and_what_they_cut_off_is_not_the_policy_any_more(
+def test_limits_that_would_cut_off_the_plan_are_refused_and_nothing_moves(
     stage: Callable[..., Stage],
 ) -> None:
     robot = stage(highest=0.2)
-    watching = {
-        "nominal": "profile",
-        "controller": "tracking_controller",
-        "stop_service": "tracking_controller/stop",
-        "command_wait": 0.5,
-        "stale_after": 1.0,
-    }
-    with process("nlsid_ros.funnel_monitor", **watching) as monitor:
-        robot.spin_until(lambda: any("waiting for the controller" in s for s in robot.monitor))
-        assert robot.call("start").success
-        robot.spin_until(lambda: any("is not the policy's" in said for said in robot.monitor))
-        robot.expect_ramp_down("asked to")
-        stop(monitor)
-    assert max(u for _, u in robot.commands) == pytest.approx(0.2)
+    answer = robot.call("start")
+    assert not answer.success
+    assert "beyond the limits [0, 0.2]" in answer.message
+    assert robot.has_said("idle; not started: the plan's input")
+    assert robot.commands == []

@@ -73,7 +73,12 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         assert int(custom["/joint_commands received"]) >= 230
         assert custom["/joint_commands lost"] == "0"
     data = read_dataset(
-        trials, responses=[RESPONSE], excitations=[COMMAND], period=0.01, max_gap=0.5, tolerance=0.5
+        trials,
+        responses=[RESPONSE],
+        excitations=[COMMAND],
+        period=0.01,
+        max_gap=0.5,
+        resample="linear",
     )
     [(group, members)] = data.repeats().items()
     assert group.startswith("/joint_commands:effort[0], multisine, sha256:")

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from benchmarks.monitor import COMMAND, STATE, timing_funnel
-from nlsid_core import _json
+from nlsid_core import files
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
@@ -42,8 +42,8 @@ def robot(funnel: Path) -> Iterator[Robot]:
     ("samples", "speed", "says"),
     [
         ([*GOOD, 4], 0.0, "time went back"),
-        ([*GOOD, 50], 0.0, "between samples"),
-        ([0, 1, 2, 3, 5, 4], 0.0, "between samples"),
+        ([*GOOD, 50], 0.0, "of the run is missing"),
+        ([0, 1, 2, 3, 5, 4], 0.0, "of the run is missing"),
         (GOOD, math.nan, "speed is nan"),
         (GOOD, math.inf, "speed is inf"),
         (GOOD, 1e300, "outside"),
@@ -95,7 +95,7 @@ def test_a_second_publisher_between_the_samples_is_not_mistaken_for_the_robot(
     for k in range(8):
         robot.drive([k])
         robot.drive([k], odom=second, speed=0.2, shift_ns=PERIOD_NS // 2)
-    robot.spin_until(lambda: robot.has_said("between samples"))
+    robot.spin_until(lambda: robot.has_said("from when the next one"))
     assert not robot.has_said("inside")
     robot.node.destroy_publisher(second)
 
@@ -106,8 +106,8 @@ def test_a_funnel_that_does_not_fit_replaces_nothing_and_a_whole_one_begins_agai
     robot.restart()
     robot.drive(GOOD)
     robot.spin_until(lambda: robot.has_said("inside"))
-    forged = _json.parse_document(robot.texts["policy"]) | {"K": [0.0, 0.0, 0.0, 0.0]}
-    robot.latched["policy"].publish(String(data=_json.canonical(forged).decode()))
+    forged = files.parse_document(robot.texts["policy"]) | {"K": [[0.0, 0.0, 0.0, 0.0]]}
+    robot.latched["policy"].publish(String(data=files.encode(forged).decode()))
     robot.spin_until(lambda: robot.has_said("funnel not used: the funnel was made for another"))
     robot.said.clear()
     robot.drive([10, 11, 12, 13, 14, 15])
@@ -200,7 +200,7 @@ def test_an_array_of_another_length_is_named_and_ends_the_run(
     ):
         for document in ("model", "policy", "funnel"):
             latched = node.create_publisher(String, f"/benchmark/{document}", qos.DOCUMENT)
-            text = _json.canonical(getattr(design, document).document()).decode()
+            text = files.encode(getattr(design, document).document()).decode()
             latched.publish(String(data=text))
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
         state, command = (

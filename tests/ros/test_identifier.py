@@ -15,11 +15,11 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.chain.shipped import config_file
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.samples import f1tenth
-from nlsid_core import _json
-from nlsid_core.certificate import check
+from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
+from nlsid_core.proofs import check
 from nlsid_ros import qos
 from tests.bag_messages import START_NS, speed_bag
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
@@ -91,7 +91,7 @@ def test_the_last_recording_is_identified_while_the_node_answers_at_once(tmp_pat
     assert slowest < AT_ONCE
     fractions = [fraction for _, _, fraction in said]
     assert len(set(fractions)) > 3, "progress is told"
-    model = DifferenceEquation.from_document(_json.parse_document(models[0]))
+    model = DifferenceEquation.from_document(files.parse_document(models[0]))
     assert "PROVED" in str(check(tmp_path / "out" / documents.MODEL_PROOF))
     assert [name for name, _ in model.bags] == ["run_1"], "the newest, whatever its name"
     assert model.training == documents.load_model(tmp_path / "out" / documents.MODEL).training

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.samples import f1tenth
 from tests.ros.domains import fresh_domain
 
@@ -31,7 +31,7 @@ def test_live_nodes_agree_with_the_offline_replay(
     funnel: Path, tmp_path: Path, environment: dict[str, str]
 ) -> None:
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    command = [sys.executable, "-m", "nlsid_ros.live", "--json"]
+    command = [sys.executable, "-m", "nlsid_ros.demo.live", "--json"]
     options = ["--funnel", str(funnel), "--bag", str(trial), "--out", str(tmp_path / "live")]
     done = subprocess.run(
         command + options, capture_output=True, text=True, env=environment, timeout=200, check=False

@@ -23,8 +23,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from bags.monitoring import documents
-from nlsid_core import _json
+from bags.designs import documents
+from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.interfaces import example_nodes
 from tests.ros.processes import (
@@ -199,15 +199,15 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
     heard: list[str] = []
 
     def hear(message: String) -> None:
-        heard.append(_json.digest(_json.parse_document(message.data)))
+        heard.append(files.digest(files.parse_document(message.data)))
 
     names = (documents.MODEL, documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF)
     for place in ("good", "forged"):
         (tmp_path / place).mkdir()
         for name in names:
             (tmp_path / place / name).write_bytes((funnel.parent / name).read_bytes())
-    forged = _json.load_document(tmp_path / "forged" / documents.FUNNEL)
-    _json.write_document(
+    forged = files.load_document(tmp_path / "forged" / documents.FUNNEL)
+    files.write_document(
         tmp_path / "forged" / documents.FUNNEL, forged | {"level": 2.0 * forged["level"]}
     )
     with (

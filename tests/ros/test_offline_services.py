@@ -18,9 +18,9 @@ from visualization_msgs.msg import MarkerArray
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.monitoring import documents
+from bags.designs import documents
 from bags.samples import f1tenth
-from nlsid_core import _json
+from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_ros import qos
 from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
@@ -73,7 +73,7 @@ def test_a_model_is_identified_on_request_published_and_can_be_called_off(tmp_pa
         spin_until(lambda: bool(models))
         spin_until(lambda: any("PROVED" in text for text in said))
         stop(identifier)
-    model = DifferenceEquation.from_document(_json.parse_document(models[0]))
+    model = DifferenceEquation.from_document(files.parse_document(models[0]))
     assert len(model) == 4
 
 
@@ -86,7 +86,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
     pictures: list[object] = []
 
     def hear_funnel(message: String) -> None:
-        funnels.append(_json.digest(_json.parse_document(message.data)))
+        funnels.append(files.digest(files.parse_document(message.data)))
 
     def hear_status(message: DiagnosticArray) -> None:
         said.extend(status.message for status in message.status)
@@ -116,12 +116,12 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
         )
         design_funnel_files(tmp_path / documents.MODEL, wider, tmp_path)
         spin_until(lambda: len(funnels) > 1)
-        design = _json.load_document(tmp_path / documents.FUNNEL)
-        spin_until(lambda: funnels[-1] == _json.digest(design))
+        design = files.load_document(tmp_path / documents.FUNNEL)
+        spin_until(lambda: funnels[-1] == files.digest(design))
 
         count = len(funnels)
         forged = design | {"level": 2.0 * design["level"]}
-        _json.write_document(tmp_path / documents.FUNNEL, forged)
+        files.write_document(tmp_path / documents.FUNNEL, forged)
         spin_until(lambda: any("REJECTED" in text for text in said))
         assert len(funnels) == count
         stop(publisher)

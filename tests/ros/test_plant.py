@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from nlsid_core._types import FloatArray
+from nlsid_core.arrays import FloatArray
 from nlsid_ros import qos
 from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
 

@@ -180,6 +180,11 @@ def test_best_effort_topics_and_documents_latched_before_the_start_are_recorded(
     assert len(messages_on(bag, "/document")) == 1
     assert b"published before the recording" in messages_on(bag, "/document")[0]
     assert len(messages_on(bag, "/sensor")) >= 4
+    with Bag(bag) as recorded:
+        assert [profile.latched for profile in recorded.offered("/document")] == [True]
+        [sensed] = recorded.offered("/sensor")
+        assert (sensed.reliability, sensed.durability) == ("best_effort", "volatile")
+        assert qos.playing_of(recorded.offered("/document")).durability == qos.DOCUMENT.durability
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Designs: the files of a design folder, and what a robot runs and is held against."""

@@ -1,0 +1,179 @@
+"""What a robot runs and is held against: a model, a policy and a funnel that belong together."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeAlias, TypeGuard, TypeVar
+
+from bags.signals.expressions import Expression
+from bags.signals.sampling import Sampler
+from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
+from nlsid_core import files
+from nlsid_core.arrays import Json
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import DataError, DocumentError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.protocol import AnyFunnel, read_funnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.models.measured_state import MeasuredState, read_measured_state
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.linear import LinearPolicy
+from nlsid_core.policies.protocol import AnyPolicy, read_policy
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
+
+M = TypeVar("M", bound=Dynamics)
+P = TypeVar("P", bound=AnyPolicy)
+F = TypeVar("F", bound=AnyFunnel)
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """Where a continuous funnel's state and inputs are, and s between samples.
+
+    A vector field has equations and no signals, so whoever runs its funnel says this.
+    """
+
+    response: SignalVector
+    command: SignalVector
+    period: float
+
+    @classmethod
+    def parse(cls, response: Iterable[str], command: Iterable[str], period: float) -> "Wiring":
+        """Read each `topic:field.path[index]`; BagError if a vector is not on one topic."""
+        return cls(SignalVector.parse(response), SignalVector.parse(command), period)
+
+
+@dataclass(frozen=True, eq=False)
+class WiredDesign(Generic[M, P, F]):
+    """The parts of a design of any kind, and where their signals are.
+
+    wiring: of a continuous funnel, None until somebody says it.
+    """
+
+    model: M
+    policy: P
+    funnel: F
+    wiring: Wiring | None = None
+
+    @property
+    def name(self) -> str:
+        """What is measured, in words."""
+        if isinstance(self.model, DifferenceEquation):
+            return self.model.y.name
+        if isinstance(self.model, VectorField):
+            return ", ".join(f"x{i}" for i in range(self.model.n))
+        return ", ".join(signal.name for signal in self.model.x)
+
+    @property
+    def response(self) -> SignalPath | SignalVector:
+        """Where the output or the state is read; BagError if a state is not on one topic."""
+        if isinstance(self.model, DifferenceEquation):
+            return Expression.parse(self.model.y.path).path
+        if isinstance(self.model, VectorField):
+            return self._wired().response
+        return SignalVector.parse(signal.path for signal in self.model.x)
+
+    @property
+    def command(self) -> SignalPath | SignalVector:
+        """Where the inputs are read and written; BagError if they are not on one topic."""
+        if isinstance(self.model, DifferenceEquation):
+            return Expression.parse(self.model.u.path).path
+        if isinstance(self.model, VectorField):
+            return self._wired().command
+        return SignalVector.parse(signal.path for signal in self.model.u)
+
+    @property
+    def period(self) -> float:
+        """S between samples."""
+        return self._wired().period if isinstance(self.model, VectorField) else self.model.period
+
+    def sampler(self) -> Sampler:
+        """What makes samples of messages, by the rule that the model was identified with."""
+        if isinstance(self.model, VectorField):
+            wiring = self._wired()
+            y, u = (list(map(Expression, v.paths)) for v in (wiring.response, wiring.command))
+            return Sampler(y, u, period=self.period)
+        if isinstance(self.model, DifferenceEquation):
+            return Sampler([self.model.y.path], [self.model.u.path], period=self.period)
+        states, inputs = ([signal.path for signal in s] for s in (self.model.x, self.model.u))
+        return Sampler(states, inputs, period=self.period)
+
+    @property
+    def has_plan(self) -> bool:
+        """Whether the funnel is always around the policy's plan; a linear tube may follow."""
+        return not isinstance(self.funnel, LinearFunnel)
+
+    @property
+    def digest(self) -> str:
+        """Of the funnel's document: how an announcement names it."""
+        return files.digest(self.funnel.document())
+
+    def monitor(self, centre: Centre) -> Monitor:
+        """A monitor for one run; centre: of a linear tube."""
+        period = self.period if isinstance(self.model, VectorField) else None
+        return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period)
+
+    def controller(self, limits: Limits, settling: float) -> Controller:
+        """A controller for one run; `settling`: s to wait for a state where it may start."""
+        period = self.period if isinstance(self.model, VectorField) else None
+        return Controller(
+            self.model, self.policy, self.funnel, limits=limits, settling=settling, period=period
+        )
+
+    def _wired(self) -> Wiring:
+        if self.wiring is None:
+            raise DataError(
+                "a vector field names no signals: say where the state and the inputs are "
+                "(response, command) and how often they come (period)"
+            )
+        return self.wiring
+
+
+LinearDesign: TypeAlias = WiredDesign[DifferenceEquation, LinearPolicy, LinearFunnel]
+SampledDesign: TypeAlias = WiredDesign[MeasuredState, SampledPolicy, SampledFunnel]
+ContinuousDesign: TypeAlias = WiredDesign[VectorField, ContinuousPolicy, ContinuousFunnel]
+AnyDesign: TypeAlias = LinearDesign | SampledDesign | ContinuousDesign
+
+
+def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) -> AnyDesign:
+    """The documents `model` (or vector field), `policy` and `funnel` as what they are.
+
+    The funnel's kind decides. Raises DocumentError if one is not what it should be,
+    CertificateMismatch if they do not belong together.
+    """
+    funnel, policy = read_funnel(documents["funnel"]), read_policy(documents["policy"])
+    readers: dict[type[AnyFunnel], tuple[type[AnyPolicy], Any]] = {
+        LinearFunnel: (LinearPolicy, DifferenceEquation.from_document),
+        SampledFunnel: (SampledPolicy, read_measured_state),
+        ContinuousFunnel: (ContinuousPolicy, VectorField.from_document),
+    }
+    kind, read_model = readers[type(funnel)]
+    if not isinstance(policy, kind):
+        raise DocumentError(
+            f"policy: a {type(policy).__name__}, the funnel needs a {kind.__name__}"
+        )
+    model = read_model(documents["model"])
+    refuse_mismatch(model, policy, funnel)
+    design: Any = WiredDesign(model, policy, funnel, wiring)
+    made: AnyDesign = design
+    return made
+
+
+def is_linear(design: AnyDesign) -> TypeGuard[LinearDesign]:
+    """Whether it is a tube of a linear model."""
+    return isinstance(design.funnel, LinearFunnel)
+
+
+def is_sampled(design: AnyDesign) -> TypeGuard[SampledDesign]:
+    """Whether it is a sampled funnel around a motion of a measured state."""
+    return isinstance(design.funnel, SampledFunnel)
+
+
+def is_continuous(design: AnyDesign) -> TypeGuard[ContinuousDesign]:
+    """Whether it is a funnel of a vector field."""
+    return isinstance(design.funnel, ContinuousFunnel)

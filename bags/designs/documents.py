@@ -1,0 +1,74 @@
+"""The files of one design folder, by name, and reading them back as nouns."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar, cast
+
+from bags.designs.design import AnyDesign, LinearDesign, SampledDesign, WiredDesign, Wiring
+from nlsid_core import designs, files
+from nlsid_core.errors import CertificateMismatch, DocumentError
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.kernel import Verdict
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.running.monitor import refuse_mismatch
+
+MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
+POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
+MODEL_PROOF = "model.proof.json"
+TRAINING = "training.npz"
+REPORT = "report.html"
+SELECTION_PLOT = "select.png"
+COMPARISON_PLOT = "compare.png"
+MARGIN_PLOT = "monitor.png"
+FUNNEL_PLOT = "funnel.png"
+FREE_RUN_PLOT = "free_run.png"
+MOTION_PLOT = "motion.png"
+
+
+D_co = TypeVar("D_co", covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Proved(Generic[D_co]):
+    """A design whose proof was checked when it was loaded."""
+
+    design: D_co
+    verdict: Verdict
+
+
+def load_model(path: Path | str) -> DifferenceEquation:
+    """Read a model file; DocumentError says what is wrong with it."""
+    path = Path(path)
+    return DifferenceEquation.from_document(files.load_document(path), source=str(path))
+
+
+def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:
+    """Read a funnel with the model, policy and proof beside it, and check the proof.
+
+    Of a continuous funnel the vector field is read in the place of the model. Raises
+    CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
+    """
+    path = Path(path)
+    found = designs.load_design(path.parent)
+    if files.digest(path.read_bytes()) != found.verdict.digests["funnel"]:
+        raise CertificateMismatch(f"{FUNNEL_PROOF} beside {path} is not about this funnel")
+    design: Any = WiredDesign(found.model, found.policy, found.funnel, wiring)
+    refuse_mismatch(found.model, found.policy, found.funnel)
+    return Proved(design, found.verdict)
+
+
+def load_proved_funnel(path: Path | str) -> Proved[LinearDesign]:
+    """`load_proved` for a tube of a difference equation; DocumentError if it is another."""
+    proved: Proved[Any] = load_proved(path)
+    if not isinstance(proved.design.funnel, LinearFunnel):
+        raise DocumentError(f"{path}: not a linear funnel; `nlsid track` reads sampled ones")
+    return cast(Proved[LinearDesign], proved)
+
+
+def load_proved_tracking(path: Path | str) -> Proved[SampledDesign]:
+    """`load_proved` for a sampled funnel; DocumentError if it is another."""
+    proved: Proved[Any] = load_proved(path)
+    if not isinstance(proved.design.funnel, SampledFunnel):
+        raise DocumentError(f"{path}: not a sampled funnel; `nlsid monitor` reads linear ones")
+    return cast(Proved[SampledDesign], proved)

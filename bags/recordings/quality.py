@@ -1,0 +1,146 @@
+"""Quality of service: what a topic's publishers offered when it was recorded.
+
+rosbag2 keeps it twice, in metadata.yaml and in the channel of the MCAP file, and offers the same
+when it plays the bag: a latched topic is latched again. rosbags reads a channel of a folder only
+if both say the same. Until version 8 policies were numbers in a text of YAML, from version 9 (ROS
+2 Jazzy) they are words in YAML of its own; both are read, and words are written.
+"""
+
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Any, Final, NamedTuple
+
+import yaml
+
+MAX_TEXT: Final = 2**16  # characters; a topic with a hundred publishers has 30 000
+KEY: Final = "offered_qos_profiles"  # in metadata.yaml, and of a channel's metadata
+
+HISTORIES: Final = ("system_default", "keep_last", "keep_all", "unknown")
+RELIABILITIES: Final = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+DURABILITIES: Final = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+LIVELINESSES: Final = (
+    "system_default",
+    "automatic",
+    "manual_by_node",
+    "manual_by_topic",
+    "unknown",
+    "best_available",
+)  # as rmw counts them from 0
+
+_LOADER: Final[Any] = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class Span(NamedTuple):
+    """A time that a policy states; the default is forever, as ROS 2 writes it."""
+
+    sec: int = 9223372036
+    nsec: int = 854775807
+
+
+class Profile(NamedTuple):
+    """What one publisher offered, in the words of rmw."""
+
+    history: str = "keep_last"
+    depth: int = 10
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline: Span = Span()
+    lifespan: Span = Span()
+    liveliness: str = "automatic"
+    liveliness_lease_duration: Span = Span()
+    avoid_ros_namespace_conventions: bool = False
+
+    @property
+    def latched(self) -> bool:
+        """Whether a subscriber that comes later still gets the last messages."""
+        return self.durability == "transient_local"
+
+    def document(self) -> dict[str, Any]:
+        """As metadata.yaml of version 9 says it."""
+        return {
+            key: value._asdict() if isinstance(value, Span) else value
+            for key, value in self._asdict().items()
+        }
+
+
+LATCHED: Final = Profile(depth=1, durability="transient_local")  # a latched topic of ROS 1
+
+
+def offered(found: object) -> tuple[Profile, ...]:
+    """The profiles in a text of YAML or in what was read of one; none where they are malformed.
+
+    A bag without a quality of service plays with the player's own; so does one whose is damaged.
+    """
+    if isinstance(found, str):
+        return _parsed(found) if len(found) <= MAX_TEXT else ()
+    try:
+        return tuple(dict.fromkeys(_profile(entry) for entry in found))  # type: ignore[attr-defined]
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError):
+        return ()
+
+
+def offered_text(profiles: Iterable[Profile]) -> str:
+    """The profiles as the channel of an MCAP file holds them."""
+    return yaml.safe_dump([profile.document() for profile in profiles], sort_keys=False)
+
+
+def profile_of(qos: Any) -> Profile:
+    """From rosbags' or rclpy's object: policies with names, times with parts or nanoseconds."""
+    return Profile(
+        qos.history.name.lower(),
+        int(qos.depth),
+        qos.reliability.name.lower(),
+        qos.durability.name.lower(),
+        _span_of(qos.deadline),
+        _span_of(qos.lifespan),
+        qos.liveliness.name.lower(),
+        _span_of(qos.liveliness_lease_duration),
+        bool(qos.avoid_ros_namespace_conventions),
+    )
+
+
+@lru_cache(maxsize=1024)
+def _parsed(text: str) -> tuple[Profile, ...]:
+    try:
+        found = yaml.load(text, Loader=_LOADER)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return ()
+    return () if isinstance(found, str) else offered(found)
+
+
+def _profile(entry: Any) -> Profile:
+    depth = int(entry["depth"])
+    if depth < 0:
+        raise ValueError(f"depth {depth}")
+    return Profile(
+        _word(entry["history"], HISTORIES),
+        depth,
+        _word(entry["reliability"], RELIABILITIES),
+        _word(entry["durability"], DURABILITIES),
+        _span(entry["deadline"]),
+        _span(entry["lifespan"]),
+        _word(entry["liveliness"], LIVELINESSES),
+        _span(entry["liveliness_lease_duration"]),
+        bool(entry["avoid_ros_namespace_conventions"]),
+    )
+
+
+def _word(found: object, words: tuple[str, ...]) -> str:
+    if isinstance(found, int) and 0 <= found < len(words):
+        return words[found]
+    word = str(found).lower()
+    return word if word in words else "unknown"
+
+
+def _span(found: Any) -> Span:
+    span = Span(int(found["sec"]), int(found["nsec"]))
+    if not (0 <= span.sec < 2**64 and 0 <= span.nsec < 2**64):
+        raise ValueError(f"a time of {span}")
+    return span
+
+
+def _span_of(time: Any) -> Span:
+    if hasattr(time, "nanoseconds"):
+        whole = int(time.nanoseconds)
+        return Span(*divmod(whole, 10**9)) if whole else Span(0, 0)
+    return Span(int(time.sec), int(time.nsec))

@@ -1,0 +1,346 @@
+"""What a sample is: the one path from messages to the numbers a model is fitted to and judged by.
+
+`bags.signals.grid` feeds a `Sampler` with a recording, a replay or a live monitor with messages as
+they come; the samples are equal bit for bit. What to call for a model's signals:
+
+    sampler = Sampler([y.path for y in ...], [u.path for u in ...], period=model.period)
+    sampler.check(topic, msgtype, types)  # once for each of sampler.topics
+    for sample in sampler.message(topic, sampler.stamp(data, log_ns), decoded): ...
+    for sample in sampler.flush(until_ns): ...  # stop waiting for other topics
+
+The paths are expressions (`bags.signals.expressions`) and carry the whole rule, so that nothing
+besides the model has to be known:
+
+- The clock is one for all signals: header stamps, or with `|clock(log)` on every signal the time
+  of logging, live of arrival. Stamps of two clocks are never put together.
+- Responses without `|hold(T s)` or `|linear(T s)` are samples as they come: the first response's
+  stamps are the samples' stamps, and the others have to be stamped within MATCH periods of it.
+- If every response has one of them, samples lie on a grid of one period from the first stamp at
+  which every signal has a value. `hold`: the latest value at or before, at most T s old.
+  `linear`: on the line between the values before and after, at most T s apart.
+- An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`.
+- The first sample is the first with every signal; what came before it is counted, not given.
+  Later a signal that is missing is NaN, and `missing` says which and why.
+
+A sample is given as soon as no message that is still to come can change it: topics are in order,
+so that is when every topic has been seen at or after it.
+"""
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+from rosbags.typesys.store import Typestore
+
+from bags.recordings.message_types import header_stamp_ns, is_stamped
+from bags.signals.expressions import Expression, Running
+from nlsid_core.errors import BagError, apart
+
+MATCH: Final = 0.05  # periods between stamps of one sample on two topics; a loop's usual scatter
+NOT_FINITE: Final = "not a finite number"
+HISTORY: Final = 2**16  # values kept of a signal while no sample comes: a minute at 1 kHz
+
+
+class Sample(NamedTuple):
+    """One sample: responses y and excitations u in the order they were named, NaN where missing."""
+
+    stamp_ns: int
+    y: tuple[float, ...]
+    u: tuple[float, ...]
+    missing: str = ""
+
+
+class Sampler:
+    """Messages or numbers in, samples out; see the module.
+
+    incomplete: times of samples before the first complete one. late: values that came after a
+    sample they belong to was given. late_responses, duplicate_responses: responses that came after
+    a later one was given, or with the stamp of another; they give no sample.
+
+    Raises BagError for signals that are no expressions, on several clocks, or of which some
+    responses are samples as they come and others on a grid.
+    """
+
+    def __init__(
+        self,
+        responses: Sequence[str | Expression],
+        excitations: Sequence[str | Expression],
+        *,
+        period: float,
+    ) -> None:
+        self.responses = tuple(map(_expression, responses))
+        self.excitations = tuple(map(_expression, excitations))
+        signals = (*self.responses, *self.excitations)
+        if not self.responses or not self.excitations:
+            raise BagError("name at least one response and one excitation")
+        self.clock = one_clock(signals)
+        self.topics = tuple(dict.fromkeys(signal.path.topic for signal in signals))
+        self.period_ns = round(period * 1e9)
+        gridded = [signal.operation("hold", "linear") is not None for signal in self.responses]
+        if any(gridded) and not all(gridded):
+            raise BagError(
+                f"{self.responses[gridded.index(False)]} is sampled as it comes, "
+                f"{self.responses[gridded.index(True)]} on a grid; give every response |hold(T s) "
+                "or |linear(T s), or none"
+            )
+        self.on_grid = all(gridded)
+        self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
+        self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
+        for k, signal in enumerate(signals):
+            self._on[signal.path.topic].append(k)
+        self._signals = signals
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything but the signals."""
+        n = len(self.responses)
+        match_ns = round(MATCH * self.period_ns)
+        matches = [0, *[match_ns] * (n - 1), *[None] * len(self.excitations)]
+        self._kept = [_Kept(s, m) for s, m in zip(self._signals, matches, strict=True)]
+        self._running: dict[int, Running] = {
+            k: self._signals[k].numbers.running(unit) for k, unit in self._recorded.items()
+        }
+        self._waiting: list[int] = []
+        self._released_ns: float = -math.inf
+        self._started = False
+        self._next_ns: int | None = None
+        self.incomplete = self.late = self.late_responses = self.duplicate_responses = 0
+
+    def check(self, topic: str, msgtype: str, types: Typestore) -> None:
+        """BagError unless messages of `msgtype` on `topic` have the signals and their clock."""
+        if self.clock == "header" and not is_stamped(msgtype, types):
+            signal = next(s for s in self._signals if s.path.topic == topic)
+            raise BagError(
+                f"{signal}: {topic} ({msgtype}) has no header stamp; a model of it is identified "
+                "with `clock: log`, by the times at which messages were logged"
+            )
+        for k in self._on[topic]:
+            signal = self._signals[k]
+            signal.path.check(msgtype, types)
+            signal.unit(msgtype, types)
+            self._recorded[k] = signal.recorded_unit(msgtype, types)
+            self._running[k] = signal.numbers.running(self._recorded[k])
+
+    def stamp(self, data: bytes, log_ns: int) -> int:
+        """The stamp (ns) of a serialised message that was logged, or live arrived, at `log_ns`."""
+        return log_ns if self.clock == "log" else header_stamp_ns(data)
+
+    def message(self, topic: str, stamp_ns: int, message: Any) -> list[Sample]:
+        """Take a decoded message of a checked topic; the samples that are certain now."""
+        for k in self._on[topic]:
+            self._operate(k, stamp_ns, self._signals[k].path.value(message))
+        return self._release(-math.inf)
+
+    def respond(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
+        """Take every response as read from one message; the samples that are certain now."""
+        for k, value in enumerate(values):
+            self._operate(k, stamp_ns, value)
+        return self._release(-math.inf)
+
+    def excite(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
+        """Take every excitation as read from one message; the samples that are certain now."""
+        for k, value in enumerate(values, start=len(self.responses)):
+            self._operate(k, stamp_ns, value)
+        return self._release(-math.inf)
+
+    def feed(self, k: int, stamp_ns: int, value: float) -> list[Sample]:
+        """Take a number of signal k (responses first), its operations done already."""
+        self._add(k, stamp_ns, value)
+        return self._release(-math.inf)
+
+    def flush(self, until_ns: int | None = None) -> list[Sample]:
+        """Stop waiting: the samples up to `until_ns` (None: all) as things are.
+
+        None: on a grid, up to the last stamp that every response has reached.
+        """
+        if until_ns is not None:
+            return self._release(until_ns)
+        if not self.on_grid:
+            return self._release(math.inf)
+        return self._release(min(kept.newest_ns for kept in self._kept[: len(self.responses)]))
+
+    def _operate(self, k: int, stamp_ns: int, value: float) -> None:
+        if self._signals[k].path.framed and math.isnan(value):
+            return  # the message has other transforms
+        running = self._running.get(k)
+        if running is None:
+            running = self._running[k] = self._signals[k].numbers.running("")
+        if running.remembers and stamp_ns <= self._kept[k].newest_ns:
+            self._count_late(k, stamp_ns)
+            return
+        self._add(k, stamp_ns, running.update(stamp_ns, value))
+
+    def _count_late(self, k: int, stamp_ns: int) -> None:
+        if k >= len(self.responses):
+            self.late += 1
+        elif stamp_ns == self._kept[k].newest_ns:
+            self.duplicate_responses += k == 0
+        else:
+            self.late_responses += k == 0
+
+    def _add(self, k: int, stamp_ns: int, value: float) -> None:
+        kept = self._kept[k]
+        if k == 0 and not self.on_grid:
+            at = bisect_left(self._waiting, stamp_ns)
+            if stamp_ns == self._released_ns or self._waiting[at : at + 1] == [stamp_ns]:
+                self.duplicate_responses += 1
+                return
+            if stamp_ns < self._released_ns:
+                self.late_responses += 1
+                return
+            self._waiting.insert(at, stamp_ns)
+        elif stamp_ns <= self._released_ns:
+            self.late += 1
+        kept.add(stamp_ns, value)
+
+    def _release(self, until_ns: float) -> list[Sample]:
+        """The samples that are certain, or stamped up to `until_ns`."""
+        given: list[Sample] = []
+        while True:
+            stamp_ns = self._next_stamp()
+            if stamp_ns is None:
+                return given
+            if stamp_ns > until_ns and not all(kept.is_certain(stamp_ns) for kept in self._kept):
+                return given
+            self._take_stamp(stamp_ns)
+            values = [kept.value_at(stamp_ns) for kept in self._kept]
+            self._released_ns = stamp_ns
+            if all(map(math.isfinite, values)):
+                self._started = True
+            elif not self._started:
+                self.incomplete += 1
+                continue
+            n = len(self.responses)
+            missing = "" if all(map(math.isfinite, values)) else self._why(stamp_ns, values)
+            given.append(Sample(stamp_ns, tuple(values[:n]), tuple(values[n:]), missing))
+
+    def _next_stamp(self) -> int | None:
+        if not self.on_grid:
+            return self._waiting[0] if self._waiting else None
+        if self._next_ns is None:
+            firsts = [kept.first_ns for kept in self._kept]
+            if None in firsts:
+                return None
+            self._next_ns = max(first for first in firsts if first is not None)
+        return self._next_ns
+
+    def _take_stamp(self, stamp_ns: int) -> None:
+        if self.on_grid:
+            self._next_ns = stamp_ns + self.period_ns
+        else:
+            del self._waiting[0]
+
+    def _why(self, stamp_ns: int, values: Sequence[float]) -> str:
+        k = next(k for k, value in enumerate(values) if not math.isfinite(value))
+        return f"{self._signals[k]}: {self._kept[k].why(stamp_ns)}"
+
+
+class _Kept:
+    """The values of one signal that samples still to come may need."""
+
+    def __init__(self, signal: Expression, match_ns: int | None) -> None:
+        rule = signal.operation("hold", "linear")
+        self.linear = rule is not None and rule.name == "linear"
+        self.limit_ns: float = math.inf if rule is None else round(rule.window * 1e9)
+        self.match_ns = match_ns if rule is None else None
+        self.stamps: list[int] = []
+        self.values: list[float] = []
+        self.newest_ns: float = -math.inf
+        self.first_ns: int | None = None
+
+    def add(self, stamp_ns: int, value: float) -> None:
+        if stamp_ns >= self.newest_ns:
+            self.stamps.append(stamp_ns)
+            self.values.append(value)
+            self.newest_ns = stamp_ns
+        else:
+            at = bisect_right(self.stamps, stamp_ns)
+            self.stamps.insert(at, stamp_ns)
+            self.values.insert(at, value)
+        if len(self.stamps) > HISTORY:
+            del self.stamps[0], self.values[0]
+        if self.first_ns is None and math.isfinite(value):
+            self.first_ns = stamp_ns
+
+    def is_certain(self, stamp_ns: int) -> bool:
+        """Whether nothing that is still to come changes the value at `stamp_ns`."""
+        if self.match_ns is None:
+            return self.newest_ns >= stamp_ns
+        return self.newest_ns >= stamp_ns - self.match_ns
+
+    def value_at(self, stamp_ns: int) -> float:
+        """The value of a sample; older values are forgotten, as samples only get later."""
+        if self.match_ns is not None:
+            first = bisect_left(self.stamps, stamp_ns - self.match_ns)
+            del self.stamps[:first], self.values[:first]
+            found = self.stamps and self.stamps[0] <= stamp_ns + self.match_ns
+            return self.values[0] if found else math.nan
+        after = bisect_right(self.stamps, stamp_ns)
+        if not after:
+            return math.nan
+        del self.stamps[: after - 1], self.values[: after - 1]
+        before_ns, value = self.stamps[0], self.values[0]
+        if before_ns == stamp_ns:
+            return value
+        if not self.linear:
+            return value if stamp_ns - before_ns <= self.limit_ns else math.nan
+        if len(self.stamps) < 2 or self.stamps[1] - before_ns > self.limit_ns:
+            return math.nan
+        share = (stamp_ns - before_ns) / (self.stamps[1] - before_ns)
+        return value + (self.values[1] - value) * share
+
+    def why(self, stamp_ns: int) -> str:
+        """Why there is no value, in words."""
+        before = bisect_right(self.stamps, stamp_ns) - 1
+        if self.match_ns is not None:
+            at = bisect_left(self.stamps, stamp_ns - self.match_ns)
+            found = at < len(self.stamps) and self.stamps[at] <= stamp_ns + self.match_ns
+            return NOT_FINITE if found else "no message with the stamp of the sample"
+        if before < 0:
+            return "no message with the stamp of the sample"
+        if not math.isfinite(self.values[before]):
+            return NOT_FINITE
+        if self.linear:
+            return f"no message for more than {self.limit_ns / 1e9:g} s"
+        age, most = apart((stamp_ns - self.stamps[before]) / 1e9, self.limit_ns / 1e9)
+        return f"nothing for {age} s; at most {most} s is held"
+
+
+def one_clock(signals: Sequence[Expression]) -> str:
+    """`header` or `log`, whichever all the signals are stamped by; BagError if they are of two."""
+    clocks = {str(signal): signal.clock or "header" for signal in signals}
+    if len(set(clocks.values())) > 1:
+        said = ", ".join(f"{text} by its {clock} time" for text, clock in clocks.items())
+        raise BagError(f"signals on two clocks cannot be paired: {said}; choose one clock")
+    return next(iter(clocks.values()))
+
+
+def sampled_path(
+    text: str,
+    *,
+    clock: str = "header",
+    resample: str = "none",
+    hold: float | None = None,
+    max_gap: float | None = None,
+    response: bool,
+) -> str:
+    """A signal's text with a configuration's `clock` and `grid` written into it.
+
+    resample: `none`, `last` or `linear` for responses, over at most `max_gap` s. hold: s for which
+    an excitation is held. What the text says itself stays.
+    """
+    signal = Expression.parse(text)
+    if clock != "header":
+        signal = signal.sampled("clock", unit=clock)
+    if response and resample != "none":
+        if max_gap is None:
+            raise BagError("resampling needs max_gap: the longest time between two values")
+        signal = signal.sampled("hold" if resample == "last" else "linear", window=max_gap)
+    if not response and hold is not None:
+        signal = signal.sampled("hold", window=hold)
+    return text if signal == Expression.parse(text) else str(signal)
+
+
+def _expression(signal: str | Expression) -> Expression:
+    return Expression.parse(signal) if isinstance(signal, str) else signal

@@ -1,0 +1,176 @@
+"""The kernel: its size, its imports, its processor seconds for examples/, and attacks on it.
+
+    python -m benchmarks.kernel [--json] [--mutations N] [--no-designs]
+
+A time is the least of three `kernel.check` of a saved proof, in processor seconds of one process.
+Lines are those that are not blank. A mutant is a structured change of a proof of version 2 or of a
+file it is about; each that is proved is judged by an oracle (tests/core/kernel), in fractions.
+"""
+
+import argparse
+import ast
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.designs import documents
+from bags.samples import f1tenth
+from benchmarks.machine import describe
+from examples import cart_pole, planar_quadrotor, quadrotor, satellite_funnel
+from nlsid_core import kernel
+from nlsid_core.design import design_funnel
+from nlsid_core.kernel.checking import KINDS
+
+FOLDER = Path(kernel.__file__).parent
+REPEATS = 3
+MUTATIONS = 2000
+SEED = 3
+QUADROTOR_LEVEL = 0.1  # of the goal, in LQR cost, as in benchmarks.quadrotor
+QUADROTOR_KNOTS = 31
+REACHED = {  # what was aimed at
+    "kernel_lines": 1500,
+    "largest_claim_lines": 900,
+    "imports_outside_stdlib": 0,
+    "satellite_s": 0.6,
+    "quadrotor_s": 3.0,
+    "cart_pole_s": 2.5,
+    "planar_quadrotor_s": 2.5,
+    "f1tenth_s": 0.1,
+    "false_proved": 0,
+}
+
+
+def main() -> None:
+    """Print the figures; the last line is one JSON object with --json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--mutations", type=int, default=MUTATIONS)
+    parser.add_argument("--no-designs", action="store_true", help="lines and mutations only")
+    arguments = parser.parse_args()
+    result: dict[str, Any] = size()
+    if not arguments.no_designs:
+        with tempfile.TemporaryDirectory() as folder:
+            result |= times(Path(folder))
+    result |= mutated(arguments.mutations)
+    print(describe())
+    for key, value in result.items():
+        print(f"{key:24}{value!s:>24}   {REACHED.get(key, '')}")
+    if arguments.json:
+        print(json.dumps(result))
+
+
+def size() -> dict[str, Any]:
+    """Lines, and imports that are not of the standard library."""
+    lines = {path.stem: _lines(path) for path in FOLDER.glob("*.py")}
+    claims = {kind: sum(lines[name] for name in _closure(kind)) for kind in KINDS}
+    largest = max(claims, key=lambda kind: claims[kind])
+    outside = {name for path in FOLDER.glob("*.py") for name in _imports(path)[1]}
+    return {
+        "kernel_lines": sum(lines.values()),
+        "largest_claim": largest,
+        "largest_claim_lines": claims[largest],
+        "claim_lines": claims,
+        "imports_outside_stdlib": len(outside - sys.stdlib_module_names),
+    }
+
+
+def times(folder: Path) -> dict[str, Any]:
+    """Processor seconds of `kernel.check`, and MB of the proofs."""
+    designs: Mapping[str, Callable[[], Any]] = {
+        "satellite": _satellite,
+        "quadrotor": _quadrotor,
+        "cart_pole": cart_pole.designed,
+        "planar_quadrotor": planar_quadrotor.designed,
+    }
+    result: dict[str, Any] = {}
+    sizes: dict[str, float] = {}
+    margins: dict[str, float] = {}
+    for name, design in designs.items():
+        *_, proof = design().save(folder / name)
+        result[f"{name}_s"], verdict = _checked(proof)
+        sizes[name], margins[name] = proof.stat().st_size / 1e6, float(verdict.margin)
+    out = folder / "f1tenth"
+    config = load_config(config_file("f1tenth.yaml"))
+    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    design_funnel_files(out / documents.MODEL, config, out)
+    proofs = [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
+    result["f1tenth_s"] = sum(_checked(proof)[0] for proof in proofs)
+    sizes["f1tenth"] = sum(proof.stat().st_size for proof in proofs) / 1e6
+    return result | {"files_mb": sizes, "margins": margins}
+
+
+def mutated(count: int) -> dict[str, Any]:
+    """How many mutants were decided, and how many false ones were proved."""
+    from tests.core.kernel import mutations
+
+    outcomes = mutations.run(count, np.random.default_rng(SEED))
+    return {"mutations": count, "outcomes": outcomes, "false_proved": outcomes["false_proved"]}
+
+
+def _satellite() -> Any:
+    field, nominal, weights = satellite_funnel.problem()
+    return design_funnel(field, nominal, goal=satellite_funnel.goal_matrix(), **weights)
+
+
+def _quadrotor() -> Any:
+    dynamics, nominal, S = quadrotor.problem(QUADROTOR_KNOTS)
+    return design_funnel(
+        dynamics,
+        nominal,
+        goal=S / QUADROTOR_LEVEL,
+        Q=quadrotor.Q / QUADROTOR_LEVEL,
+        R=quadrotor.R / QUADROTOR_LEVEL,
+    )
+
+
+def _checked(proof: Path) -> tuple[float, kernel.Verdict]:
+    seconds = []
+    for _ in range(REPEATS):
+        started = time.process_time()
+        verdict = kernel.check(proof)
+        seconds.append(time.process_time() - started)
+    return min(seconds), verdict
+
+
+def _lines(path: Path) -> int:
+    return sum(1 for line in path.read_text().splitlines() if line.strip())
+
+
+def _closure(name: str) -> set[str]:
+    """A module of the kernel and all that it imports there."""
+    found, waiting = set[str](), [name]
+    while waiting:
+        current = waiting.pop()
+        if current not in found:
+            found.add(current)
+            waiting += _imports(FOLDER / f"{current}.py")[0]
+    return found
+
+
+def _imports(path: Path) -> tuple[list[str], set[str]]:
+    """The modules of the kernel that a file imports, and the others, by their first name."""
+    inside: list[str] = []
+    outside: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            outside |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level and node.module:
+            inside.append(node.module)
+        elif isinstance(node, ast.ImportFrom) and node.level:
+            inside += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            outside.add(node.module.partition(".")[0])
+    return inside, outside
+
+
+if __name__ == "__main__":
+    main()

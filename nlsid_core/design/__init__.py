@@ -1,0 +1,36 @@
+"""Funnels: a model and a policy in, a funnel with its proof out (thesis Part II)."""
+
+from nlsid_core.design.compose import compose_funnels
+from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
+from nlsid_core.design.continuous.setting import Goal
+from nlsid_core.design.continuous.tvlqr import (
+    Tracking,
+    integrate_nominal,
+    lyapunov,
+    nominal_through,
+    tvlqr,
+)
+from nlsid_core.design.design import design
+from nlsid_core.design.linear import TubeDesign, design_tube
+from nlsid_core.design.problems import ContinuousTracking, LinearTube, SampledTracking
+from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
+
+__all__ = [
+    "ContinuousTracking",
+    "Feedback",
+    "FunnelDesign",
+    "Goal",
+    "LinearTube",
+    "SampledTracking",
+    "Tracking",
+    "TubeDesign",
+    "compose_funnels",
+    "design",
+    "design_funnel",
+    "design_tube",
+    "discrete_tvlqr",
+    "integrate_nominal",
+    "lyapunov",
+    "nominal_through",
+    "tvlqr",
+]

@@ -1,0 +1,1 @@
+"""Funnels of dynamics in continuous time."""

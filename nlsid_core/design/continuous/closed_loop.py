@@ -1,0 +1,298 @@
+"""The polynomial c(s, z) of a funnel's claim for the search: many pieces at once.
+
+In floating point; the kernel expands the same polynomial exactly, and says what it claims.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.design.continuous.graded import (
+    Graded,
+    add,
+    monomials_of,
+    multiply,
+    negative,
+    positions,
+    restrict,
+    weighted,
+)
+from nlsid_core.dynamics.vector_field import VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.polynomial.maps import monomials
+
+SHARED = ("basis", "kappa")  # by all pieces of a proof
+CELLS = 6_000_000  # Gram entries held at once
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """basis: (k, n) exponents of v. Per piece: interval, vertex of w, part index/2^level of it.
+
+    T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
+    2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
+    kappa: (n_w,) powers of two; then what w adds to ẋ is bounded with them and `vertex` is 0.
+    mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
+    y = (1, z) the multiplier of what holds in that mode. stated: (B,) how a proof writes mu and
+    tau, see `witnesses.rounded`.
+    """
+
+    basis: IntArray
+    interval: IntArray
+    vertex: IntArray
+    level: IntArray
+    index: IntArray
+    T: FloatArray
+    mu: FloatArray
+    gram: FloatArray
+    mode: IntArray
+    tau: FloatArray
+    stated: NDArray[np.object_]
+    kappa: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.interval)
+
+    @staticmethod
+    def multiplier_size(basis: IntArray) -> int:
+        """M for this basis."""
+        return len(monomials(basis.shape[1], Pieces.multiplier_degrees(basis)))
+
+    @staticmethod
+    def multiplier_degrees(basis: IntArray) -> range:
+        """The degrees of the multiplier's monomials."""
+        return range(max(2 * int(np.max(basis.sum(axis=1))) - 1, 1))
+
+    def select(self, chosen: slice | IntArray) -> "Pieces":
+        """Some of the pieces."""
+        kept = {f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name not in SHARED}
+        return replace(self, **kept)
+
+
+def batches(field: VectorField, funnel: ContinuousFunnel, pieces: Pieces) -> Iterator[IntArray]:
+    """Indices of pieces that obey the same equations, as many as fit at once."""
+    size = max(1, CELLS // (len(pieces.basis) ** 2 * 16))
+    span = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]
+    for equations in np.unique(span):
+        chosen = np.flatnonzero(span == equations)
+        for start in range(0, len(chosen), size):
+            yield chosen[start : start + size]
+
+
+def closed_loop_polynomial(
+    field: VectorField, policy: ContinuousPolicy, funnel: ContinuousFunnel, pieces: Pieces
+) -> Graded:
+    """c(s, z) of every piece, in Bernstein form times the binomials; all in one time span.
+
+    c = dρ/ds - 2x̄'P(hf - dx₀/ds) - x̄'(dP/ds)x̄ + μ(ρ - x̄'Px̄) - Στq, x̄ = Tz, s in [0, 1] on the
+    piece; derivatives are with respect to s on the whole interval, of length h. Where inputs are
+    limited, f is that of the piece's mode, and what holds in the mode is taken off.
+    """
+    n, k = field.n, pieces.interval
+    loop = _Loop(field, policy, funnel, pieces)
+    P = _linear(funnel.P)[k]
+    rho = _linear(funnel.rho)[k]
+    x_bar: list[Graded] = [{1: pieces.T[:, i][:, None]} for i in range(n)]
+    PT = _product(loop.restricted(P), pieces.T)  # (B, 2, n, n): row i is (Px̄)_i
+    rates = loop.field_times_h()
+    x_rate = loop.nominal_rate()
+    c: Graded = {0: (rho[:, 1] - rho[:, 0])[:, None, None]}
+    for i in range(n):
+        error = add(rates[i], {0: -x_rate[:, :, i][:, :, None]})
+        c = add(c, multiply({1: -2 * PT[:, :, i]}, error, n))
+    for term in loop.bounded_pushes(PT):
+        c = add(c, negative(term))
+    W: Graded = {}
+    PdotT = _product((P[:, 1] - P[:, 0])[:, None], pieces.T)
+    for i in range(n):
+        W = add(W, multiply({1: PT[:, :, i]}, x_bar[i], n))
+        c = add(c, multiply({1: -PdotT[:, :, i]}, x_bar[i], n))
+    level: Graded = {0: loop.restricted(rho)[:, :, None]}
+    c = add(c, multiply(_multiplier(pieces), add(level, negative(W)), n))
+    for term in loop.held():
+        c = add(c, negative(term))
+    return c
+
+
+def error_at_end(
+    field: VectorField,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    pieces: Pieces,
+    end: int,
+) -> FloatArray:
+    """(B, n, M) coefficients of f(x₀ + Tz, u) - ẋ₀ at one end of each piece.
+
+    M: monomials in z of degree 0 up to the largest that occurs.
+    """
+    loop = _Loop(field, policy, funnel, pieces)
+    x_rate = loop.nominal_rate()
+    h = np.diff(funnel.t)[pieces.interval]
+    rows = []
+    for i, rate in enumerate(loop.field_times_h()):
+        error = add(rate, {0: -x_rate[:, :, i][:, :, None]})
+        parts = [
+            error[q][:, -end] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
+            for q in range(field.degree + 1)
+        ]
+        rows.append(np.concatenate(parts, axis=1) / h[:, None])
+    return np.stack(rows, axis=1)
+
+
+def _multiplier(pieces: Pieces) -> Graded:
+    n, start, result = pieces.basis.shape[1], 0, {}
+    for q in pieces.multiplier_degrees(pieces.basis):
+        size = len(monomials_of(n, q))
+        result[q] = pieces.mu[:, :, start : start + size]
+        start += size
+    return result
+
+
+class _Loop:
+    """The variables t, x, u, w of the field in z and s, one batch entry per piece."""
+
+    def __init__(
+        self,
+        field: VectorField,
+        policy: ContinuousPolicy,
+        funnel: ContinuousFunnel,
+        pieces: Pieces,
+    ) -> None:
+        self.field, self.pieces = field, pieces
+        self.policy, self.funnel = policy, funnel
+        spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]
+        self.span = int(spans[0])
+        assert (spans == self.span).all()  # pieces of one batch obey the same equations
+        self.equations = field.pieces[self.span]
+        self._variables = self._affine_forms()
+        self._known: dict[tuple[int, ...], Graded] = {}
+
+    def restricted(self, control: FloatArray) -> FloatArray:
+        """Bernstein control points (B, d+1, ...) as polynomials in s on each piece."""
+        return restrict(weighted(control), self.pieces.level, self.pieces.index)
+
+    def nominal_rate(self) -> FloatArray:
+        """dx₀/ds (B, d, n)."""
+        control = self.funnel.x.control[self.pieces.interval]
+        degree = control.shape[1] - 1
+        if degree == 0:
+            return np.zeros((len(control), 1, control.shape[2]))
+        return self.restricted(degree * np.diff(control, axis=1))
+
+    def field_times_h(self) -> list[Graded]:
+        """h·f_i along the closed loop."""
+        h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
+        rates: list[Graded] = [{} for _ in self.equations]
+        for i, p in enumerate(self.equations):
+            numbers = [float(c) for c in p.coefficients.tolist()]
+            for number, exponent in zip(numbers, p.exponents.tolist(), strict=True):
+                value = self._monomial(tuple(exponent)).items()
+                rates[i] = add(rates[i], {q: number * h * part for q, part in value})
+        return rates
+
+    def bounded_pushes(self, PT: FloatArray) -> list[Graded]:
+        """h·r(κ(x̄'Pg)² + 1/κ) for each w, r half its range: at least 2|x̄'Pg|·h·|w - centre|."""
+        kappa, pushes = self.pieces.kappa, self.field.pushes(self.span)
+        if kappa is None or pushes is None:
+            return []
+        h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
+        terms = []
+        for j, (scale, radius) in enumerate(
+            zip(kappa.tolist(), (np.ptp(self.field.uncertain, axis=1) / 2).tolist(), strict=True)
+        ):
+            along: Graded = {1: np.einsum("bkij,i->bkj", PT, pushes[:, j])}
+            square = multiply(along, along, self.field.n)
+            total = add({q: scale * part for q, part in square.items()},
+                        {0: np.full((1, 1, 1), 1 / scale)})  # fmt: skip
+            terms.append({q: radius * h * part for q, part in total.items()})
+        return terms
+
+    def held(self) -> list[Graded]:
+        """τ_l q_l for every limited input: what is nonnegative in the piece's mode."""
+        n, terms = self.field.n, []
+        for place, (i, low, high) in enumerate(self.policy.limits.tolist()):
+            mode = self.pieces.mode[:, place][:, None, None]
+            demand = self.demands[int(i)]
+            above = add(demand, {0: np.full((1, 1, 1), -low)})
+            below = add(negative(demand), {0: np.full((1, 1, 1), high)})
+            q: Graded = {}
+            for part, chosen in (
+                (multiply(above, below, n), mode == 0),
+                (negative(above), mode < 0),
+                (negative(below), mode > 0),
+            ):
+                q = add(q, {degree: chosen * factor for degree, factor in part.items()})
+            terms.append(multiply(_squares(self.pieces.tau[:, :, place]), q, n))
+        return terms
+
+    def _monomial(self, exponent: tuple[int, ...]) -> Graded:
+        if exponent not in self._known:
+            last = max((j for j, e in enumerate(exponent) if e), default=-1)
+            if last < 0:
+                return {0: np.ones((len(self.pieces), 1, 1))}
+            lower = list(exponent)
+            lower[last] -= 1
+            self._known[exponent] = multiply(
+                self._monomial(tuple(lower)), self._variables[last], self.field.n
+            )
+        return self._known[exponent]
+
+    def _affine_forms(self) -> list[Graded]:
+        k, T = self.pieces.interval, self.pieces.T
+        x = self.restricted(self.policy.x.control[k])
+        u = self.restricted(self.policy.u.control[k])
+        KT = _product(self.restricted(self.policy.K.control[k]), T)
+        time = self.restricted(_linear(self.funnel.t)[k])
+        w = self.field.vertices()[self.pieces.vertex]
+        if self.pieces.kappa is not None:
+            w = np.tile(self.field.uncertain.mean(axis=1), (len(self.pieces), 1))
+        forms: list[Graded] = [{0: time[:, :, None]}]
+        forms += [{0: x[:, :, i][:, :, None], 1: T[:, None, i]} for i in range(self.field.n)]
+        self.demands: list[Graded] = [
+            {0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)
+        ]
+        forms += self._clipped()
+        forms += [{0: w[:, None, i][:, :, None]} for i in range(w.shape[1])]
+        return forms
+
+    def _clipped(self) -> list[Graded]:
+        """The inputs in each piece's mode: ũ, or a limit."""
+        inputs = list(self.demands)
+        for place, (i, low, high) in enumerate(self.policy.limits.tolist()):
+            mode = self.pieces.mode[:, place][:, None, None]
+            limit = np.where(mode < 0, low, np.where(mode > 0, high, 0.0))
+            free = {q: (mode == 0) * part for q, part in self.demands[int(i)].items()}
+            inputs[int(i)] = add(free, {0: limit})
+        return inputs
+
+
+def _squares(S: FloatArray) -> Graded:
+    """y'Sy with y = (1, z), S (B, J, n+1, n+1) in Bernstein form times the binomials."""
+    n = S.shape[-1] - 1
+    y = np.vstack([np.zeros((1, n), dtype=np.int64), monomials(n, [1])])
+    products: IntArray = (y[:, None] + y[None]).reshape(-1, n)
+    entries = S.reshape(*S.shape[:2], -1)
+    result: Graded = {}
+    for degree in range(3):
+        chosen = np.flatnonzero(products.sum(axis=1) == degree)
+        rows = monomials(n, [degree])
+        part = np.zeros((*S.shape[:2], len(rows)))
+        homes = positions(products[chosen], rows)
+        for home, entry in zip(homes.tolist(), chosen.tolist(), strict=True):
+            part[:, :, home] += entries[:, :, entry]
+        result[degree] = part
+    return result
+
+
+def _product(A: FloatArray, T: FloatArray) -> FloatArray:
+    """A(s) T for A (B, S+1, r, n) and T (B, n, n)."""
+    return np.asarray(np.einsum("bsij,bjk->bsik", A, T))
+
+
+def _linear(values: FloatArray) -> FloatArray:
+    """(K-1, 2, ...) control points of the piecewise linear function through (K, ...)."""
+    return np.stack([values[:-1], values[1:]], axis=1)

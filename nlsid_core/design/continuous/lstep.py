@@ -1,0 +1,222 @@
+"""The L-step: the largest m with (ρ̇ - Ẇ)/ρ ≥ m on the boundary W = ρ at one instant.
+
+In coordinates x̄ = √ρ L⁻ᵀz, P = LL', the boundary is |z| = 1 at every t and φ = m - ρ̇/ρ does not
+depend on ρ̇. Source: thesis (6.4), in the sphere form.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.design.continuous.line import LineProgram
+from nlsid_core.design.continuous.modes import multipliers
+from nlsid_core.dynamics import VectorField
+from nlsid_core.dynamics.piecewise import bernstein
+from nlsid_core.errors import DataError
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution
+
+MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One side of one knot: what c(s, z) is made of at that instant, except ρ.
+
+    t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
+    x̄ = √ρ·base·z.
+    span: which of the field's pieces holds.
+    """
+
+    t: float
+    x: FloatArray
+    x_rate: FloatArray
+    u: FloatArray
+    K: FloatArray
+    P: FloatArray
+    P_rate: FloatArray
+    base: FloatArray
+    span: int
+
+
+def section_at(
+    field: VectorField, policy: ContinuousPolicy, P: FloatArray, k: int, s: float
+) -> Section:
+    """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) is linear there."""
+    t = policy.t
+    h = t[k + 1] - t[k]
+    here = (1 - s) * P[k] + s * P[k + 1]
+    control = policy.x.control[k]
+    return Section(
+        t=float(t[k] + s * h),
+        x=bernstein(control, s),
+        x_rate=(len(control) - 1) * bernstein(np.diff(control, axis=0), s) / h,
+        u=bernstein(policy.u.control[k], s),
+        K=bernstein(policy.K.control[k], s),
+        P=here,
+        P_rate=(P[k + 1] - P[k]) / h,
+        base=coordinates(here, field.nonlinear_states),
+        span=field.span(float(t[k])),
+    )
+
+
+def sections(
+    field: VectorField, policy: ContinuousPolicy, P: FloatArray, *, count: int = 2
+) -> list[list[Section]]:
+    """`count` equally spaced instants of every interval, its ends included, seen from inside it."""
+    return [
+        [section_at(field, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
+        for k in range(len(policy.t) - 1)
+    ]
+
+
+def coordinates(P: FloatArray, nonlinear: tuple[int, ...]) -> FloatArray:
+    """T (n, n) with T'PT = I, in which the nonlinear states are functions of the last z only."""
+    n = len(P)
+    order = [j for j in range(n) if j not in nonlinear] + list(nonlinear)
+    L = np.linalg.cholesky(P[np.ix_(order, order)])
+    T = np.zeros((n, n))
+    T[order] = np.triu(np.linalg.inv(L).T)  # exactly triangular, not up to rounding
+    return T
+
+
+def refuse_degree(field: VectorField) -> None:
+    """Raise DataError for dynamics of a degree that no program here is for."""
+    if field.degree > MAX_DEGREE:
+        raise DataError(
+            f"the dynamics have degree {field.degree}; L-steps are solved up to {MAX_DEGREE}: "
+            "take a Taylor polynomial of lower degree, and its remainder as an uncertain w "
+            "with bounds"
+        )
+
+
+class LSteps:
+    """L-steps of one vector field; holds the sphere program and counts what is solved.
+
+    A case is a vertex of w in a mode of the policy: every vertex in the first mode comes first.
+    limits and modes: of the policy, if its inputs are clipped.
+    """
+
+    def __init__(
+        self, field: VectorField, policy: ContinuousPolicy | None = None, *, tolerance: float = 1e-5
+    ) -> None:
+        refuse_degree(field)
+        self.field = field
+        self.tolerance = tolerance
+        self.limits = np.zeros((0, 3)) if policy is None else policy.limits
+        self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
+        self.program = sphere_program(field, reduced=len(self.limits) == 0)
+        self.kappa: FloatArray | None = None
+        self.vertices = field.vertices()
+        self.solved = 0
+
+    def bound_pushes(self, P: FloatArray) -> None:
+        """If w only pushes, bound what it does on ellipsoids like {x̄'Px̄ ≤ 1}, not at corners.
+
+        κ near 1/max|x̄'Pg| makes the bound tight where the push hurts most.
+        """
+        pushes = self.field.pushes(0)
+        if self.field.is_pushed and pushes is not None:
+            largest = np.sqrt(np.einsum("ij,ik,kj->j", pushes, P, pushes))
+            self.kappa = np.exp2(np.round(-np.log2(largest)))
+            self.vertices = self.field.uncertain.mean(axis=1)[None]
+
+    @property
+    def cases(self) -> int:
+        """Vertices times modes."""
+        return len(self.vertices) * len(self.modes)
+
+    def split(self, case: int) -> tuple[int, IntArray]:
+        """The vertex and the mode of a case."""
+        mode, vertex = divmod(case, len(self.vertices))
+        return vertex, self.modes[mode]
+
+    def values(self, section: Section, rho: float, case: int) -> FloatArray:
+        """-Ẇ/ρ at the program's points, straight from the vector field in the case's mode."""
+        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        vertex, mode = self.split(case)
+        u = section.u - x_bar @ section.K.T
+        for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
+            if side:
+                u[:, int(i)] = low if side < 0 else high
+        w = self.vertices[vertex]
+        rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
+        W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
+        W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
+        pushes = self.field.pushes(section.span)
+        if self.kappa is not None and pushes is not None:
+            radius = np.ptp(self.field.uncertain, axis=1) / 2
+            along = x_bar @ section.P @ pushes
+            W_rate += (self.kappa * along**2 + 1 / self.kappa) @ radius
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+
+    def _from_defect(self, section: Section, rho: float) -> FloatArray:
+        """What the nominal's defect adds to -Ẇ/ρ along z that enter linearly, of degree 1.
+
+        The reduced basis has no product for it; the proof's Gram matrix, which has 1, does.
+        """
+        linear = [j for j in range(self.program.n) if j not in self.program.chosen]
+        if not linear:
+            return np.zeros(len(self.program.points))
+        rate = self.field(section.t, section.x[None], section.u[None], span=section.span)[0]
+        slope = -2 * section.base.T @ section.P @ (rate - section.x_rate) / np.sqrt(rho)
+        return np.asarray(self.program.points[:, linear] @ slope[linear])
+
+    def in_mode(self, section: Section, rho: float, case: int) -> FloatArray:
+        """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
+        x_bar = np.sqrt(rho) * self.program.points @ section.base.T
+        demand = section.u - x_bar @ section.K.T
+        _, mode = self.split(case)
+        rows = []
+        for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
+            above, below = demand[:, int(i)] - low, high - demand[:, int(i)]
+            rows.append(above * below if side == 0 else -above if side < 0 else -below)
+        return np.array(rows).reshape(len(self.limits), len(x_bar))
+
+    def solve(
+        self, section: Section, rho: float, start: list[SphereSolution] | None = None
+    ) -> list[SphereSolution]:
+        """φ for every case."""
+        found = []
+        for case in range(self.cases):
+            g = self.values(section, rho, case)
+            warm = None if start is None else start[case]
+            tau: FloatArray = np.zeros((0, 0, 0))
+            if len(self.limits):
+                tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
+                g = g - products
+            solved = self.program.solve(g, tolerance=self.tolerance, start=warm)
+            found.append(replace(solved, tau=tau))
+            self.solved += 1
+        return found
+
+    def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
+        """An upper bound of φ at another ρ or section, from dual solutions: no program solved.
+
+        With limits it is an estimate: the multipliers of the mode stay what they are.
+        """
+        bounds = []
+        y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
+        for case, d in enumerate(duals):
+            g = self.values(section, rho, case)
+            if len(self.limits):
+                q = self.in_mode(section, rho, case)
+                g = g - np.einsum("ln,na,lab,nb->n", q, y, d.tau, y)
+            bounds.append(float(g @ d.y))
+        return min(bounds)
+
+
+def sphere_program(field: VectorField, *, reduced: bool = True) -> SphereProgram | LineProgram:
+    """The program for this field: squares of half the degree of Ẇ.
+
+    Up to degree 3, nonlinear states come last, and degree 2 only where they occur. reduced: False
+    keeps every product, for multipliers in all states.
+    """
+    n, count = field.n, len(field.nonlinear_states)
+    half = max(2, (field.degree + 2) // 2)
+    if n == 1:
+        return LineProgram(half=half)
+    if half > 2 or count in (0, n) or not reduced:
+        return SphereProgram(n, half=half)
+    return SphereProgram(n, tuple(range(n - count, n)))

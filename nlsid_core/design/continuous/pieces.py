@@ -1,0 +1,359 @@
+"""From L-steps at the ends of pieces of time to a proof for every instant between them.
+
+The margin m of each L-step is turned into a strictly positive definite Gram matrix,
+m = m(¼ + ¾Σ(w_i v_i)²) + m(1-|z|²)ν, so that in between there is room. A piece on
+which no proof is found is halved, with a new L-step in its middle. `witnesses` writes what is found
+for the kernel, which decides.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.design.continuous.closed_loop import Pieces, batches, closed_loop_polynomial
+from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
+from nlsid_core.design.continuous.line import LineProgram
+from nlsid_core.design.continuous.lstep import LSteps, section_at
+from nlsid_core.design.continuous.sweep import Ends
+from nlsid_core.design.continuous.witnesses import documents, piece_margins, rounded, stated_margin
+from nlsid_core.errors import SolverError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.polynomial.maps import monomials
+from nlsid_core.sos.sphere import SphereProgram, SphereSolution, multinomials
+
+MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part [index, index + 1]/2^level of an interval."""
+
+    interval: int
+    level: int
+    index: int
+
+    def ends(self) -> tuple[float, float]:
+        """Start and end as fractions of the interval."""
+        return self.index / 2**self.level, (self.index + 1) / 2**self.level
+
+    def halves(self) -> tuple["Part", "Part"]:
+        """The two parts it is made of."""
+        return (
+            Part(self.interval, self.level + 1, 2 * self.index),
+            Part(self.interval, self.level + 1, 2 * self.index + 1),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Proved:
+    """pieces and each one's margin in 1/s; unproved: the parts on which no proof was found."""
+
+    pieces: Pieces
+    margins: FloatArray
+    unproved: tuple[Part, ...]
+
+
+def prove_pieces(
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    ends: list[Ends] | None = None,
+) -> Proved:
+    """A proof for all time, or the parts on which there is none.
+
+    ends: L-steps at the ends of the intervals, where they are at hand.
+    """
+    known: dict[tuple[int, float], list[SphereSolution]] = {}
+    for k, pair in enumerate(ends or []):
+        known[k, 0.0], known[k, 1.0] = pair.start, pair.end
+    waiting = [Part(k, 0, 0) for k in range(len(funnel.t) - 1)]
+    done: list[tuple[Pieces, FloatArray]] = []
+    unproved: list[Part] = []
+    while waiting:
+        solvable = [part for part in waiting if _solved(steps, policy, funnel, part, known)]
+        unproved += [part for part in waiting if part not in solvable]
+        if not solvable:
+            break
+        solvable.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
+        alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
+        pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
+        pieces = rounded(pieces)
+        margins = np.full(len(pieces), np.nan)
+        for chosen in batches(steps.field, funnel, pieces):
+            margins[chosen] = piece_margins(steps.field, policy, funnel, pieces.select(chosen))
+        by_part = np.asarray(np.isfinite(margins).reshape(len(solvable), -1).all(axis=1))
+        keep = np.repeat(by_part, steps.cases)
+        if keep.any():
+            chosen = np.flatnonzero(keep)
+            done.append((pieces.select(chosen), margins[chosen]))
+        failed = [part for part, good in zip(solvable, by_part.tolist(), strict=True) if not good]
+        unproved += [part for part in failed if part.level == MAX_LEVEL]
+        waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
+    return Proved(*_joined(steps, done), unproved=tuple(unproved))
+
+
+def _solved(
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    part: Part,
+    known: dict[tuple[int, float], list[SphereSolution]],
+) -> bool:
+    """L-steps at both ends of the part; False if one leaves no margin."""
+    k = part.interval
+    h = float(funnel.t[k + 1] - funnel.t[k])
+    for s in part.ends():
+        rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
+        if (k, s) not in known:
+            section = section_at(steps.field, policy, funnel.P, k, s)
+            try:
+                known[k, s] = steps.solve(section, rho)
+            except SolverError:
+                return False
+        growth = (funnel.rho[k + 1] - funnel.rho[k]) / h / rho
+        if min(found.m for found in known[k, s]) + growth <= 0:
+            return False
+    return True
+
+
+def _pieces(
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    parts: list[Part],
+    known: dict[tuple[int, float], list[SphereSolution]],
+) -> Pieces:
+    """The pieces of the proof for these parts, part by part, case by case, all of them in x̄."""
+    n, program = funnel.n, steps.program
+    basis = proof_basis(program)
+    full = monomials(n, Pieces.multiplier_degrees(basis))
+    linear = [j for j in range(n) if j not in steps.field.nonlinear_states]
+    order = linear + [j for j in range(n) if j not in linear]
+    both: dict[str, list[FloatArray]] = {"mu": [], "gram": [], "tau": []}
+    for end in (0, 1):
+        T, rho, rows = [], [], []
+        for part in parts:
+            s = part.ends()[end]
+            i = part.interval
+            rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
+            section = section_at(steps.field, policy, funnel.P, i, s)
+            T += [np.sqrt(rho_here) * section.base] * steps.cases
+            rho += [rho_here] * steps.cases
+            rows += known[i, s]
+        blank = draft(steps, parts, np.array(T))
+        scale = np.diff(funnel.t)[blank.interval] * rho
+        tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
+        tau = tau.reshape(len(rows), -1, n + 1, n + 1)
+        blank = replace(blank, tau=np.stack([tau, tau], axis=1))
+        c = closed_loop_polynomial(steps.field, policy, funnel, blank)
+        at_end = {q: part[:, -end] for q, part in c.items()}
+        mu, gram = [], []
+        for b, solution in enumerate(rows):
+            i = int(blank.interval[b])
+            h = float(funnel.t[i + 1] - funnel.t[i])
+            growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
+            target = {q: values[b] for q, values in at_end.items()}
+            Q, scaled = end_proof(program, solution, target, h * rho[b], solution.m + growth)
+            # From z to y = x̄ in the order in which T is triangular: z = A y.
+            A = np.triu(np.linalg.inv(T[b][order]))
+            M = substitution(basis, A)
+            gram.append(M.T @ Q @ M)
+            mu.append(substitution(full, A).T @ scaled / rho[b])
+            around = np.eye(n + 1)
+            around[1:, 1:] = A
+            tau[b] = around.T @ tau[b] @ around
+        both["mu"].append(np.array(mu))
+        both["gram"].append(np.array(gram))
+        both["tau"].append(tau)
+    # Entry j of y is x̄ at order[j]: the same numbers, of monomials with their columns exchanged.
+    back = np.argsort(order)
+    places = positions(full, full[:, back])
+    sides = np.r_[0, 1 + back]
+    return replace(
+        blank,
+        basis=basis[:, back],
+        T=np.tile(np.eye(n), (len(blank), 1, 1)),
+        mu=np.stack(both["mu"], axis=1)[:, :, places],
+        gram=np.stack(both["gram"], axis=1),
+        tau=np.stack(both["tau"], axis=1)[..., sides[:, None], sides],
+    )
+
+
+def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
+    """1 and the program's basis; with half = 3 every monomial up to degree 3.
+
+    Off the sphere degrees 0 to 2·half have to be products of the basis, each of them.
+    """
+    if program.half > 2:
+        return np.vstack([monomials_of(program.n, q) for q in range(program.half + 1)])
+    return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
+
+
+def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
+    """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
+    squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
+    return np.concatenate([[0.25], 0.75 * squares])
+
+
+def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
+    """Pieces that state frames T (parts x cases, n, n) only: μ, Q and S are zero."""
+    basis, count = proof_basis(steps.program), len(parts) * steps.cases
+    whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
+    repeated = np.repeat(whole, steps.cases, axis=0)
+    vertices, limited, n = len(steps.vertices), len(steps.limits), steps.program.n
+    return Pieces(
+        basis,
+        interval=repeated[:, 0],
+        vertex=np.tile(np.arange(steps.cases) % vertices, len(parts)),
+        level=repeated[:, 1],
+        index=repeated[:, 2],
+        T=T,
+        mu=np.zeros((count, 2, Pieces.multiplier_size(basis))),
+        gram=np.zeros((count, 2, len(basis), len(basis))),
+        mode=np.tile(np.repeat(steps.modes, vertices, axis=0), (len(parts), 1)),
+        tau=np.zeros((count, 2, limited, n + 1, n + 1)),
+        stated=np.empty(count, dtype=object),
+        kappa=steps.kappa,
+    )
+
+
+def end_proof(
+    program: SphereProgram | LineProgram,
+    solution: SphereSolution,
+    target: dict[int, FloatArray],
+    scale: float,
+    m: float,
+    *,
+    constant: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Q and ρμ with target + ρμ(1 - |z|²) = v'Qv, target/scale ≥ m on the sphere, all of m used up.
+
+    constant: the share of m that stays a constant; the rest makes Q positive definite.
+    """
+    n = program.n
+    basis = proof_basis(program)
+    Q = np.zeros((len(basis), len(basis)))
+    home = positions(program.basis, basis)
+    Q[np.ix_(home, home)] = program.gram(solution) * scale
+    spread = (1 - constant) * _spread(program, basis)
+    spread[0] += constant
+    Q[np.diag_indices(len(basis))] += scale * m * spread
+    linear = np.array([j not in program.chosen for j in range(n)])
+    first = target.get(1, np.zeros(n))
+    for j in np.flatnonzero(linear).tolist():
+        place = int(positions(np.eye(n, dtype=np.int64)[[j]], basis)[0])
+        Q[0, place] = Q[place, 0] = first[int(positions(basis[[place]], monomials_of(n, 1))[0])] / 2
+    # ρμ(1 - |z|²) = v'Qv - target, solved degree by degree from below: μ_q = d_q + |z|²μ_(q-2).
+    degrees = range(2 * program.half + 1)
+    offset = np.concatenate([target.get(q, np.zeros(len(monomials_of(n, q)))) for q in degrees])
+    rows = np.concatenate([monomials_of(n, q) for q in degrees])
+    pairs = positions((basis[:, None] + basis[None]).reshape(-1, n), rows)
+    difference = np.bincount(pairs, Q.ravel(), len(rows)) - offset
+    starts = np.cumsum([0] + [len(monomials_of(n, q)) for q in degrees])
+    squares = positions(2 * np.eye(n, dtype=np.int64), monomials_of(n, 2))
+    mu: list[FloatArray] = []
+    for q in Pieces.multiplier_degrees(basis):
+        part = difference[starts[q] : starts[q + 1]]
+        if q >= 2:
+            homes = product_table(n, 2, q - 2)[squares]
+            lower = np.broadcast_to(mu[q - 2], homes.shape)
+            part = part + np.bincount(homes.ravel(), lower.ravel(), len(part))
+        mu.append(part)
+    # Beyond its constant μ has nonlinear variables only; in others it is rounding, which products
+    # with |z|² would put where the Gram matrix has no place for it.
+    for q in range(1, len(mu)):
+        mu[q] = np.where(monomials_of(n, q)[:, linear].any(axis=1), 0.0, mu[q])
+    return Q, np.concatenate(mu)
+
+
+def substitution(rows: IntArray, A: FloatArray) -> FloatArray:
+    """M with v(Az) = M v(z), v the monomials `rows` (k, n).
+
+    Monomials that are not among the rows are dropped: with A triangular in the order of the
+    nonlinear variables their coefficients are zero.
+    """
+    n = len(A)
+    homes = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
+    forms = np.zeros((n, n))
+    forms[:, homes] = A
+    powers: dict[tuple[int, ...], FloatArray] = {(0,) * n: np.ones(1)}
+
+    def power(exponent: tuple[int, ...]) -> FloatArray:
+        if exponent not in powers:
+            last = max(j for j, e in enumerate(exponent) if e)
+            lower = power(tuple(e - (j == last) for j, e in enumerate(exponent)))
+            table = product_table(n, 1, sum(exponent) - 1)
+            products = np.outer(forms[last], lower)
+            size = len(monomials_of(n, sum(exponent)))
+            sums = np.bincount(table.ravel(), products.ravel(), size)
+            powers[exponent] = sums.astype(np.float64)
+        return powers[exponent]
+
+    M = np.zeros((len(rows), len(rows)))
+    degree = rows.sum(axis=1)
+    for q in np.unique(degree).tolist():
+        among = np.flatnonzero(degree == q)
+        columns = positions(rows[among], monomials_of(n, q))
+        for i in among.tolist():
+            M[i, among] = power(tuple(rows[i].tolist()))[columns]
+    return M
+
+
+def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Pieces, FloatArray]:
+    """All proved pieces in the order of time."""
+    if not done:
+        n = steps.program.n
+        return draft(steps, [], np.zeros((0, n, n))), np.zeros(0)
+    pieces = stacked([part for part, _ in done])
+    margins = np.concatenate([m for _, m in done])
+    modes = list(pieces.mode.T)[::-1]  # what shares its part of time and its mode is side by side
+    order = np.lexsort((pieces.vertex, *modes, pieces.index / 2.0**pieces.level, pieces.interval))
+    return pieces.select(order), margins[order]
+
+
+def stacked(parts: Sequence[Pieces]) -> Pieces:
+    """All pieces in one; they have the same basis."""
+    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram", "mode", "tau", "stated")
+    whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+    return replace(parts[0], **whole)
+
+
+def proof_of(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, proved: Proved
+) -> Json:
+    """The witnesses of all pieces as a proof states them; the kernel has not decided them yet."""
+    pieces, n = proved.pieces, funnel.n
+    margin = stated_margin(proved.margins)
+    written: list[Json] = [{}] * len(pieces)
+    for chosen in batches(steps.field, funnel, pieces):
+        found = documents(steps.field, policy, funnel, pieces.select(chosen), margin)
+        for i, document in zip(chosen.tolist(), found, strict=True):
+            written[i] = document
+    used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))
+    for document in written:
+        document["mu"] = {
+            key: [row[i] for i in used.tolist()] for key, row in document["mu"].items()
+        }
+    proof: Json = {
+        "margin": margin,
+        "basis": pieces.basis.tolist(),
+        "multiplier": monomials(n, Pieces.multiplier_degrees(pieces.basis))[used].tolist(),
+        "pieces": written,
+    }
+    if pieces.mode.shape[1]:
+        proof["sides"] = [[0] * n, *np.eye(n, dtype=int).tolist()]
+    if pieces.kappa is not None:
+        proof["kappa"] = pieces.kappa.tolist()
+    return proof
+
+
+def unsolved(policy: ContinuousPolicy, parts: tuple[Part, ...]) -> str:
+    """The first unproved part in words."""
+    part = min(parts, key=lambda p: (p.interval, p.ends()))
+    start, h = policy.t[part.interval], policy.t[part.interval + 1] - policy.t[part.interval]
+    a, b = part.ends()
+    return f"{start + a * h:.6g} to {start + b * h:.6g} s"

@@ -1,0 +1,220 @@
+"""What every search for a funnel starts from: dynamics, policy, P(t), the goal and where to end.
+
+Everything that can be wrong with what a user gives is found here, before anything slow.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.lstep import LSteps, refuse_degree, section_at
+from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
+START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
+MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
+DECAY = 3.0  # c of the thesis's first guess for the satellite
+DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """{x : |x - centre|²_P ≤ 1}, the set to end in. centre: (n,), P: (n, n) ≻ 0."""
+
+    centre: FloatArray
+    P: FloatArray
+
+    @classmethod
+    def start_of(cls, funnel: ContinuousFunnel) -> "Goal":
+        """A little less than where `funnel` starts, so that the two compose."""
+        P = START_ROOM * funnel.P[0] / funnel.rho[0]
+        return cls(funnel.x.ends()[0], np.asarray((P + P.T) / 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it."""
+
+    steps: LSteps
+    policy: ContinuousPolicy
+    P: FloatArray
+    rho_final: float
+    goal: Goal
+
+    def first_guess(self) -> ContinuousFunnel:
+        """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
+        t = self.policy.t
+        rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
+        return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
+
+    def margin(self, rho: float) -> float:
+        """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
+        end = section_at(self.steps.field, self.policy, self.P, len(self.policy.t) - 2, 1.0)
+        return MARGIN * float(np.abs(self.steps.values(end, rho, 0)).mean())
+
+
+def prepare(
+    dynamics: VectorField | Callable[..., Any],
+    nominal: Nominal,
+    *,
+    goal: Goal | ArrayLike | None,
+    policy: ContinuousPolicy | None,
+    Q: ArrayLike | None,
+    R: ArrayLike | None,
+    gain: str,
+    limits: ArrayLike | None = None,
+) -> Setting:
+    """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
+    sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
+    field = dynamics if isinstance(dynamics, VectorField) else VectorField.from_function(
+        dynamics, *sizes
+    )  # fmt: skip
+    refuse_nominal(field, nominal)
+    Q = definite(np.eye(field.n) if Q is None else Q, field.n, "Q", strict=False)
+    R = definite(np.eye(field.m) if R is None else R, field.m, "R", strict=True)
+    refuse_degree(field)
+    wanted = _wanted_goal(goal, nominal, field.n)
+    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
+    policy, S = tracking.policy, tracking.S
+    if limits is not None:
+        policy = replace(policy, limits=np.asarray(limits, dtype=np.float64))
+    refuse_saturated(policy)
+    steps = LSteps(field, policy)
+    steps.bound_pushes(S[-1])
+    rho_final, target = _final(steps, policy, S, wanted)
+    return Setting(steps, policy, S, rho_final, target)
+
+
+def refuse_first(setting: Setting, rho: FloatArray) -> None:
+    """Raise DataError unless a first ρ (K,) given by a user is positive and ends in the goal."""
+    if rho.shape != setting.policy.t.shape or not (np.isfinite(rho).all() and (rho > 0).all()):
+        raise DataError(
+            f"the first rho should be {len(setting.policy.t)} positive numbers, one per knot; it "
+            f"has shape {rho.shape}"
+        )
+    if rho[-1] > setting.rho_final:
+        raise DataError(
+            f"the first rho does not end in the goal: rho(t_f) = {rho[-1]:.6g}, and the goal holds "
+            f"what ends with at most {setting.rho_final:.6g}. Scale it down, or take a larger goal"
+        )
+
+
+def refuse_nominal(field: VectorField, nominal: Nominal) -> None:
+    """Raise unless the nominal fits the dynamics' sizes and obeys them well enough."""
+    sizes = (nominal.x.control.shape[2], nominal.u.control.shape[2])
+    if sizes != (field.n, field.m):
+        raise DataError(
+            f"the nominal has {sizes[0]} states and {sizes[1]} inputs, the dynamics {field.n} and "
+            f"{field.m}"
+        )
+    gap, t, state = nominal.defect(field)
+    scale = float(np.abs(nominal.x.derivative().control).max())
+    if gap > DEFECT * max(scale, 1e-9):
+        raise DataError(
+            f"the nominal does not obey the dynamics: dx{state}/dt is off by {gap:.3g} at "
+            f"t = {t:.6g} s (the largest rate is {scale:.3g}); use integrate_nominal "
+            "or more knots"
+        )
+
+
+def refuse_saturated(policy: ContinuousPolicy) -> None:
+    """Raise DataError unless the nominal's own inputs are within the policy's limits."""
+    for i, low, high in policy.limits.tolist():
+        u = policy.u.control[:, :, int(i)]
+        least, most = float(np.min(u)), float(np.max(u))
+        if not (low < least and most < high):
+            raise DataError(
+                f"the nominal's input {int(i)} needs [{least:.6g}, {most:.6g}], its limits are "
+                f"[{low:g}, {high:g}]: no room is left to correct anything"
+            )
+
+
+def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goal | None:
+    if goal is None or isinstance(goal, Goal):
+        wanted = goal
+    else:
+        wanted = Goal(nominal.x.ends()[-1], np.asarray(goal, dtype=np.float64))
+    if wanted is not None:
+        if wanted.P.shape != (n, n) or wanted.centre.shape != (n,):
+            raise DataError(f"the goal should be an ellipsoid in {n} states")
+        if not (wanted.P == wanted.P.T).all() or np.linalg.eigvalsh(wanted.P)[0] <= 0:
+            raise DataError("the goal's matrix should be symmetric positive definite")
+        d = nominal.x.ends()[-1] - wanted.centre
+        if d @ wanted.P @ d >= 1:
+            raise DataError(
+                f"the nominal ends outside the goal: |x - centre|² = {d @ wanted.P @ d:.3g} > 1"
+            )
+    return wanted
+
+
+def _tracking(
+    field: VectorField,
+    nominal: Nominal,
+    goal: Goal | None,
+    policy: ContinuousPolicy | None,
+    Q: FloatArray,
+    R: FloatArray,
+    gain: str,
+) -> Tracking:
+    """ContinuousPolicy and P(t): of the LQR, or the given policy with its Lyapunov equation."""
+    if goal is not None:
+        final = GOAL_ROOM * goal.P
+    else:
+        A, B = field.jacobians(float(nominal.t[-1]), nominal.x.ends()[-1], nominal.u.ends()[-1])
+        try:
+            final = solve_continuous_are(A, B, Q, R)
+            final = (final + final.T) / 2
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise Infeasible(
+                "the linearisation at the nominal's end cannot be stabilised by any gain "
+                f"({error}): it is uncontrollable, or Q or R is indefinite. Give a goal "
+                "and a policy."
+            ) from error
+    if policy is None:
+        return tvlqr(field, nominal, Q=Q, R=R, S_final=final, gain=gain)
+    if policy.vector_field != files.digest(field.document()):
+        raise DataError("the policy was made for other dynamics")
+    same = np.array_equal(policy.x.control, nominal.x.control)
+    if not same or not np.array_equal(policy.t, nominal.t):
+        raise DataError("the policy is around another nominal")
+    return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
+
+
+def _final(
+    steps: LSteps, policy: ContinuousPolicy, S: FloatArray, goal: Goal | None
+) -> tuple[float, Goal]:
+    """ρ(t_f) and the goal: the largest level inside a given goal, or one the end itself keeps."""
+    end = policy.x.ends()[-1]
+    if goal is None:
+        section = section_at(steps.field, policy, S, len(S) - 2, 1.0)
+        low, high = 0.0, np.inf
+        rho = 1.0
+        for _ in range(24):
+            kept = min(s.m for s in steps.solve(section, rho)) > 0
+            low, high = (rho, high) if kept else (low, rho)
+            rho = 4 * low if np.isinf(high) else (high / 4 if low == 0 else (low + high) / 2)
+            if low and high / low < 1.05:
+                break
+        if low == 0:
+            raise Infeasible(
+                "the closed loop keeps no set at the end: give a goal, or another Q and R"
+            )
+        return low, Goal(end, S[-1] / (GOAL_ROOM * low))
+    low, high = 0.0, 1.0
+    d = end - goal.centre
+    if not d.any():
+        return 1.0, goal
+    for _ in range(40):
+        middle = (low + high) / 2
+        found = ellipsoid_inside(end, S[-1] / middle, goal.centre, goal.P)
+        low, high = (low, middle) if found is None else (middle, high)
+    return low * (1 - 1e-6), goal

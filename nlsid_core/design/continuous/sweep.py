@@ -1,0 +1,139 @@
+"""ρ(t) by one backward sweep: the largest piecewise-linear ρ that the L-steps allow.
+
+With s = log ρ the condition is ṡ ≥ margin - φ(t, ρ) at both ends of every interval, so each ρ_k
+follows from ρ_{k+1}: no alternation, no objective.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.lstep import LSteps, Section
+from nlsid_core.errors import Infeasible
+from nlsid_core.sos.sphere import SphereSolution
+
+ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
+MAX_TRIES = 12
+NEAR = 1.01  # of a feasible ρ: closer to the largest is not worth another program
+LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """One interval's L-steps: solutions at its start and end per vertex; margins include ρ̇/ρ."""
+
+    start: list[SphereSolution]
+    end: list[SphereSolution]
+
+
+def sweep_rho(
+    steps: LSteps,
+    instants: Sequence[Sequence[Section]],
+    *,
+    margin: float,
+    rho_final: float = 1.0,
+    caps: FloatArray | None = None,
+    progress: Progress | None = None,
+) -> tuple[FloatArray, list[Ends]]:
+    """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
+
+    instants: per interval its start, its end and, between them, others where ρ has to hold too.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. caps: (K,) that ρ keeps below.
+    Raises Infeasible naming the time.
+    """
+    rho = np.empty(len(instants) + 1)
+    rho[-1] = rho_final
+    ends: list[Ends] = []
+    duals: list[SphereSolution] | None = None
+    for k in range(len(instants) - 1, -1, -1):
+        start, *between, end = instants[k]
+        h = end.t - start.t
+        at_end = steps.solve(end, rho[k + 1], duals)
+        phi = min(s.m for s in at_end)
+        cap = rho[k + 1] * (1 + h * (phi - margin))
+        if caps is not None:
+            cap = min(cap, float(caps[k]))
+        for section in between:
+            share = (section.t - start.t) / h
+            cap, _ = _largest(steps, section, share, rho[k + 1], h, cap, margin, at_end)
+        rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end)
+        ends.append(Ends(at_start, at_end))
+        duals = at_start
+        if progress is not None:
+            progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
+    return rho, ends[::-1]
+
+
+def _largest(
+    steps: LSteps,
+    section: Section,
+    share: float,
+    after: float,
+    h: float,
+    cap: float,
+    margin: float,
+    duals: list[SphereSolution],
+) -> tuple[float, list[SphereSolution]]:
+    """The largest ρ_k ≤ cap with which the L-step at s = share leaves the margin, and that L-step.
+
+    ρ is linear from ρ_k to `after`.
+    """
+
+    def here(rho: float) -> float:
+        return (1 - share) * rho + share * after
+
+    def slack(rho: float, phi: float) -> float:
+        return phi + (after - rho) / here(rho) / h - margin
+
+    feasible, infeasible = 0.0, np.inf
+    best: list[SphereSolution] | None = None
+    estimated = len(steps.limits) > 0  # then `predicted` may be too low, and more be possible
+    for _ in range(MAX_TRIES):
+        if cap <= LOWEST * after:
+            break
+        known = duals
+        rho = _root(lambda r: slack(r, steps.predicted(section, here(r), known)),  # noqa: B023
+                    LOWEST * after, min(cap, infeasible))  # fmt: skip
+        if best is not None and rho <= feasible:
+            break
+        found = steps.solve(section, here(rho), duals)
+        left = slack(rho, min(s.m for s in found))
+        if left >= -ACCEPT * margin:
+            if not estimated or rho >= cap:
+                return rho, found
+            done = rho <= NEAR * feasible
+            feasible, best = rho, found
+            if done:
+                break
+        else:
+            infeasible = min(infeasible, rho)
+        duals = found
+    if best is None:
+        raise Infeasible(
+            f"no rho at t = {section.t:.6g} s keeps solutions inside: the linearisation may not be "
+            "stabilised there. Try more knots, another P (Q and R of the LQR), or a smaller goal."
+        )
+    return feasible, best
+
+
+def _root(slack: Callable[[float], float], low: float, high: float) -> float:
+    """The largest r in [low, high] with slack(r) ≥ 0, by bisection on log r after a coarse look."""
+    if slack(high) >= 0:
+        return high
+    step = 0.9
+    inside = high
+    while inside > low and slack(inside) < 0:
+        high, inside = inside, inside * step
+        step *= step
+    if inside <= low:
+        return low
+    for _ in range(40):
+        middle = (inside + high) / 2
+        if high - inside <= 1e-9 * high:
+            break
+        inside, high = (middle, high) if slack(middle) >= 0 else (inside, middle)
+    return inside

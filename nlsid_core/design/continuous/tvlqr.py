@@ -1,0 +1,225 @@
+"""Time-varying LQR and Lyapunov functions along a nominal motion: Riccati and Lyapunov equations.
+
+Source: thesis Sections 5.2 and 6.1, (6.2).
+"""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.dynamics import (
+    Nominal,
+    PiecewisePolynomial,
+    VectorField,
+    constant_on,
+    cubic_through,
+    linear_through,
+)
+from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+RTOL, ATOL = 1e-9, 1e-10  # of the integrations; P's interpolation error is far larger
+NOMINAL_RTOL, NOMINAL_ATOL = 1e-11, 1e-12
+BLOW_UP = 1e12  # relative growth of S past which the linearisation is as good as uncontrollable
+DIFFERENCE = 1e-5  # of a knot interval, for the slope of B: errors of 1e-10
+GAINS = ("constant", "linear", "cubic")
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """A policy and its cost-to-go S (K, n, n) at the knots."""
+
+    policy: ContinuousPolicy
+    S: FloatArray
+
+
+def tvlqr(
+    field: VectorField,
+    nominal: Nominal,
+    *,
+    Q: ArrayLike,
+    R: ArrayLike,
+    S_final: ArrayLike,
+    gain: str = "constant",
+) -> Tracking:
+    """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
+
+    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots.
+
+    Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
+    """
+    Q = definite(Q, field.n, "Q", strict=False)
+    R = definite(R, field.m, "R", strict=True)
+    S_final = definite(S_final, field.n, "S_final", strict=True)
+    if gain not in GAINS:
+        raise DataError(f"gain is '{gain}'; known: {', '.join(GAINS)}")
+    R_inverse = np.linalg.inv(R)
+
+    def rate(t: float, S: FloatArray) -> FloatArray:
+        A, B = _linearised(field, nominal, t)
+        BS = B.T @ S
+        return np.asarray(-(A.T @ S + S @ A - BS.T @ R_inverse @ BS + Q))
+
+    S = _backward(
+        rate, nominal.t, S_final, "the Riccati equation: is the linearisation controllable?"
+    )
+
+    def gain_at(k: int, side: float) -> FloatArray:
+        return np.asarray(R_inverse @ _linearised(field, nominal, nominal.t[k], side)[1].T @ S[k])
+
+    knots = len(nominal.t)
+    before = np.array([gain_at(k, -1.0) for k in range(1, knots)])
+    after = np.array([gain_at(k, 1.0) for k in range(knots - 1)])
+    if gain == "constant":
+        K = constant_on(nominal.t, after)
+    elif gain == "linear":
+        K = PiecewisePolynomial(nominal.t, np.stack([after, before], axis=1))
+    else:
+        K = _cubic_gain(field, nominal, S, R_inverse, rate)
+    policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
+    return Tracking(policy, S)
+
+
+def lyapunov(
+    field: VectorField, policy: ContinuousPolicy, *, Q: ArrayLike, P_final: ArrayLike
+) -> FloatArray:
+    """P (K, n, n) at the knots from -Ṗ = A'P + PA + Q along the closed loop, thesis (6.2)."""
+    Q = definite(Q, field.n, "Q", strict=False)
+    P_final = definite(P_final, field.n, "P_final", strict=True)
+    nominal = Nominal(policy.x, policy.u)
+
+    def rate(t: float, P: FloatArray) -> FloatArray:
+        A, B = _linearised(field, nominal, t)
+        closed = A - B @ policy.K(t)
+        return np.asarray(-(closed.T @ P + P @ closed + Q))
+
+    return _backward(rate, nominal.t, P_final, "the Lyapunov equation")
+
+
+def integrate_nominal(
+    field: VectorField,
+    u: Callable[[float], ArrayLike] | PiecewisePolynomial,
+    *,
+    t: ArrayLike,
+    start: ArrayLike | None = None,
+    final: ArrayLike | None = None,
+) -> Nominal:
+    """The motion with input u(t) from `start` at t[0], or back from `final` at t[-1], as cubics.
+
+    t: (K,) knots in s. Raises DataError unless one end is given and the knots increase.
+    """
+    t = np.asarray(t, dtype=np.float64)
+    if (start is None) == (final is None):
+        raise DataError("give the state at the start or at the end, not both")
+    given = np.asarray(start if final is None else final, dtype=np.float64)
+    inputs = u if isinstance(u, PiecewisePolynomial) else _cubic_input(u, t)
+    values = inputs.ends()
+    span, order = ((t[0], t[-1]), t) if final is None else ((t[-1], t[0]), t[::-1])
+    solved = solve_ivp(
+        lambda s, x: field(s, x[None], inputs(s)[None])[0],
+        span,
+        given,
+        t_eval=order,
+        rtol=NOMINAL_RTOL,
+        atol=NOMINAL_ATOL,
+        max_step=float(np.diff(t).min()),
+    )
+    if not solved.success or solved.y.shape[1] != len(t):
+        raise SolverError(f"the nominal cannot be integrated: {solved.message}")
+    x = solved.y.T if final is None else solved.y.T[::-1]
+    rates = np.array([field(s, x[k][None], values[k][None])[0] for k, s in enumerate(t)])
+    return Nominal(cubic_through(t, x, rates), inputs)
+
+
+def nominal_through(t: ArrayLike, x: ArrayLike, u: ArrayLike, field: VectorField) -> Nominal:
+    """Samples x (K, n), u (K, m) at times t (K,), as cubics with the field's slopes."""
+    t, x, u = (np.asarray(part, dtype=np.float64) for part in (t, x, u))
+    inputs = linear_through(t, u)
+    rates = np.array([field(s, x[k][None], u[k][None])[0] for k, s in enumerate(t)])
+    return Nominal(cubic_through(t, x, rates), inputs)
+
+
+def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePolynomial:
+    """Cubics through u at four Chebyshev-like points of each interval: exact for cubic u(t)."""
+    pieces = []
+    share = np.array([0.0, 1 / 3, 2 / 3, 1.0])
+    # Values at the four points from Bernstein control points, inverted.
+    to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
+                          for s in share])  # fmt: skip
+    for start, end in itertools.pairwise(t):
+        values = np.array([np.asarray(u(float(start + s * (end - start))), float) for s in share])
+        pieces.append(np.linalg.solve(to_values, values))
+    control = np.array(pieces)
+    control[1:, 0] = control[:-1, -1]
+    return PiecewisePolynomial(t, control)
+
+
+def _cubic_gain(
+    field: VectorField,
+    nominal: Nominal,
+    S: FloatArray,
+    R_inverse: FloatArray,
+    rate: Callable[[float, FloatArray], FloatArray],
+) -> PiecewisePolynomial:
+    """K = R⁻¹B'S with its slopes R⁻¹(B'Ṡ + Ḃ'S), Ṡ from the Riccati equation."""
+    t = nominal.t
+    step = DIFFERENCE * float(np.min(np.diff(t)))
+    B, ahead, behind = (
+        np.array([_linearised(field, nominal, float(s) + shift)[1] for s in t])
+        for shift in (0.0, step, -step)
+    )
+    B_rate = (ahead - behind) / (2 * step)
+    S_rate = np.array([rate(float(s), S[k]) for k, s in enumerate(t)])
+    values = R_inverse @ B.transpose(0, 2, 1) @ S
+    slopes = R_inverse @ (B.transpose(0, 2, 1) @ S_rate + B_rate.transpose(0, 2, 1) @ S)
+    return cubic_through(t, values, slopes)
+
+
+def _linearised(
+    field: VectorField, nominal: Nominal, t: float, side: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    inside = np.clip(t + side * 1e-12, nominal.t[0], nominal.t[-1])
+    return field.jacobians(float(inside), nominal.x(t), nominal.u(t))
+
+
+def _backward(
+    rate: Callable[[float, FloatArray], FloatArray], t: FloatArray, final: FloatArray, what: str
+) -> FloatArray:
+    n = len(final)
+
+    def flat(s: float, S: FloatArray) -> FloatArray:
+        return rate(s, S.reshape(n, n)).ravel()
+
+    def explodes(_: float, S: FloatArray) -> float:
+        return float(BLOW_UP * np.abs(final).max() - np.abs(S).max())
+
+    explodes.terminal = True  # type: ignore[attr-defined]
+    solved: Any = solve_ivp(
+        flat, (t[-1], t[0]), final.ravel(), t_eval=t[::-1], rtol=RTOL, atol=ATOL, events=explodes
+    )
+    if not solved.success or solved.y.shape[1] != len(t):
+        raise Infeasible(f"no bounded solution of {what} ({solved.message})")
+    S = solved.y.T[::-1].reshape(-1, n, n)
+    return np.asarray((S + S.transpose(0, 2, 1)) / 2)
+
+
+def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
+    """M as a symmetric (n, n) array; DataError unless it is one, ⪰ 0 or, if strict, ≻ 0."""
+    M = np.asarray(M, dtype=np.float64)
+    if (
+        M.shape != (n, n)
+        or not np.isfinite(M).all()
+        or not np.allclose(M, M.T, rtol=1e-12, atol=0.0)
+    ):
+        raise DataError(f"{name} should be a symmetric {n}x{n} matrix, has shape {M.shape}")
+    lowest = float(np.linalg.eigvalsh(M)[0]) if n else 1.0
+    if lowest < 0 or (strict and lowest <= 0):
+        kind = "positive definite" if strict else "positive semidefinite"
+        raise DataError(f"{name} should be {kind}; its smallest eigenvalue is {lowest:.3g}")
+    return np.asarray((M + M.T) / 2)

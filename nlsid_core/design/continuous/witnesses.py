@@ -1,0 +1,248 @@
+"""From pieces in floating point to what the kernel decides: small whole numbers.
+
+Multipliers are rounded first; the polynomial c(s, x̄) is then what it is, and its Gram matrices are
+corrected to it. Half of what the constant can lose is the margin. The rest is written as factors
+R_j of low degree in s, with room for rounding. Source: docs/certificate_continuous_funnel.md.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import comb, floor, frexp, ldexp
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
+from nlsid_core.design.continuous.graded import Graded, elevate, monomials_of, positions
+from nlsid_core.dynamics.vector_field import VectorField
+from nlsid_core.errors import Infeasible
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.polynomial.maps import monomials
+from nlsid_core.sos.witness import multiplier, witness
+
+SHARE = 0.5  # of what the constant can lose that becomes the margin
+FIT = 0.2  # of the least eigenvalue of the scaled Gram matrices: how well factors have to fit
+MU_BITS, TAU_BITS = 32, 24  # of multipliers, relative to the largest coefficient on the funnel
+MARGIN_BITS = 10  # of the margin that is stated
+MAX_DEGREE = 23  # of the factors in s: what the kernel takes
+
+
+def rounded(pieces: Pieces) -> Pieces:
+    """The pieces in x̄ with multipliers of few bits, and how a proof states these."""
+    n = pieces.basis.shape[1]
+    rows = monomials(n, pieces.multiplier_degrees(pieces.basis))
+    places = positions(
+        np.vstack([np.zeros((1, n), dtype=np.int64), monomials(n, [1])]), pieces.basis
+    )
+    diagonal = np.diagonal(pieces.gram, axis1=2, axis2=3).max(axis=1)[:, places]
+    reach = np.sqrt(diagonal[:, :1] / diagonal[:, 1:])  # of each x̄_i on the funnel, nearly
+    sizes = np.exp(np.log(reach) @ monomials(n, [1]).T @ rows.T)  # (B, M) of the monomials
+    largest = (np.abs(pieces.mu).max(axis=1) * sizes).max(axis=1, keepdims=True)
+    shifts = np.round(np.log2(largest / sizes)).astype(np.int64) - MU_BITS
+    whole = np.round(pieces.mu * np.exp2(-shifts[:, None].astype(np.float64)))
+    tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
+    sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
+    for b in range(len(pieces)):
+        stated[b] = {
+            "mu": {
+                "shifts": shifts[b].tolist(),
+                "start": whole[b, 0].astype(np.int64).tolist(),
+                "end": whole[b, 1].astype(np.int64).tolist(),
+            }
+        }
+        factors = []
+        for limited in range(tau.shape[2]):
+            found = multiplier(sides, pieces.tau[b, :, limited], bits=TAU_BITS)
+            tau[b, :, limited] = matrices(found["columns"], found["squares"])
+            factors.append({"columns": found["columns"], "squares": found["squares"]})
+        if factors:
+            stated[b] |= {"mode": pieces.mode[b].tolist(), "tau": factors}
+    mu = whole * np.exp2(shifts[:, None].astype(np.float64))
+    return replace(pieces, mu=mu, tau=tau, stated=stated)
+
+
+def matrices(columns: Sequence[int], squares: Json) -> FloatArray:
+    """(J+1, k, k) what factors of whole numbers stand for."""
+    k = len(columns)
+    result = np.zeros((len(squares["factors"]), k, k))
+    for j, factor in enumerate(squares["factors"]):
+        R = np.array([[0.0] * (k - len(row)) + [float(e) for e in row] for row in factor])
+        R = R.reshape(-1, k) * np.exp2(np.array(columns, dtype=float) - squares["unit"])
+        result[j] = R.T @ R
+    return result
+
+
+def piece_margins(
+    field: VectorField, policy: ContinuousPolicy, funnel: ContinuousFunnel, pieces: Pieces
+) -> FloatArray:
+    """Each piece's margin in 1/s; nan where its Gram matrices are not positive definite."""
+    curves = _Curves.of(field, policy, funnel, pieces)
+    lowest = np.linalg.eigvalsh(curves.scaled()).min(axis=(1, 2))
+    margins = np.full(len(pieces), np.nan)
+    sound = np.isfinite(lowest) & (lowest > 0)
+    if sound.any():
+        Q = curves.grams[sound]
+        constant = 1 / np.linalg.inv(Q)[:, :, curves.one, curves.one]  # Schur complement
+        margins[sound] = SHARE * (constant / curves.room[sound]).min(axis=1)
+    margins[~(margins > 0)] = np.nan
+    return margins
+
+
+def stated_margin(margins: FloatArray) -> float:
+    """The least margin, rounded down to few bits."""
+    part, exponent = frexp(float(np.min(margins)))
+    return ldexp(floor(ldexp(part, MARGIN_BITS)), exponent - MARGIN_BITS)
+
+
+def documents(
+    field: VectorField,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    pieces: Pieces,
+    margin: float,
+) -> list[Json]:
+    """The pieces as the kernel reads them, all of one time span, for this margin in 1/s.
+
+    Raises Infeasible if no factors of few enough degrees in s are near enough.
+    """
+    curves = _Curves.of(field, policy, funnel, pieces)
+    grams = curves.grams
+    grams[:, :, curves.one, curves.one] -= margin * curves.room
+    found = []
+    for b in range(len(pieces)):
+        squares = witness(pieces.basis, curves.fitted(grams[b]))
+        found.append(
+            {
+                "interval": int(pieces.interval[b]),
+                "vertex": int(pieces.vertex[b]),
+                "level": int(pieces.level[b]),
+                "index": int(pieces.index[b]),
+                **pieces.stated[b],
+                "columns": squares["columns"],
+                "squares": squares["squares"],
+            }
+        )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Curves:
+    """grams: (B, N+1, k, k) Bernstein control points of Q(s), c = v'Qv. room: (B, N+1) of hρ(s).
+
+    one: the place of the monomial 1 in v. charged: (k, k) one place of each product of v: what the
+    kernel charges for that monomial.
+    """
+
+    grams: FloatArray
+    room: FloatArray
+    one: int
+    of_pairs: IntArray
+    charged: tuple[IntArray, IntArray]
+
+    @classmethod
+    def of(
+        cls,
+        field: VectorField,
+        policy: ContinuousPolicy,
+        funnel: ContinuousFunnel,
+        pieces: Pieces,
+    ) -> "_Curves":
+        basis = pieces.basis
+        c, rows = _together(closed_loop_polynomial(field, policy, funnel, pieces), basis.shape[1])
+        N = c.shape[1] - 1
+        c = c / np.array([comb(N, j) for j in range(N + 1)])[:, None]
+        of_pairs = positions((basis[:, None] + basis[None]).reshape(-1, basis.shape[1]), rows)
+        count = np.bincount(of_pairs, minlength=len(rows))
+        share = (np.arange(N + 1) / max(N, 1))[:, None, None]
+        grams = (1 - share) * pieces.gram[:, :1] + share * pieces.gram[:, 1:]
+        missing = (c - _sums(grams, of_pairs, len(rows))) / np.maximum(count, 1)
+        grams = grams + missing[..., of_pairs].reshape(grams.shape)
+        ends = funnel.rho[pieces.interval], funnel.rho[pieces.interval + 1]
+        first, last = ((pieces.index + end) / 2.0**pieces.level for end in (0, 1))
+        at = first[:, None] + (last - first)[:, None] * share[:, 0, 0]
+        rho = (1 - at) * ends[0][:, None] + at * ends[1][:, None]
+        h = np.diff(funnel.t)[pieces.interval]
+        one = int(np.flatnonzero(~basis.any(axis=1))[0])
+        return cls(
+            (grams + grams.swapaxes(-1, -2)) / 2,
+            h[:, None] * rho,
+            one,
+            of_pairs,
+            _charged(of_pairs),
+        )
+
+    def scaled(self) -> FloatArray:
+        """The Gram matrices with a unit diagonal."""
+        root = np.sqrt(np.maximum(np.diagonal(self.grams, axis1=2, axis2=3), 1e-300))
+        return np.asarray(self.grams / root[..., :, None] / root[..., None, :])
+
+    def fitted(self, grams: FloatArray) -> FloatArray:
+        """(J+1, k, k) control points of the lowest degree that are near enough to (N+1, k, k)."""
+        N, k = len(grams) - 1, grams.shape[1]
+        diagonal = np.diagonal(grams, axis1=1, axis2=2).max(axis=0)
+        scale = np.exp2(-np.round(np.log2(diagonal) / 2))  # as the factors are scaled
+        S = grams * scale[:, None] * scale
+        for J in range(min(N, 1), min(N, MAX_DEGREE) + 1):
+            lift = _lift(J, N)
+            points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), S)
+            lowest = float(np.linalg.eigvalsh(points)[:, 0].min())
+            gap = _sums(S - np.einsum("kj,jab->kab", lift, points), self.of_pairs, None)
+            rows, columns = self.charged
+            errors = np.zeros((N + 1, k, k))
+            errors[:, rows, columns] = np.abs(gap)
+            errors[:, columns, rows] = np.abs(gap)
+            if errors.sum(axis=2).max() <= FIT * lowest:
+                return np.asarray(points / scale[:, None] / scale)
+        raise Infeasible(f"the Gram matrices of a piece need factors of degree above {MAX_DEGREE}")
+
+
+def _sums(Q: FloatArray, of_pairs: IntArray, count: int | None) -> FloatArray:
+    """(..., M) coefficients of v'Qv for Q (..., k, k)."""
+    order = np.argsort(of_pairs, kind="stable")
+    present, starts = np.unique(of_pairs[order], return_index=True)
+    sums = np.add.reduceat(Q.reshape(*Q.shape[:-2], -1)[..., order], starts, axis=-1)
+    if count is None:
+        return np.asarray(sums)
+    result = np.zeros((*Q.shape[:-2], count))
+    result[..., present] = sums
+    return result
+
+
+def _charged(of_pairs: IntArray) -> tuple[IntArray, IntArray]:
+    """For each product of v, in increasing order: itself if it is a square, else its first pair."""
+    k = round(len(of_pairs) ** 0.5)
+    table = of_pairs.reshape(k, k)
+    homes: dict[int, tuple[int, int]] = {}
+    for i in range(k):
+        for j in range(i + 1, k):
+            homes.setdefault(int(table[i, j]), (i, j))
+    homes |= {int(table[i, i]): (i, i) for i in range(k)}
+    places = np.array([homes[m] for m in sorted(homes)])
+    return places[:, 0], places[:, 1]
+
+
+def _lift(J: int, N: int) -> FloatArray:
+    """(N+1, J+1) Bernstein control points of degree N from those of degree J."""
+    return np.array(
+        [
+            [comb(J, j) * comb(N - J, k - j) / comb(N, k) if 0 <= k - j <= N - J else 0.0
+             for j in range(J + 1)]
+            for k in range(N + 1)
+        ]
+    )  # fmt: skip
+
+
+def _together(c: Graded, n: int) -> tuple[FloatArray, IntArray]:
+    """All degrees in one array (B, N+1, M), and its monomials (M, n)."""
+    degrees = range(max(c) + 1)
+    rows = np.concatenate([monomials_of(n, q) for q in degrees])
+    N = max(part.shape[1] for part in c.values()) - 1
+    batch = max(part.shape[0] for part in c.values())
+    parts = [
+        elevate(np.broadcast_to(c[q], (batch, *c[q].shape[1:])), N)
+        if q in c
+        else np.zeros((batch, N + 1, len(monomials_of(n, q))))
+        for q in degrees
+    ]
+    return np.concatenate(parts, axis=2), rows

@@ -1,0 +1,45 @@
+"""`design`: a problem in; policy, funnel and proof out, whatever the kind.
+
+Each kind has one search, which the kernel decides before anything is returned.
+"""
+
+from concurrent.futures import Executor
+from typing import overload
+
+from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
+from nlsid_core.design.continuous.sweep import Progress
+from nlsid_core.design.linear import TubeDesign, design_tube
+from nlsid_core.design.problems import ContinuousTracking, LinearTube, SampledTracking
+from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
+
+
+@overload
+def design(problem: LinearTube) -> TubeDesign: ...
+@overload
+def design(problem: SampledTracking, *, progress: Progress | None = None) -> TrackingDesign: ...
+@overload
+def design(
+    problem: ContinuousTracking,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> FunnelDesign: ...
+def design(
+    problem: LinearTube | SampledTracking | ContinuousTracking,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+) -> TubeDesign | TrackingDesign | FunnelDesign:
+    """A policy and a funnel for the problem, proved; `Design.save` writes them and the proof.
+
+    executor: shares work that splits. progress: called with (what was done, fraction done).
+    Raises DataError on a problem that makes no sense, Infeasible if no funnel was found or proved,
+    CertificateRejected if an assumption is not one that the kernel accepts.
+    """
+    match problem:
+        case LinearTube():
+            return design_tube(**vars(problem))
+        case SampledTracking():
+            return design_state_funnel(**vars(problem), progress=progress)
+        case ContinuousTracking():
+            return design_funnel(**vars(problem), executor=executor, progress=progress)

@@ -1,0 +1,108 @@
+"""What `design` solves: a frozen dataclass for each kind of funnel, checked when it is made."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from nlsid_core.arrays import ArrayLike
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design.continuous.setting import Goal
+from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.sampled.motion import Feedback
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.errors import OptionError
+from nlsid_core.funnels.sampled import DisturbanceAssumption
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.options import require_at_least, require_one_of, require_positive
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.sampled import SampledPolicy
+
+Shape = Literal["rho", "P"]
+Objective = Literal["volume", "reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearTube:
+    """Policy, observer and tube of an identified model, under a bound on the innovations' energy.
+
+    train: what the bound is measured on. profile: (s, output) corners of the nominal. horizon: s,
+    how long the energy budget lasts. safety_factor: of the disturbance's amplitude over the largest
+    measured, at least 1. inlet: allowed initial error of the output, in its unit. lqr_weights: of
+    output and input, positive; None is K = 0, a prediction tube.
+    Source: energy form of a disturbance bound, linear case.
+    """
+
+    model: DifferenceEquation
+    train: Dataset
+    profile: Sequence[tuple[float, float]]
+    horizon: float
+    safety_factor: float = 1.5
+    inlet: float = 0.0
+    lqr_weights: tuple[float, float] | None = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if len(self.profile) < 2:
+            raise OptionError("profile", self.profile, "two or more corners (s, output)")
+        require_positive(self, "horizon")
+        require_at_least(self, "safety_factor", 1.0)
+        require_at_least(self, "inlet", 0.0)
+        if self.lqr_weights is not None and not all(weight > 0 for weight in self.lqr_weights):
+            raise OptionError("lqr_weights", self.lqr_weights, "two numbers above 0, or None")
+
+
+@dataclass(frozen=True, eq=False)
+class SampledTracking:
+    """The largest inlet and the tube around a policy's motion, sample by sample.
+
+    feedback: the LQR that the policy was made with. assumption: about the disturbance, as `assume`
+    measures it on runs of the policy. goal, start: radii at the end and at the start, in the LQR's
+    norm (None: the largest that the box of the data allows, and the inlet's).
+    """
+
+    model: MeasuredState
+    policy: SampledPolicy
+    feedback: Feedback
+    assumption: DisturbanceAssumption
+    goal: float | None = None
+    start: float | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("goal", "start"):
+            if getattr(self, key) is not None:
+                require_positive(self, key)
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousTracking:
+    """The largest funnel around a nominal motion that ends in a goal, proved for every t.
+
+    dynamics: a VectorField, or a polynomial function of some of t, x, u, w. goal: an ellipsoid, or
+    its matrix around the nominal's end (None: the largest set that the closed loop keeps at the
+    end). policy: None is a time-varying LQR with Q (n, n) and R (m, m) (None: identities), and P(t)
+    its cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's
+    K varies between knots: "constant", "linear" or "cubic". limits: rows (input, low, high) at
+    which inputs saturate; the proof then covers every mode of them.
+
+    shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
+    there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
+    """
+
+    dynamics: VectorField | Callable[..., Any]
+    nominal: Nominal
+    goal: Goal | ArrayLike | None = None
+    policy: ContinuousPolicy | None = None
+    shape: Shape = "rho"
+    objective: Objective = "volume"
+    Q: ArrayLike | None = None
+    R: ArrayLike | None = None
+    gain: str = "constant"
+    limits: ArrayLike | None = None
+
+    def __post_init__(self) -> None:
+        require_one_of(self, "shape", get_args(Shape))
+        require_one_of(self, "objective", get_args(Objective))
+        require_one_of(self, "gain", GAINS)
+
+
+Problem = LinearTube | SampledTracking | ContinuousTracking

@@ -1,0 +1,1 @@
+"""Funnels of identified models, sample by sample."""

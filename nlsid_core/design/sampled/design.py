@@ -1,0 +1,262 @@
+"""`design_state_funnel`: inlet and tube around a motion of an identified polynomial model.
+
+Backward, the inlet: the largest radius whose step, disturbance included, fits in the next. Forward,
+the tube: where starts in the inlet get to. Every step of both is one semidefinite program.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Protocol, TypeAlias
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design.sampled.closed_loop import Frame, half_widths
+from nlsid_core.design.sampled.explicit import ExplicitStep
+from nlsid_core.design.sampled.implicit import ImplicitFunnelStep
+from nlsid_core.design.sampled.motion import Feedback
+from nlsid_core.designs import Design
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.factor import refuse_unmonitorable
+from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.trapezoidal import TrapezoidalModel
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.assumption import disturbance_of
+
+AIM = 1.0 - 5e-5  # of the next radius: where the search for a radius aims ...
+CLOSE = 1.0 - 4e-4  # ... and from where it is content
+ATTEMPTS = 8  # semidefinite programs a step; two or three are usual
+INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
+
+ROOTS = 3.0  # radii of the tube within which the roots of an implicit step are claimed
+
+Progress = Callable[[str, float], None]
+
+
+TrackingDesign: TypeAlias = Design[MeasuredState, SampledPolicy, SampledFunnel, None]
+
+
+def frame(model: MeasuredState, policy: SampledPolicy, feedback: Feedback) -> Frame:
+    """The norms |S x̄|, S'S the LQR cost, and how far the box of the data lets them grow."""
+    S = np.array([np.linalg.cholesky(P).T for P in feedback.P])
+    T = np.array([np.triu(np.linalg.inv(s)) for s in S])
+    A, cap = [], []
+    for k in range(len(policy) + 1):
+        rows = [np.eye(len(model))]
+        room = [_room(policy.x[k], model.x_range)]
+        if k < len(policy):
+            a, b = model.linearised(policy.x[k], policy.u[k])
+            A.append(a - b @ policy.K[k])
+            rows.append(policy.K[k])
+            room.append(_room(policy.u[k], model.u_range))
+        size = np.linalg.norm(np.vstack(rows) @ T[k], axis=1)
+        cap.append(float((np.concatenate(room) / size).min()) * INSIDE_BOX)
+    if min(cap) <= 0:
+        raise Infeasible("the motion touches the box of the model's data; keep more in reserve")
+    return Frame(S, T, np.array(A), np.array(cap))
+
+
+def design_state_funnel(
+    model: MeasuredState,
+    policy: SampledPolicy,
+    feedback: Feedback,
+    *,
+    assumption: DisturbanceAssumption,
+    goal: float | None = None,
+    start: float | None = None,
+    progress: Progress | None = None,
+) -> TrackingDesign:
+    """The largest inlet that reaches the goal, and the tube from it; see `SampledTracking`.
+
+    Raises CertificateRejected if the assumption is not one a checker would accept,
+    Infeasible if the disturbance leaves no inlet, DataError if `start` is beyond the inlet.
+    """
+    report = progress if progress is not None else _silent
+    refuse_assumption(model, assumption)
+    norms = frame(model, policy, feedback)
+    cap = norms.cap - assumption.widens
+    if np.min(cap) <= 0:
+        k = int(np.argmin(cap))
+        raise Infeasible(
+            f"at sample {k} the disturbance alone ({assumption.bound:.3g}) fills the box of the "
+            f"data ({norms.cap[k]:.3g}); record more widely, or disturb less"
+        )
+    implicit = isinstance(model, TrapezoidalModel)
+    kind: Any = ImplicitFunnelStep if implicit else ExplicitStep
+    steps = [kind.at(model, policy, norms, k, assumption) for k in range(len(policy))]
+    for k, step in enumerate(steps):
+        cap[k] = step.largest(float(cap[k]))
+    inlet, to_goal = _inlet(steps, cap, goal, report)
+    roots = ROOTS * (inlet + assumption.widens)
+    first = float(inlet[0]) if start is None else start
+    if not 0 < first <= inlet[0]:
+        raise DataError(
+            f"start {first:.4g} should be positive and at most the inlet {inlet[0]:.4g}"
+        )
+    tube, along = _tube(steps, first, roots, report)
+    funnel = SampledFunnel(
+        S=norms.S,
+        A=norms.A,
+        tube=tube,
+        inlet=inlet,
+        half_widths=half_widths(norms.S, tube, assumption.widens),
+        assumption=assumption,
+        model=policy.model,
+        policy=files.digest(policy.document()),
+        roots=roots if implicit else None,
+    )
+    refuse_unmonitorable(funnel)
+    entries = [
+        step.stated() | {"tube": step.proof(a), "inlet": step.proof(b)}
+        for step, a, b in zip(steps, along, to_goal, strict=True)
+    ]
+    proof = steps[0].bases() | {"steps": entries}
+    claim = {"kind": "sampled_funnel"}
+    return Design.proved(model, policy, funnel, claim=claim, proof=proof, found=None)
+
+
+def assume(
+    model: MeasuredState,
+    policy: SampledPolicy,
+    feedback: Feedback,
+    runs: Dataset,
+    *,
+    form: str = "response",
+    safety_factor: float = 1.5,
+    rate: float = 1.0,
+) -> DisturbanceAssumption:
+    """The bound that commissioning runs of the policy give: safety_factor times their largest.
+
+    rate: by which `fading` forgets a sample, below 1.
+
+    Raises DataError if a run is shorter than the policy, CertificateRejected if one of them is a
+    recording the model was fitted on.
+    """
+    norms = frame(model, policy, feedback)
+    gain = _gain(norms, rate) if form in ("energy", "fading") else 1.0
+    options = {"S": norms.S, "A": norms.A, "form": form, "rate": rate, "gain": gain}
+    measured = max(
+        float(np.max(disturbance_of(model, policy, run, **options)))  # type: ignore[arg-type]
+        for run in runs
+    )
+    assumption = DisturbanceAssumption(
+        form=form,
+        bound=float(np.nextafter(safety_factor * measured, np.inf)),
+        measured=measured,
+        safety_factor=safety_factor,
+        measured_on=tuple((run.name, run.digest) for run in runs),
+        rate=rate,
+        gain=gain,
+    )
+    refuse_assumption(model, assumption)
+    return assumption
+
+
+def undisturbed(assumption: DisturbanceAssumption) -> DisturbanceAssumption:
+    """The same with nothing to disturb, to compare with."""
+    return replace(assumption, bound=0.0, measured=0.0)
+
+
+class FunnelStep(Protocol):
+    """One step of either kind of model; what is found for a radius is its own business."""
+
+    assumption: DisturbanceAssumption
+
+    def from_radius(self, radius: float, roots: float, /) -> tuple[Any, float]:
+        """What is found from `radius`, next rates within `roots`, and the radius it needs next."""
+
+    def largest(self, cap: float) -> float:
+        """The largest radius up to `cap` at which the form's own condition holds."""
+
+    def proof(self, found: Any, /) -> Json:
+        """The proof of what was found."""
+
+    def stated(self) -> Json:
+        """What the proof states of the step, whatever the radius."""
+
+    def bases(self) -> Json:
+        """The monomials of every step's witnesses."""
+
+
+def _inlet(
+    steps: Sequence[FunnelStep], cap: FloatArray, goal: float | None, progress: Progress
+) -> tuple[FloatArray, list[Any]]:
+    """Backward: at each sample the largest radius whose step fits in the next one."""
+    N = len(steps)
+    radii, proofs = np.empty(N + 1), []
+    radii[N] = cap[N] if goal is None else min(goal, float(cap[N]))
+    growth = 1.0
+    for k in range(N - 1, -1, -1):
+        target = float(radii[k + 1])
+        radius = min(target * growth, float(cap[k]))
+        roots = ROOTS * (target + steps[k].assumption.widens)
+        best: tuple[float, Any] | None = None
+        for _ in range(ATTEMPTS):
+            proof, needed = steps[k].from_radius(radius, roots)
+            if needed <= target:
+                if best is None or radius > best[0]:
+                    best = (radius, proof)
+                if needed >= CLOSE * target or radius >= cap[k]:
+                    break
+            radius = min(radius * AIM * target / needed, float(cap[k]))
+        if best is None:
+            raise Infeasible(
+                f"at sample {k} no radius fits in the next, {target:.3g}: the disturbance "
+                f"({steps[k].assumption.bound:.3g}) or the curvature is too large for this goal"
+            )
+        radii[k], growth = best[0], max(1e-3, best[0] / target)
+        proofs.append(best[1])
+        progress("inlet", (N - k) / N)
+    return radii, proofs[::-1]
+
+
+def _tube(
+    steps: Sequence[FunnelStep], start: float, roots: FloatArray, progress: Progress
+) -> tuple[FloatArray, list[Any]]:
+    """Forward: what each step needs is the next radius."""
+    radii, proofs = [start], []
+    for k, step in enumerate(steps):
+        proof, needed = step.from_radius(radii[-1], float(roots[k + 1]))
+        radii.append(needed)
+        proofs.append(proof)
+        progress("tube", (k + 1) / len(steps))
+    return np.array(radii), proofs
+
+
+def _gain(norms: Frame, rate: float) -> float:
+    """c of E⁺ = rate·E + c|d|², with half of what the linear part leaves kept for curvature."""
+    linear = max(
+        float(np.linalg.norm(S @ A @ T, 2))
+        for S, A, T in zip(norms.S[1:], norms.A, norms.T[:-1], strict=True)
+    )
+    mu = (linear + np.sqrt(rate)) / 2
+    if linear >= np.sqrt(rate):
+        raise Infeasible(
+            f"the loop shrinks deviations by {linear:.4g} a sample; a rate of {rate:g} forgets "
+            f"faster; use one above {linear**2:.4g}"
+        )
+    return float(rate / (rate - mu**2))
+
+
+def refuse_assumption(model: MeasuredState, a: DisturbanceAssumption) -> None:
+    """Refuse an assumption that the kernel would refuse, before any work."""
+    fitted = {digest for _, digest in model.bags}
+    if not a.measured_on:
+        raise CertificateRejected("the assumption was measured on no commissioning run")
+    for name, digest in a.measured_on:
+        if not digest or digest in fitted:
+            raise CertificateRejected(
+                f"commissioning run {name} is a recording the model was fitted on: its disturbance "
+                "is too small; record the policy running"
+            )
+
+
+def _room(centre: FloatArray, ranges: FloatArray) -> FloatArray:
+    return np.minimum(ranges[:, 1] - centre, centre - ranges[:, 0])
+
+
+def _silent(_what: str, _fraction: float) -> None:
+    return None

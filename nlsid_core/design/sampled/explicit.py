@@ -1,0 +1,115 @@
+"""One step of the funnel of an explicit model, for the sweeps of `design_state_funnel`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.design.sampled import closed_loop
+from nlsid_core.design.sampled.closed_loop import Frame
+from nlsid_core.design.sampled.reach import Reach, bases, reach
+from nlsid_core.errors import Infeasible
+from nlsid_core.funnels.sampled import DisturbanceAssumption
+from nlsid_core.kernel.exact import Matrix, product
+from nlsid_core.kernel.polynomials import Polynomial, Ring
+from nlsid_core.kernel.sampled_steps import explicit_step, mapped, square
+from nlsid_core.models.state_map import StateModel
+from nlsid_core.policies.sampled import SampledPolicy
+
+UP = 1.0 + 1e-9  # a radius written down is above its value by more than rounding
+BISECTIONS = 40
+SMALLEST = 1e-3  # of the box: below it no radius is worth having
+
+
+@dataclass(frozen=True, eq=False)
+class ExplicitStep:
+    """The exact step S⁺f̄(Tz) of z, |S T z|², and the bounds that the disturbance's form needs."""
+
+    T: FloatArray
+    ring: Ring
+    rows: list[Polynomial]
+    size: Polynomial
+    degree: int
+    kappa: float
+    curvature: list[float]
+    assumption: DisturbanceAssumption
+
+    @classmethod
+    def at(
+        cls,
+        model: StateModel,
+        policy: SampledPolicy,
+        norms: Frame,
+        k: int,
+        assumption: DisturbanceAssumption,
+    ) -> "ExplicitStep":
+        """The step from sample k."""
+        n, sample, T = len(model), norms.sample(policy, k), closed_loop.exact(norms.T[k])
+        ring = closed_loop.ring_of(n)
+        rows = explicit_step(closed_loop.map_of(model), sample, T, ring)
+        z = [ring.variable(i) for i in range(n)]
+        ST: Matrix = product(sample.S, T)
+        moved = rows
+        if assumption.form == "response":
+            carried = mapped(product(sample.S_next, product(sample.A, T)), z, ring)
+            moved = [ring.minus(p, q) for p, q in zip(rows, carried, strict=True)]
+        return cls(
+            T=norms.T[k],
+            ring=ring,
+            rows=rows,
+            size=square(mapped(ST, z, ring), ring),
+            degree=max(1, int(np.max(model.exponents.sum(axis=1)))),
+            kappa=closed_loop.inverse_bound(ST),
+            curvature=closed_loop.curvature_bounds(moved, ring, 1),
+            assumption=assumption,
+        )
+
+    def from_radius(self, radius: float, _roots: float) -> tuple[Reach, float]:
+        """The reach from `radius`, and the radius it needs next."""
+        found = reach(self.rows, self.ring, radius, self.degree)
+        bound = self.assumption.bound
+        added = {"peak": bound, "response": bound * self.stretch(radius)}
+        return found, (found.bound + added.get(self.assumption.form, 0.0)) * UP
+
+    def largest(self, cap: float) -> float:
+        """The largest radius up to `cap` from which deviations shrink as the form needs."""
+        a = self.assumption
+        if a.form not in ("energy", "fading"):
+            return cap
+        low, high, radius = 0.0, cap, cap  # usually there is nothing to search for
+        for _ in range(BISECTIONS):
+            mu = self.stretch(radius) * UP
+            if a.gain * mu**2 > (a.gain - 1.0) * a.rate:
+                if radius < SMALLEST * cap:
+                    raise Infeasible(
+                        f"deviations shrink by {mu:.6g} a step at radius {radius:.4g}, too little "
+                        f"for rate {a.rate:g} and gain {a.gain:g}; use the form response"
+                    )
+                high = radius
+            else:
+                low = radius
+            if low == cap:
+                break
+            radius = (low + high) / 2
+        return low
+
+    def stretch(self, radius: float) -> float:
+        """μ of the kernel: what a deviation up to the bound is stretched by, from `radius`."""
+        z, far = self.kappa * radius, self.kappa * (radius + self.assumption.bound)
+        powers = enumerate(self.curvature, start=1)
+        return self.kappa * sum(
+            gamma * sum(far**i * z ** (m - 1 - i) for i in range(m)) for m, gamma in powers
+        )
+
+    def proof(self, found: Reach) -> Json:
+        """The proof of a reach."""
+        return found.stated(self.rows, self.size, self.ring)
+
+    def stated(self) -> Json:
+        """Coordinates and bounds."""
+        return {"T": self.T.tolist(), "kappa": self.kappa, "curvature": self.curvature}
+
+    def bases(self) -> Json:
+        """The monomials of every step's witnesses."""
+        basis, inner = bases(len(self.T), self.degree)
+        return {"basis": basis.tolist(), "ball_basis": inner.tolist()}

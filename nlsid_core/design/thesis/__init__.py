@@ -1,0 +1,1 @@
+"""The literal algorithms of the thesis, beside the faster ones."""

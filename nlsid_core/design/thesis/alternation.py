@@ -1,0 +1,141 @@
+"""The thesis's alternation for ρ(t) (Section 6.2): L-steps find multipliers, V-steps enlarge.
+
+It starts from a funnel that holds at its knots and stops when the volume grows by less than 2.5 %.
+What holds at knots alone is a sampled relaxation, thesis (6.7), and proves nothing: only a proof
+for every t makes a funnel, and `design_by_alternation` asks for one.
+"""
+
+import time
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.design import FunnelDesign, decided, proved_for
+from nlsid_core.design.continuous.knots import KnotForms
+from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.continuous.setting import prepare, refuse_first
+from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
+from nlsid_core.design.continuous.sweep import Ends
+from nlsid_core.design.continuous.vstep import largest_level
+from nlsid_core.design.problems import ContinuousTracking
+from nlsid_core.design.thesis.relaxation import Sampled
+from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+HIGHEST_DECAY = 40.0  # of the exponential start
+
+
+def design_by_alternation(
+    problem: ContinuousTracking, *, rho: ArrayLike | None = None, executor: Executor | None = None
+) -> FunnelDesign:
+    """The funnel of shape rho that the thesis's alternation finds, proved for every t.
+
+    rho: (K,) the first ρ; None: an exponential one. executor: shares the independent L-steps.
+    Raises DataError and Infeasible as `design` does.
+    """
+    started = time.perf_counter()
+    setting = prepare(
+        problem.dynamics, problem.nominal, goal=problem.goal, policy=problem.policy, Q=problem.Q,
+        R=problem.R, gain=problem.gain, limits=problem.limits,
+    )  # fmt: skip
+    steps, policy = setting.steps, setting.policy
+    if len(steps.field.valid):
+        raise DataError("the alternation does not know where dynamics are valid: take the sweep")
+    refuse_shape(steps)
+    if rho is None:
+        start = exponential_start(steps, policy, setting.P, rho_final=setting.rho_final)
+    else:
+        first = np.asarray(rho, dtype=np.float64)
+        refuse_first(setting, first)
+        start = ContinuousFunnel(policy.x, setting.P, first, policy.vector_field, "")
+        refuse_start(start, solve_ends(steps, policy, start, executor=executor))
+
+    def search(margin: float) -> tuple[FloatArray, None]:
+        found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
+        return found.funnel.rho, None
+
+    funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
+    seconds = {"rho": time.perf_counter() - started}
+    history = [("rho", funnel.volume_integral())]
+    return decided(setting, funnel, proved, history=history, seconds=seconds)
+
+
+def exponential_start(
+    steps: LSteps, policy: ContinuousPolicy, P: FloatArray, *, rho_final: float = 1.0
+) -> ContinuousFunnel:
+    """ρ(t) = ρ(t_f) exp(-c (t_f - t)/(t_f - t₀)), c the least whole number that holds (Prop 6.2).
+
+    Raises Infeasible if none up to 40 does.
+    """
+    t = policy.t
+    decay = 0.0
+    while decay <= HIGHEST_DECAY:
+        rho = rho_final * np.exp(-decay * (t[-1] - t) / (t[-1] - t[0]))
+        funnel = ContinuousFunnel(policy.x, P, rho, policy.vector_field, "")
+        if least_margin(funnel, solve_ends(steps, policy, funnel)) > 0:
+            return funnel
+        decay += 1.0
+    raise Infeasible(
+        f"no exponential start up to c = {HIGHEST_DECAY:g} holds: try a smaller goal, more "
+        "knots, or other weights of the LQR"
+    )
+
+
+def least_margin(funnel: ContinuousFunnel, ends: Sequence[Ends]) -> float:
+    """The smallest L-step margin over all ends, in 1/s, ρ̇/ρ included."""
+    growth = np.diff(funnel.rho) / np.diff(funnel.t)
+    margins = []
+    for k, pair in enumerate(ends):
+        margins.append(min(s.m for s in pair.start) + growth[k] / funnel.rho[k])
+        margins.append(min(s.m for s in pair.end) + growth[k] / funnel.rho[k + 1])
+    return float(min(margins))
+
+
+def refuse_start(funnel: ContinuousFunnel, ends: Sequence[Ends]) -> None:
+    """Raise Infeasible, with what to try, unless the L-steps at the knots of a first ρ hold."""
+    margin = least_margin(funnel, ends)
+    if margin <= 0:
+        raise Infeasible(
+            f"the first rho does not hold: its margin is {margin:.3g} 1/s at worst. Try one that "
+            "grows faster towards t_f, a smaller one, or none: an exponential one is then found"
+        )
+
+
+def alternate_rho(
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    *,
+    margin: float = 0.0,
+    stop: float = STOP,
+    iterations: int = MAX_ITERATIONS,
+    executor: Executor | None = None,
+) -> Sampled:
+    """Enlarge ρ(t) at fixed P(t), keeping ρ(t_f) and, where the start has it, a margin in 1/s.
+
+    With the multipliers fixed, each V-step takes the largest ρ at a knot after the one behind it:
+    at both ends of an interval the constraint is an interval of ρ that contains the present one.
+    """
+    volumes = [funnel.volume_integral()]
+    for _ in range(iterations):
+        ends = solve_ends(steps, policy, funnel, executor=executor)
+        forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
+        rho = funnel.rho.copy()
+        for k in range(len(rho) - 2, -1, -1):
+            levels = []
+            for constant, slope in forms.levels(k, rho[k + 1]):
+                constant[0] -= margin
+                try:
+                    levels.append(largest_level(constant, slope, forms.basis))
+                except SolverError:
+                    levels.append(0.0)
+            rho[k] = max(funnel.rho[k], min(levels) * (1 - 1e-6))
+        funnel = replace(funnel, rho=rho)
+        volumes.append(funnel.volume_integral())
+        if volumes[-1] < volumes[-2] * (1 + stop):
+            break
+    return Sampled(funnel, tuple(volumes))

@@ -1,0 +1,64 @@
+"""The time-sampled relaxation, thesis (6.7): ρ(t) that holds at instants. It is not a proof.
+
+Between the instants anything may happen, so what is found is at least as large as what is true.
+`Sampled` has no certificate and nothing that could become one: only `design_funnel` proves.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike
+from nlsid_core.design.continuous.lstep import sections
+from nlsid_core.design.continuous.setting import Goal, prepare
+from nlsid_core.design.continuous.sweep import Progress, sweep_rho
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.errors import DataError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """A set that holds at sampled instants, which is no proof, and ∫ volume dt of every iterate."""
+
+    funnel: ContinuousFunnel
+    volumes: tuple[float, ...]
+
+    def __str__(self) -> str:
+        return (
+            f"NOT PROVED: holds at samples only, volume integral {self.volumes[-1]:.4g} over "
+            f"{self.funnel.t0:g} to {self.funnel.tf:g} s"
+        )
+
+
+def sample_funnel(
+    dynamics: VectorField | Callable[..., Any],
+    nominal: Nominal,
+    *,
+    goal: Goal | ArrayLike | None = None,
+    policy: ContinuousPolicy | None = None,
+    samples: int = 4,
+    Q: ArrayLike | None = None,
+    R: ArrayLike | None = None,
+    gain: str = "constant",
+    progress: Progress | None = None,
+) -> Sampled:
+    """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
+
+    Necessary for a funnel with this P(t), not sufficient: to compare with, or to see what could be
+    hoped for. The other arguments are those of `design_funnel`, and so is what it raises.
+    """
+    if samples < 2:
+        raise DataError(f"{samples} samples an interval: its two ends are the least")
+    setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
+    steps, policy = setting.steps, setting.policy
+    instants = sections(steps.field, policy, setting.P, count=samples)
+    margin = setting.margin(setting.rho_final)
+    rho, _ = sweep_rho(
+        steps, instants, margin=margin, rho_final=setting.rho_final, progress=progress
+    )
+    digest = files.digest(policy.document())
+    funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
+    return Sampled(funnel, (funnel.volume_integral(),))

@@ -1,0 +1,188 @@
+"""Simulated attempts to break a proved funnel: starts on its boundary, followed to its end.
+
+A simulation proves nothing; one start that leaves would show that the proof or the code is wrong.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.dynamics.piecewise import bernstein
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+SUBSTEPS = 5  # Runge-Kutta steps of order four per interval: errors of 1e-8 on the satellite
+TOLERANCE = 1e-6  # of V above 1, for the integration's error
+CHUNK = 4096  # trajectories integrated together: their monomials fit the cache
+
+
+class Dynamics(Protocol):
+    """What is simulated: a `VectorField`, or what it stands for."""
+
+    @property
+    def uncertain(self) -> FloatArray:
+        """(n_w, 2) bounds of w."""
+
+    def span(self, t: float) -> int:
+        """The index of the equations that hold from time t on."""
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None
+    ) -> FloatArray:
+        """ẋ (N, n)."""
+
+
+@dataclass(frozen=True)
+class TrueDynamics:
+    """rate(X, U) -> ẋ (N, n): what a Taylor model stands for, without uncertainty."""
+
+    rate: Callable[[FloatArray, FloatArray], FloatArray]
+    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def span(self, t: float) -> int:
+        """There is one set of equations."""
+        del t
+        return 0
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None
+    ) -> FloatArray:
+        """ẋ (N, n)."""
+        del t, W, span
+        X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
+        return self.rate(X, U)
+
+
+@dataclass(frozen=True)
+class Soundness:
+    """starts: how many; violations: how many had V > 1 at some step; max_v: the largest V seen."""
+
+    starts: int
+    violations: int
+    max_v: float
+
+
+def simulate_boundary(
+    dynamics: Dynamics,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    *,
+    starts: int,
+    rng: np.random.Generator,
+    knot: int = 0,
+    scale: float = 1.0,
+    substeps: int = SUBSTEPS,
+    adversary: bool = False,
+) -> Soundness:
+    """Follow `starts` random points of {V = scale²} at a knot to the end; w at random corners.
+
+    adversary: w at the corner that raises V most instead, anew at every step.
+    """
+    violations, largest = 0, 0.0
+    for first in range(0, starts, CHUNK):
+        count = min(CHUNK, starts - first)
+        X = _boundary(funnel, knot, count, rng, scale)
+        worst = np.zeros(count)
+        for k in range(knot, len(funnel.t) - 1):
+            X, V = follow(dynamics, policy, funnel, k, X, rng, substeps, adversary=adversary)
+            worst = np.maximum(worst, V)
+        violations += int((worst > 1 + TOLERANCE).sum())
+        largest = max(largest, float(np.max(worst)))
+    return Soundness(starts, violations, largest)
+
+
+def smallest_escape(
+    dynamics: Dynamics,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    goal: FloatArray,
+    *,
+    starts: int,
+    rng: np.random.Generator,
+    highest: float = 10.0,
+) -> float:
+    """The smallest scaling of the start set from which some trajectory misses {|x - x₀|²_goal ≤ 1}.
+
+    To a ratio of 1.02; `highest` if none was found below it.
+    """
+    low, high = 1.0, highest
+    while high / low > 1.02:
+        middle = float(np.sqrt(low * high))
+        X = _boundary(funnel, 0, starts, rng, middle)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(len(funnel.t) - 1):
+                X, _ = follow(dynamics, policy, funnel, k, X, rng, 2 * SUBSTEPS)
+            d = X - funnel.x.ends()[-1]
+            missed = not (np.einsum("ni,ij,nj->n", d, goal, d) <= 1).all()
+        low, high = (low, middle) if missed else (middle, high)
+    return high
+
+
+def follow(
+    dynamics: Dynamics,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    k: int,
+    X: FloatArray,
+    rng: np.random.Generator,
+    substeps: int,
+    *,
+    adversary: bool = False,
+) -> tuple[FloatArray, FloatArray]:
+    """States at the end of interval k from X (N, n) at its start, and the largest V on the way."""
+    t, h = funnel.t[k], (funnel.t[k + 1] - funnel.t[k]) / substeps
+    span = dynamics.span(float(t))
+    x, u, K = (part.control[k] for part in (policy.x, policy.u, policy.K))
+    low, high = dynamics.uncertain.T
+    worst = np.zeros(len(X))
+
+    def rate(s: float, states: FloatArray, w: FloatArray) -> FloatArray:
+        inputs = policy.clipped(bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T)
+        when = float(t + s * (funnel.t[k + 1] - t))
+        return dynamics(when, states, inputs, w, span=span)
+
+    for j in range(substeps):
+        s, half, end = j / substeps, (j + 0.5) / substeps, (j + 1) / substeps
+        if adversary:
+            P = (1 - s) * funnel.P[k] + s * funnel.P[k + 1]
+            w = _worst(partial(rate, s, X), (X - bernstein(x, s)) @ P, low, high)
+        else:
+            w = low + (high - low) * rng.integers(0, 2, size=(len(X), len(low)))
+        a = rate(s, X, w)
+        b = rate(half, X + h / 2 * a, w)
+        c = rate(half, X + h / 2 * b, w)
+        d = rate(end, X + h * c, w)
+        X = X + h / 6 * (a + 2 * b + 2 * c + d)
+        P = (1 - end) * funnel.P[k] + end * funnel.P[k + 1]
+        rho = (1 - end) * funnel.rho[k] + end * funnel.rho[k + 1]
+        x_bar = X - bernstein(x, end)
+        worst = np.maximum(worst, np.einsum("ni,ij,nj->n", x_bar, P / rho, x_bar))
+    return X, worst
+
+
+def _worst(
+    rate: Callable[[FloatArray], FloatArray], slope: FloatArray, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """(N, n_w) the corner that makes slope'ẋ largest; ẋ is affine in each entry of w."""
+    middle = np.tile((low + high) / 2, (len(slope), 1))
+    chosen = middle.copy()
+    for j in range(len(low)):
+        ends = []
+        for value in (low[j], high[j]):
+            w = middle.copy()
+            w[:, j] = value
+            ends.append(np.einsum("ni,ni->n", slope, rate(w)))
+        chosen[:, j] = np.where(ends[1] > ends[0], high[j], low[j])
+    return chosen
+
+
+def _boundary(
+    funnel: ContinuousFunnel, knot: int, count: int, rng: np.random.Generator, scale: float
+) -> FloatArray:
+    directions = rng.normal(size=(count, funnel.n))
+    directions *= scale / np.linalg.norm(directions, axis=1)[:, None]
+    return funnel.boundary(float(funnel.t[knot]), directions)

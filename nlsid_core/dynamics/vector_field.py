@@ -1,0 +1,388 @@
+"""`VectorField`: polynomial dynamics ẋ = f(t, x, u, w), exact, piecewise in time if need be."""
+
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
+from nlsid_core.polynomial import Polynomial, trace
+from nlsid_core.polynomial.maps import coefficient_table
+
+FORMAT = "nlsid/vector_field"
+MANY_PUSHES = 3
+MAX_UNCERTAIN = 10  # their box has 2^10 vertices, each checked
+MAX_VARIABLES = 200
+MAX_SENTENCE = 200  # characters
+ARGUMENTS = ("t", "x", "u", "w")
+_RATIONAL = re.compile(r"-?[0-9]{1,4000}(/[1-9][0-9]{0,3999})?", re.ASCII)
+
+
+@dataclass(frozen=True, eq=False)
+class VectorField:
+    """ẋ_i = pieces[j][i](t, x, u, w) on the j-th of the time spans that `breaks` separate.
+
+    pieces: exact polynomials in `names` = t, x0.., u0.., w0... n, m: numbers of states and inputs.
+    breaks: (J-1,) s, increasing, where the equations change. uncertain: (n_w, 2) lower and upper
+    bounds of w, which may vary arbitrarily in time within its box: bounded disturbances and
+    uncertain parameters; w has to enter with degree at most one in each entry. valid: (D, 3) rows
+    (j, low, high): the equations describe the system only where entry j of (x, u) is within; a
+    proved funnel stays there. Rows (j, low, high, span), (D, 4), hold in that time span only.
+    expansion: for equations that expand others, with what they leave out as w, one sentence that
+    says how its bounds were computed; every proof then names it as an assumption. Else empty.
+
+    Raises ShapeError or DataError on equations that do not fit.
+    """
+
+    pieces: tuple[tuple[Polynomial, ...], ...]
+    n: int
+    m: int
+    breaks: FloatArray = field(default_factory=lambda: np.zeros(0))
+    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    valid: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    expansion: str = ""
+    names: tuple[str, ...] = field(init=False)
+    _plans: tuple["_Plan", ...] = field(init=False)
+    _slopes: dict[int, "_Plan"] = field(init=False, default_factory=dict)  # built when first asked
+
+    def __post_init__(self) -> None:
+        bounds = np.array(self.uncertain, dtype=np.float64).reshape(-1, 2)
+        breaks = np.array(self.breaks, dtype=np.float64)
+        if not (np.isfinite(bounds).all() and (bounds[:, 0] <= bounds[:, 1]).all()):
+            raise DataError(
+                f"bounds of the uncertain w should be finite pairs low <= high: {bounds}"
+            )
+        if len(bounds) > MAX_UNCERTAIN:
+            raise DataError(f"{len(bounds)} uncertain entries; at most {MAX_UNCERTAIN} are decided")
+        if breaks.ndim != 1 or not np.isfinite(breaks).all() or (np.diff(breaks) <= 0).any():
+            raise DataError(f"breaks should be increasing times, are {breaks}")
+        names = ("t", *variable_names(self.n, self.m, len(bounds)))
+        object.__setattr__(self, "names", names)
+        valid = np.array(self.valid, dtype=np.float64)
+        if valid.size == 0:
+            valid = np.zeros((0, 3))
+        sound = valid.ndim == 2 and valid.shape[1] in (3, 4) and np.isfinite(valid).all()
+        if not (
+            sound
+            and np.isin(valid[:, 0], range(self.n + self.m)).all()
+            and np.isin(valid[:, 3:], range(len(self.pieces))).all()
+        ):
+            raise DataError(
+                "rows of valid should be (entry of (x, u), low, high), and the span where only "
+                f"one is meant; they are {valid.tolist()}"
+            )
+        if len(self.expansion) > MAX_SENTENCE or not self.expansion.isprintable():
+            raise DataError(f"expansion should be one sentence of at most {MAX_SENTENCE} signs")
+        if not self.pieces or len(self.pieces) != len(breaks) + 1:
+            raise ShapeError(f"{len(self.pieces)} sets of equations for {len(breaks)} breaks")
+        pieces = []
+        for equations in self.pieces:
+            if len(equations) != self.n:
+                raise ShapeError(f"{len(equations)} equations for {self.n} states")
+            pieces.append(tuple(p.exact().over(names) for p in equations))
+            for i, p in enumerate(pieces[-1]):
+                if (p.exponents[:, 1 + self.n + self.m :] > 1).any():
+                    raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
+        for key, value in (("breaks", breaks), ("uncertain", bounds), ("valid", valid)):
+            value.setflags(write=False)
+            object.__setattr__(self, key, value)
+        object.__setattr__(self, "pieces", tuple(pieces))
+        object.__setattr__(self, "_plans", tuple(_Plan.of(*_table(p, names)) for p in pieces))
+
+    @classmethod
+    def from_function(
+        cls,
+        function: Callable[..., Any],
+        n: int,
+        m: int,
+        *,
+        uncertain: ArrayLike | None = None,
+        valid: ArrayLike | None = None,
+        expansion: str = "",
+    ) -> "VectorField":
+        """Trace a Python function of any of t, x, u, w, named so, that returns ẋ (n,).
+
+        Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
+        """
+        bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
+        given = tuple(inspect.signature(function).parameters)
+        if not given or not set(given) <= set(ARGUMENTS):
+            raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        sizes = {"t": 1, "x": n, "u": m, "w": len(bounds)}
+
+        def called(*vectors: Any) -> Any:
+            passed = [v[0] if name == "t" else v for name, v in zip(given, vectors, strict=True)]
+            return function(*passed)
+
+        called.__name__ = getattr(function, "__name__", "dynamics")
+        try:
+            traced = trace(called, {name: sizes[name] for name in given})
+        except NotPolynomial as error:
+            raise NotPolynomial(
+                f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
+                "leave out; or give a polynomial, and what it leaves out as a bounded w"
+            ) from error
+        if traced.shape != (n,):
+            raise ShapeError(f"{called.__name__} returned shape {traced.shape}, expected ({n},)")
+        equations = []
+        for p in traced.tolist():
+            renamed = tuple("t" if name == "t0" else name for name in p.names)
+            equations.append(Polynomial(p.exponents, p.coefficients, renamed))
+        names = ("t", *variable_names(n, m, len(bounds)))
+        within = np.zeros((0, 3)) if valid is None else np.asarray(valid, dtype=np.float64)
+        pieces = (tuple(p.over(names) for p in equations),)
+        return cls(pieces, n, m, uncertain=bounds, valid=within, expansion=expansion)
+
+    @property
+    def degree(self) -> int:
+        """Largest total degree in x and u."""
+        columns = slice(1, 1 + self.n + self.m)
+        return max(
+            int(np.max(p.exponents[:, columns].sum(axis=1), initial=0))
+            for equations in self.pieces
+            for p in equations
+        )
+
+    @property
+    def nonlinear_states(self) -> tuple[int, ...]:
+        """States such that every term of degree d ≥ 2 in x and u has at least d - 1 of them.
+
+        Those in terms of degree 2 or more, if inputs do not spoil it; else all of them. All, too,
+        if w is taken at its corners: a push is a term of degree 1 in Ẇ.
+        """
+        if len(self.uncertain) and not self.is_pushed:
+            return tuple(range(self.n))
+        found: set[int] = set()
+        for equations in self.pieces:
+            for p in equations:
+                high = p.exponents[p.exponents[:, 1 : 1 + self.n + self.m].sum(axis=1) > 1]
+                inputs = high[:, 1 + self.n : 1 + self.n + self.m].sum(axis=1)
+                if (inputs > 1).any():
+                    return tuple(range(self.n))
+                found |= set(np.flatnonzero(high[:, 1 : 1 + self.n].any(axis=0)).tolist())
+        return tuple(sorted(found))
+
+    @property
+    def is_pushed(self) -> bool:
+        """True if w only adds constants to ẋ, and has so many entries that corners are too many.
+
+        Then 2|x̄'Pg|r ≤ r(κ(x̄'Pg)² + 1/κ) bounds what each does, and no corner is needed.
+        """
+        return len(self.uncertain) >= MANY_PUSHES and all(
+            self.pushes(span) is not None for span in range(len(self.pieces))
+        )
+
+    def pushes(self, span: int) -> FloatArray | None:
+        """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""
+        count = len(self.uncertain)
+        result = np.zeros((self.n, count))
+        for i, p in enumerate(self.pieces[span]):
+            for exponent, coefficient in p.terms():
+                used = [j for j in range(count) if exponent[1 + self.n + self.m + j]]
+                if used:
+                    if sum(exponent) > 1 or Fraction(float(coefficient)) != coefficient:
+                        return None
+                    result[i, used[0]] = float(coefficient)
+        return result
+
+    def vertices(self) -> FloatArray:
+        """(2^n_w, n_w) corners of the box of w; one empty row without uncertainty."""
+        return np.array(list(product(*self.uncertain.tolist()))).reshape(
+            2 ** len(self.uncertain), -1
+        )
+
+    def span(self, t: float) -> int:
+        """The index of the equations that hold from time t on."""
+        return int(np.searchsorted(self.breaks, t, side="right"))
+
+    def validity(self, span: int) -> list[tuple[int, float, float]]:
+        """(entry of (x, u), low, high) for every bound that holds in this span."""
+        rows = self.valid[(self.valid[:, 3:] == span).all(axis=1)]
+        return [(int(j), low, high) for j, low, high in rows[:, :3].tolist()]
+
+    def __call__(
+        self,
+        t: float,
+        X: ArrayLike,
+        U: ArrayLike,
+        W: ArrayLike | None = None,
+        *,
+        span: int | None = None,
+    ) -> FloatArray:
+        """ẋ (N, n) at states X (N, n), inputs U (N, m); w is the centre of its box if not given.
+
+        span: which piece to take, if not the one that holds from t on.
+        """
+        X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
+        U = np.broadcast_to(U, (len(X), self.m))
+        w = self.uncertain.mean(axis=1) if W is None else np.asarray(W, dtype=np.float64)
+        columns = np.empty((len(self.names), len(X)))
+        columns[0] = t
+        columns[1 : 1 + self.n] = X.T
+        columns[1 + self.n : 1 + self.n + self.m] = U.T
+        columns[1 + self.n + self.m :] = w.T if w.ndim == 2 else w[:, None]
+        return self._plans[self.span(t) if span is None else span](columns)
+
+    def jacobians(self, t: float, x: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """A (n, n) = ∂f/∂x and B (n, m) = ∂f/∂u at one point, w in the centre of its box."""
+        span = self.span(t)
+        if span not in self._slopes:
+            names = self.names[1 : 1 + self.n + self.m]
+            slopes = [p.derivative(name) for p in self.pieces[span] for name in names]
+            self._slopes[span] = _Plan.of(*_table(slopes, self.names))
+        w = self.uncertain.mean(axis=1)
+        point = np.concatenate([[t], np.asarray(x, float), np.asarray(u, float), w])
+        J = self._slopes[span](point[:, None]).reshape(self.n, self.n + self.m)
+        return J[:, : self.n], J[:, self.n :]
+
+    def document(self) -> Json:
+        """The JSON form; every coefficient is exact."""
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "states": self.n,
+            "inputs": self.m,
+            "uncertain": self.uncertain.tolist(),
+            "breaks": self.breaks.tolist(),
+            "valid": self.valid.tolist(),
+            "expansion": self.expansion,
+            "pieces": [[_written(p) for p in part] for part in self.pieces],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "vector field") -> "VectorField":
+        """Raises DocumentError if the document is not a vector field."""
+        files.header(document, FORMAT, source=source)
+        n = files.member(document, "states", int, source=source)
+        m = files.member(document, "inputs", int, source=source)
+        if not (0 < n <= MAX_VARIABLES and 0 <= m <= MAX_VARIABLES):
+            raise DocumentError(f"{source}: {n} states and {m} inputs are not a vector field")
+        uncertain = files.member(document, "uncertain", list, source=source)
+        bounds = files.array(document, "uncertain", (len(uncertain), 2), source=source)
+        names = ("t", *variable_names(n, m, len(bounds)))
+        pieces = []
+        for part in files.member(document, "pieces", list, source=source):
+            if not isinstance(part, list):
+                raise DocumentError(f"{source}: a piece should be a list of equations")
+            pieces.append(tuple(_read(p, names, source=f"{source} equation") for p in part))
+        breaks = files.array(document, "breaks", (None,), source=source)
+        rows = files.member(document, "valid", list, source=source)
+        valid = files.array(document, "valid", (len(rows), None), source=source)
+        expansion = files.member(document, "expansion", str, source=source)
+        return cls(tuple(pieces), n, m, breaks, bounds, valid, expansion)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """Monomials as products of two earlier ones, a row of points each: fast for many points.
+
+    products: (L, 2) rows of the stack [1, variables, products so far]. table: (n, stack size).
+    """
+
+    products: tuple[tuple[int, int], ...]
+    table: FloatArray
+
+    @classmethod
+    def of(cls, exponents: IntArray, table: FloatArray) -> "_Plan":
+        size = exponents.shape[1]
+        known = {(0,) * size: 0}
+        known |= {tuple(row): j + 1 for j, row in enumerate(np.eye(size, dtype=int).tolist())}
+        products: list[tuple[int, int]] = []
+
+        def place(exponent: tuple[int, ...]) -> int:
+            if exponent not in known:
+                last = max(j for j, e in enumerate(exponent) if e)
+                lower = tuple(e - (j == last) for j, e in enumerate(exponent))
+                products.append((place(lower), last + 1))
+                known[exponent] = size + len(products)
+            return known[exponent]
+
+        rows = [place(tuple(row)) for row in exponents.tolist()]
+        full = np.zeros((table.shape[1], size + 1 + len(products)))
+        full[:, rows] = table.T
+        return cls(tuple(products), full)
+
+    def __call__(self, columns: FloatArray) -> FloatArray:
+        """Values (N, n) from variables (number, N)."""
+        size = len(columns)
+        stack = np.empty((self.table.shape[1], columns.shape[1]))
+        stack[0] = 1.0
+        stack[1 : size + 1] = columns
+        for i, (a, b) in enumerate(self.products, start=size + 1):
+            np.multiply(stack[a], stack[b], out=stack[i])
+        return (self.table @ stack).T
+
+
+def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:
+    """x0.., u0.., w0.."""
+    return tuple(
+        f"{letter}{i}"
+        for letter, size in (("x", n), ("u", m), ("w", uncertain))
+        for i in range(size)
+    )
+
+
+def _table(equations: Sequence[Polynomial], names: Sequence[str]) -> tuple[IntArray, FloatArray]:
+    if not any(len(p) for p in equations):
+        empty = np.zeros((1, len(names)), dtype=np.int64)
+        return empty, np.zeros((1, len(equations)))
+    exponents, table = coefficient_table([p.rounded() for p in equations])
+    return exponents, table
+
+
+def _written(p: Polynomial) -> Json:
+    """Distinct monomials in increasing order; a coefficient that is no float64 as "p/q"."""
+    order = [k for k in np.lexsort(p.exponents.T[::-1]).tolist() if p.coefficients[k]]
+    exact = [Fraction(p.coefficients[k]) for k in order]
+    return {
+        "exponents": p.exponents[order].tolist(),
+        "coefficients": [
+            float(value) if _is_float(value) else f"{value.numerator}/{value.denominator}"
+            for value in exact
+        ],
+    }
+
+
+def _read(document: Any, names: Sequence[str], *, source: str) -> Polynomial:
+    if not isinstance(document, dict):
+        raise DocumentError(f"{source}: expected an object, found {type(document).__name__}")
+    rows = files.member(document, "exponents", list, source=source)
+    values = files.member(document, "coefficients", list, source=source)
+    sound = all(
+        isinstance(row, list) and len(row) == len(names)
+        and all(type(e) is int and e >= 0 for e in row)
+        for row in rows
+    )  # fmt: skip
+    if not sound or len(values) != len(rows):
+        raise DocumentError(
+            f"{source}: 'exponents' should hold a row of {len(names)} whole numbers of 0 or more "
+            "for every coefficient"
+        )
+    if any(later <= row for row, later in pairwise(rows)):
+        raise DocumentError(f"{source}: monomials should be distinct, in increasing order")
+    coefficients = np.empty(len(values), dtype=object)
+    coefficients[:] = [_number(value, source) for value in values]
+    exponents = np.array(rows, dtype=np.int64).reshape(-1, len(names))
+    return Polynomial(exponents, coefficients, tuple(names))
+
+
+def _number(value: Any, source: str) -> Fraction:
+    if type(value) in (int, float):
+        return Fraction(value)
+    if type(value) is str and _RATIONAL.fullmatch(value):
+        return Fraction(value)
+    raise DocumentError(f"{source}: {value!r:.40} is neither a number nor a text p/q")
+
+
+def _is_float(value: Fraction) -> bool:
+    try:
+        return Fraction(float(value)) == value
+    except OverflowError:
+        return False

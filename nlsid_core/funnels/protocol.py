@@ -1,0 +1,61 @@
+"""What funnels of every kind have in common, so that one monitor serves them all."""
+
+from pathlib import Path
+from typing import Protocol, TypeAlias
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import DocumentError
+from nlsid_core.funnels import continuous, linear, sampled
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+
+AnyFunnel: TypeAlias = LinearFunnel | SampledFunnel | ContinuousFunnel
+
+
+class Funnel(Protocol):
+    """An ellipsoid around a motion at each moment `when`: a sample, or s of a continuous funnel."""
+
+    @property
+    def made_for(self) -> tuple[str, str]:
+        """The digests of the model or vector field, and of the policy."""
+
+    @property
+    def last(self) -> float:
+        """The last moment that the proof covers."""
+
+    def size(self, when: float, deviation: FloatArray) -> float:
+        """How far out a deviation is: 0 on the motion, 1 on the boundary, rounded up.
+
+        At most 1 only if the deviation is in the set in exact arithmetic; NaN stays NaN.
+        """
+
+    def start_size(self, x_bar: FloatArray) -> float:
+        """How far out of what may start a deviation is: 1 on the boundary, rounded up."""
+
+    def widths(self, when: float) -> FloatArray:
+        """The largest deviation in the set on each axis, in the signals' units."""
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+
+
+def read_funnel(document: Json, *, source: str = "funnel") -> AnyFunnel:
+    """The funnel of a document, by its kind; DocumentError says what is wrong with it."""
+    kinds: dict[object, type[AnyFunnel]] = {
+        linear.KIND: LinearFunnel,
+        sampled.KIND: SampledFunnel,
+        continuous.KIND: ContinuousFunnel,
+    }
+    kind = document.get("kind")
+    if kind not in kinds:
+        raise DocumentError(
+            f"{source}: kind is {kind!r}, expected one of {', '.join(map(str, kinds))}"
+        )
+    return kinds[kind].from_document(document, source=source)
+
+
+def load_funnel(path: Path | str) -> AnyFunnel:
+    """Read a funnel file of any kind; DocumentError says what is wrong with it."""
+    return read_funnel(files.load_document(path), source=str(path))

@@ -1,0 +1,498 @@
+"""Claim: {x : |x - x₀(t)|²_{P(t)} <= ρ(t)} is a funnel of ẋ = f(t, x, u, w), for every t and w.
+
+With x̄ = x - x₀, W = x̄'Px̄ and s in [0, 1] along an interval of length h between knots, on which P
+and ρ are linear, every piece [index, index + 1] / 2^level of every interval has to show
+    c(s, x̄) = dρ/ds - dW/ds - margin h ρ + μ (ρ - W) - Σ_l τ_l q_l > 0,
+    dW/ds = 2x̄'P(h f - dx₀/ds) + x̄'(dP/ds)x̄,
+for every x̄: then V = W/ρ falls by margin or more, in 1/s, where V = 1 (thesis (5.5), Lemma 5.2).
+f is affine in each entry of w, so a vertex of its box each is enough; or, where w only pushes, with
+ẋ = ... + Gw, h |2x̄'Pg| r <= h r (κ(x̄'Pg)² + 1/κ) is added for each w instead, r half its range.
+Where u = clip(ũ), ũ = u₀ - Kx̄, each clipped input is free, low or high; τ_l >= 0 multiplies
+q_l >= 0 of that mode: (high - ũ)(ũ - low), low - ũ, or ũ - high.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import partial
+from itertools import pairwise, product
+from math import prod
+
+from . import text
+from .decision import Decision
+from .exact import at_most, definite, inverse_forms, semidefinite
+from .files import Mismatch, Node, Read, Rejected, bound_files
+from .polynomials import WIDTHS, Polynomial, Ring, Work, at_width
+from .positivity import MAX_SHIFT, expanded, positive, read_basis, read_squares
+
+MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
+MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
+MAX_TERMS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
+PIECE = 20_000  # of the work that a claim may take: what a piece costs at the least
+Bounds = dict[int, tuple[Fraction, Fraction]]
+Curve = list[list[list[Fraction]]]  # by interval, control point, entry
+
+
+@dataclass(frozen=True)
+class Field:
+    """By time span: bounds of entries of (x, u), and equations of (exponents, coefficient)."""
+
+    n: int
+    m: int
+    box: list[tuple[Fraction, Fraction]]
+    breaks: list[Fraction]
+    bounds: list[Bounds]
+    expansion: str
+    equations: list[list[list[tuple[list[int], Fraction]]]]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Control points of u₀ and K; limits: low and high by input."""
+
+    u: Curve
+    K: list[list[list[list[Fraction]]]]
+    limits: Bounds
+
+
+@dataclass(frozen=True)
+class Funnel:
+    """Knots, control points of x₀, and P and ρ at the knots."""
+
+    t: list[Fraction]
+    x: Curve
+    P: list[list[list[Fraction]]]
+    rho: list[Fraction]
+
+
+def decide(claim: Node, proof: Node, read: Read) -> Decision:
+    """Decide that the bound funnel is one for its dynamics and policy, and ends in the goal."""
+    return decide_funnel(claim, proof, read)[0]
+
+
+def decide_funnel(
+    claim: Node, proof: Node, read: Read, work: Work | None = None
+) -> tuple[Decision, Funnel]:
+    """The decision, and the funnel that it is about; `work` is shared by several."""
+    parts = claim.members("kind about", "goal")
+    documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
+    field = read_field(documents["vector_field"])
+    funnel = read_funnel(documents["funnel"], field.n, digests)
+    policy = read_policy(documents["policy"], field, funnel, digests)
+    more = ["goal_multiplier"] * ("goal" in parts) + ["sides"] * bool(policy.limits)
+    required = " ".join(["margin basis multiplier pieces", *more])
+    stated = proof.members(required, "kappa" if field.box else "")
+    margin = stated["margin"].number()
+    if margin <= 0:
+        raise Rejected("the margin should be positive")
+    goal = ""
+    if "goal" in parts:
+        goal = _decide_goal(parts["goal"], stated, funnel)
+    spans, work = _spans(field, funnel), work or Work()
+    bounds = [field.bounds[span] for span in spans]
+    _decide_valid(field, policy, funnel, bounds, work)
+    count = _decide_pieces(field, policy, funnel, spans, stated, margin, work)
+    end = text.exact(funnel.t[-1])
+    decision = Decision(
+        f"funnel: every solution that is in it at a time from {text.exact(funnel.t[0])} to {end} s "
+        f"stays in it until {end} s{goal}{_kept(field, bounds)}; {count} pieces of time decided, "
+        "on its boundary V falls by at least the margin, in 1/s",
+        margin,
+        _assumptions(field, policy, bounds),
+        digests,
+    )
+    return decision, funnel
+
+
+def read_field(node: Node) -> Field:
+    """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
+    parts = _opened(
+        node, "nlsid/vector_field", "states inputs uncertain breaks valid expansion pieces"
+    )
+    n, m = parts["states"].whole(1, MAX_STATES), parts["inputs"].whole(0, MAX_INPUTS)
+    box = [(low, high) for low, high in parts["uncertain"].array(None, 2)]
+    if len(box) > MAX_UNCERTAIN or any(low > high for low, high in box):
+        raise Rejected(f"uncertain should hold at most {MAX_UNCERTAIN} pairs low <= high")
+    breaks = _increasing(parts["breaks"], 0, MAX_SPANS)
+    count = len(breaks) + 1
+    bounds: list[Bounds] = [{} for _ in range(count)]
+    for row in parts["valid"].items(0, MAX_TERMS):
+        j, low, high, *only = row.array(4 if type(row.value) is list and row.value[3:] else 3)
+        if j not in range(n + m) or not all(span in range(count) for span in only):
+            raise Rejected(f"{row.where} should be an entry of (x, u), low, high, and maybe a span")
+        for found in [bounds[int(span)] for span in only] or bounds:
+            before = found.get(int(j), (low, high))
+            found[int(j)] = max(low, before[0]), min(high, before[1])
+    equations = [
+        [_equation(row, n, m, len(box)) for row in piece.items(n, n)]
+        for piece in parts["pieces"].items(count, count)
+    ]
+    return Field(n, m, box, breaks, bounds, parts["expansion"].text(), equations)
+
+
+def _equation(node: Node, n: int, m: int, uncertain: int) -> list[tuple[list[int], Fraction]]:
+    parts = node.members("exponents coefficients")
+    rows = parts["exponents"].wholes(None, 1 + n + m + uncertain)
+    numbers = [entry.rational() for entry in parts["coefficients"].items(len(rows), len(rows))]
+    if len(rows) > MAX_TERMS or any(later <= row for row, later in pairwise(rows)):
+        raise Rejected(f"{node.where}: monomials should be distinct, in increasing order")
+    for row in rows:
+        if min(row) < 0 or sum(row) > MAX_DEGREE or any(e > 1 for e in row[1 + n + m :]):
+            raise Rejected(
+                f"{node.where}: a monomial should have degree at most {MAX_DEGREE}, and at most 1 "
+                "in each w"
+            )
+    return list(zip(rows, numbers, strict=True))
+
+
+def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
+    """The funnel: x₀ continuous, P ≻ 0 and ρ > 0 at every knot, and so in between."""
+    parts = _opened(node, "nlsid/funnel", "kind vector_field policy t x P rho")
+    _made_for(parts, digests, "funnel", "vector_field policy")
+    t = _increasing(parts["t"], 2, MAX_KNOTS)
+    K = len(t)
+    x = _curve(parts["x"], K - 1, n)
+    if any(before[-1] != after[0] for before, after in pairwise(x)):
+        raise Rejected("the nominal states of the funnel jump at a knot")
+    size = len(x[0][0])
+    P, rho = parts["P"].array(K, size, size), parts["rho"].array(K)
+    for k in range(K):
+        definite(P[k], f"P at knot {k}")
+        if rho[k] <= 0:
+            raise Rejected(f"rho is not positive at knot {k}")
+    return Funnel(t, x, P, rho)
+
+
+def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str]) -> Policy:
+    """The policy: around the funnel's own nominal, each input clipped at most once."""
+    parts = _opened(node, "nlsid/policy", "kind vector_field t x u K limits")
+    _made_for(parts, digests, "policy", "vector_field")
+    count = len(funnel.x)
+    if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:
+        raise Rejected("the funnel is around another nominal than the policy's")
+    u = _curve(parts["u"], count, field.m)
+    K = parts["K"].array(count, None, field.m, field.n)
+    if any(not 0 < len(control) <= MAX_TIME_DEGREE + 1 for control in K):
+        raise Rejected(f"the gain should have degree 0 to {MAX_TIME_DEGREE} in time")
+    rows = parts["limits"].array(None, 3)
+    limits = {int(row[0]): (row[1], row[2]) for row in rows if row[0] in range(field.m)}
+    if len(limits) != len(rows) or len(rows) > MAX_LIMITED:
+        raise Rejected(f"limits should be at most {MAX_LIMITED} rows, one each for some input")
+    if any(low >= high for low, high in limits.values()):
+        raise Rejected("limits should be rows (input, low, high) with low < high")
+    return Policy(u, K, limits)
+
+
+def inside(
+    a: Sequence[Fraction], A: Sequence[Sequence[Fraction]], rho: Fraction,
+    b: Sequence[Fraction], B: Sequence[Sequence[Fraction]], multiplier: Fraction, what: str,
+) -> None:  # fmt: skip
+    """Raise Rejected unless {|x-a|²_A <= rho} lies in {|x-b|²_B <= 1}, by the S-lemma."""
+    at_most(0, multiplier, what)
+    d = [p - q for p, q in zip(a, b, strict=True)]
+    Bd = [sum((p * q for p, q in zip(row, d, strict=True)), Fraction(0)) for row in B]
+    rows = [
+        [*(multiplier * p / rho - q for p, q in zip(left, right, strict=True)), -e]
+        for left, right, e in zip(A, B, Bd, strict=True)
+    ]
+    corner = 1 - multiplier - sum(p * q for p, q in zip(d, Bd, strict=True))
+    semidefinite([*rows, [*(-e for e in Bd), corner]], what)
+
+
+def _opened(node: Node, name: str, members: str) -> dict[str, Node]:
+    parts = node.members(f"format version {members}")
+    if parts["format"].text() != name or parts["version"].whole(0) != 2:
+        raise Rejected(f"{node.where} should have format {name!r}, version 2")
+    if "kind" in parts and parts["kind"].text() != "continuous":
+        raise Rejected(f"{node.where} should be of kind 'continuous'")
+    return parts
+
+
+def _made_for(parts: dict[str, Node], digests: dict[str, str], owner: str, roles: str) -> None:
+    for role in roles.split():
+        if parts[role].text() != digests[role]:
+            raise Mismatch(f"the {owner} was made for another {role}")
+
+
+def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
+    times = node.array(None)
+    if not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)):
+        raise Rejected(f"{node.where} should be {least} to {most} times that increase")
+    return times
+
+
+def _curve(node: Node, count: int, size: int | None) -> Curve:
+    curve: Curve = node.array(count, None, size)
+    for control in curve:
+        if not 0 < len(control) <= MAX_TIME_DEGREE + 1 or len(control[0]) != len(curve[0][0]):
+            raise Rejected(f"{node.where} should have degree 0 to {MAX_TIME_DEGREE} in time")
+    return curve
+
+
+def _spans(field: Field, funnel: Funnel) -> list[int]:
+    """The time span of each interval."""
+    for t in field.breaks:
+        if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
+            raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
+    return [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
+
+
+def _decide_goal(node: Node, stated: dict[str, Node], funnel: Funnel) -> str:
+    goal, n = node.members("centre P"), len(funnel.x[0][0])
+    centre, P = goal["centre"].array(n), goal["P"].array(n, n)
+    multiplier = stated["goal_multiplier"].number()
+    what = "that the funnel ends in the goal, by the S-lemma,"
+    inside(funnel.x[-1][-1], funnel.P[-1], funnel.rho[-1], centre, P, multiplier, what)
+    units = [[Fraction(i == j) for j in range(n)] for i in range(n)]
+    reach = [text.root_above(q) for q in inverse_forms(P, units, "the goal's matrix")]
+    box = ", ".join(
+        f"x{i} in [{text.below(c - r)}, {text.above(c + r)}]"
+        for i, (c, r) in enumerate(zip(centre, reach, strict=True))
+    )
+    return f", ends in the goal, an ellipsoid within {box}"
+
+
+def _decide_valid(
+    field: Field, policy: Policy, funnel: Funnel, bounds: list[Bounds], work: Work
+) -> None:
+    """x and clip(ũ) stay where the equations are valid.
+
+    |g'x̄| <= d wherever W <= ρ if ρ g'P⁻¹g <= d², so if d²P - ρgg' ⪰ 0, which holds between knots if
+    it does at them.
+    Centres and gains between knots are convex combinations of their control points. A limit within
+    the bounds keeps its side by itself; no limit may lie beyond the other side.
+    """
+    rooms: list[dict[tuple[int, tuple[Fraction, ...]], Fraction]] = [{} for _ in funnel.t]
+    for k, entries in enumerate(bounds):
+        for j, (low, high) in entries.items():
+            if j < field.n:
+                middle = [point[j] for point in funnel.x[k]]
+                rows = [[Fraction(i == j) for i in range(field.n)]]
+            else:
+                middle = [point[j - field.n] for point in policy.u[k]]
+                rows = [gain[j - field.n] for gain in policy.K[k]]
+            room = [min(middle) - low, high - max(middle)]
+            if j - field.n in policy.limits:
+                least, most = policy.limits[j - field.n]
+                if not (low <= most and least <= high):
+                    raise Rejected(
+                        f"the limits of u{j - field.n} lie where its dynamics are not valid"
+                    )
+                room = room[least >= low : 2 - (most <= high)]
+            for row, knot in product(rows, (k, k + 1)):
+                if room:
+                    key = j, tuple(row)
+                    rooms[knot][key] = min(min(room), rooms[knot].get(key, min(room)))
+    for knot, found in enumerate(rooms):
+        work.spend(10 * field.n**2 * (field.n + len(found)))
+        forms = inverse_forms(funnel.P[knot], [g for _, g in found], "P")
+        for ((j, _), d), form in zip(found.items(), forms, strict=True):
+            if d < 0 or funnel.rho[knot] * form > d * d:
+                at = text.exact(funnel.t[knot])
+                raise Rejected(
+                    f"the funnel leaves where its dynamics are valid: at {at} s entry {j} of (x, u)"
+                    " is not proved to keep its bounds"
+                )
+
+
+def _kept(field: Field, bounds: list[Bounds]) -> str:
+    """Where x and u are proved to stay, at all times."""
+    shown = []
+    for j in sorted(set.intersection(*map(set, bounds))):
+        low, high = min(b[j][0] for b in bounds), max(b[j][1] for b in bounds)
+        name = f"x{j}" if j < field.n else f"u{j - field.n}"
+        shown.append(f"{name} in [{text.below(low)}, {text.above(high)}]")
+    if any(b != bounds[0] for b in bounds):
+        shown.append("the bounds of each time span")
+    return f", and keeps {', '.join(shown)}" if shown else ""
+
+
+def _assumptions(field: Field, policy: Policy, bounds: list[Bounds]) -> tuple[str, ...]:
+    obeyed = "the state obeys the stored equations and the stored policy is applied at every time"
+    for i in range(field.m):
+        if i in policy.limits:
+            obeyed += f", u{i} clipped to {_range(policy.limits[i])}"
+        elif not all(field.n + i in entries for entries in bounds):
+            obeyed += f", u{i} without saturation"
+    ranges = ", ".join(f"w{j} in {_range(ends)}" for j, ends in enumerate(field.box))
+    result = [obeyed] + [f"at every time {ranges}"] * bool(ranges)
+    if field.expansion:
+        said = field.expansion if field.expansion.isascii() else json.dumps(field.expansion)
+        result.append(
+            "the equations expand others, and that the ranges of w cover what they leave out is an "
+            f"assumption of the vector field, computed by: {said}"
+        )
+    return tuple(result)
+
+
+def _range(ends: tuple[Fraction, Fraction]) -> str:
+    return f"[{text.exact(ends[0])}, {text.exact(ends[1])}]"
+
+
+def _decide_pieces(
+    field: Field, policy: Policy, funnel: Funnel, spans: list[int], stated: dict[str, Node],
+    margin: Fraction, work: Work,
+) -> int:  # fmt: skip
+    """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
+    kappa = None
+    if "kappa" in stated:
+        kappa = stated["kappa"].array(len(field.box))
+        if any(k <= 0 for k in kappa):
+            raise Rejected("kappa should be positive")
+        terms = [row for span in field.equations for equation in span for row, _ in equation]
+        if any(any(row[1 + field.n + field.m :]) and sum(row) > 1 for row in terms):
+            raise Rejected("w does more than add constants: kappa does not bound what it does")
+    limited = len(policy.limits)
+    vertices = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
+    needed = product(range(len(spans)), range(len(vertices)), product((0, -1, 1), repeat=limited))
+    combinations = len(spans) * len(vertices) * 3**limited
+    if combinations > MAX_PIECES:
+        raise Rejected(f"{combinations} intervals, vertices and modes; at most {MAX_PIECES}")
+    covered = {key: Fraction(0) for key in needed}
+    names = "interval vertex level index mu columns squares" + (" mode tau" if limited else "")
+    pieces = [node.members(names) for node in stated["pieces"].items(1, MAX_PIECES)]
+    order = []
+    for i, piece in enumerate(pieces):
+        level = piece["level"].whole(0, MAX_LEVEL)
+        index = piece["index"].whole(0, 2**level - 1)
+        mode = tuple(piece["mode"].wholes(limited)) if limited else ()
+        key = piece["interval"].whole(0), piece["vertex"].whole(0), mode
+        if key not in covered:
+            raise Rejected(
+                f"piece {i} is about interval {key[0]}, vertex {key[1]}, mode {mode}: none"
+            )
+        order.append((key, Fraction(index, 2**level), level, index, i))
+    for key, start, level, *_ in sorted(order):
+        if start <= covered[key]:
+            covered[key] = max(covered[key], start + Fraction(1, 2**level))
+    for (k, v, mode), until in covered.items():
+        if until < 1:
+            raise Rejected(f"a piece of interval {k} is missing (vertex {v}, mode {mode})")
+    multiplier = stated["multiplier"].wholes(None, field.n)
+    if len(set(map(tuple, multiplier))) < len(multiplier):
+        raise Rejected("the monomials of the multiplier should be distinct")
+    work.spend(PIECE * len(pieces))
+    loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
+
+    def decide_piece(ring: Ring, number: int) -> None:
+        (k, v, mode), _, level, index, _ = order[number]
+        key = ring.width, k, level, index, mode
+        if key not in loops:
+            loops.clear()
+            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, kappa, margin)
+        piece = pieces[number]
+        c = loops[key].condition(multiplier, piece, stated, vertices[v])
+        basis = read_basis(stated["basis"], piece["columns"], ring)
+        what = f"piece {number} (interval {k}, vertex {v}, mode {mode})"
+        positive(c, read_squares(piece["squares"], basis), ring, what)
+
+    width = WIDTHS[0]
+    for number in range(len(pieces)):
+        width = at_width(field.n, work, partial(decide_piece, number=number), width)
+    return len(pieces)
+
+
+class _Loop:
+    """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it."""
+
+    def __init__(
+        self, ring: Ring, field: Field, policy: Policy, funnel: Funnel, span: int,
+        place: tuple[int, int, int], mode: tuple[int, ...], kappa: list[Fraction] | None,
+        margin: Fraction,
+    ) -> None:  # fmt: skip
+        n, (k, level, index) = field.n, place
+        h = funnel.t[k + 1] - funnel.t[k]
+
+        def in_time(points: Sequence[Fraction]) -> Polynomial:
+            return ring.bernstein(points, level, index)
+
+        x = [ring.variable(i) for i in range(n)]
+        start, end, rho = funnel.P[k], funnel.P[k + 1], in_time(funnel.rho[k : k + 2])
+        Px = [
+            ring.linear([in_time(ends) for ends in zip(*rows, strict=True)])
+            for rows in zip(start, end, strict=True)
+        ]
+        W = [(-1, ring.times(a, b)) for a, b in zip(x, Px, strict=True)]
+        self.ring, self.gap = ring, ring.weighted([(1, rho), *W])
+        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
+        rest = [(Fraction(1), ring.constant(funnel.rho[k + 1] - funnel.rho[k])), (-margin * h, rho)]
+        centres = list(zip(*funnel.x[k], strict=True))
+        for i, points in enumerate(centres):
+            rate = [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
+            bend = [ring.constant(b - a) for a, b in zip(start[i], end[i], strict=True)]
+            rest.append((Fraction(2), ring.times(Px[i], in_time(rate))))
+            rest.append((Fraction(-1), ring.times(x[i], ring.linear(bend))))
+        inputs, self.held = [], []
+        for i, points in enumerate(zip(*policy.u[k], strict=True)):  # ũ = u₀ - Kx̄
+            gains = [in_time([gain[i][j] for gain in policy.K[k]]) for j in range(n)]
+            inputs.append(ring.minus(in_time(points), ring.linear(gains)))
+        for side, (i, (low, high)) in zip(mode, policy.limits.items(), strict=True):
+            above = ring.minus(inputs[i], ring.constant(low))
+            below = ring.minus(ring.constant(high), inputs[i])
+            held = ring.times(above, below) if side == 0 else [above, below][side > 0]
+            self.held.append(ring.scaled(held, 1 if side == 0 else -1))
+            if side:
+                inputs[i] = ring.constant(low if side < 0 else high)
+        forms = [in_time(funnel.t[k : k + 2])]
+        forms += [ring.sum([in_time(points), e]) for points, e in zip(centres, x, strict=True)]
+        growth = _growth(ring, field.equations[span], Px, [*forms, *inputs], 2 * h)
+        if kappa is not None:
+            for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=True)):
+                unit = tuple(int(i == j) for i in range(len(kappa)))
+                along = growth.get(unit, ring.constant(0))  # 2h x̄'Pg
+                half = (high - low) / 2
+                rest.append((-half * bound / (4 * h), ring.times(along, along)))
+                rest.append((-half * h / bound, ring.constant(1)))
+        self.rest, self.growth = ring.weighted(rest), growth
+
+    def condition(
+        self, multiplier: list[list[int]], piece: dict[str, Node], stated: dict[str, Node],
+        w: Sequence[Fraction],
+    ) -> Polynomial:  # fmt: skip
+        """c(s, x̄) of a piece at a vertex w."""
+        ring = self.ring
+        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
+        for used, growth in self.growth.items():
+            parts.append((-prod(value for value, e in zip(w, used, strict=True) if e), growth))
+        mu = piece["mu"].members("shifts start end")
+        shifts, *ends = (mu[key].wholes(len(multiplier)) for key in ("shifts", "start", "end"))
+        if any(abs(shift) > MAX_SHIFT for shift in shifts):
+            raise Rejected(f"{piece['mu'].where}: powers of two beyond 2^{MAX_SHIFT}")
+        lines = [
+            [Fraction(2) ** e * a, Fraction(2) ** e * (b - a)]
+            for e, a, b in zip(shifts, *ends, strict=True)
+        ]
+        parts.append((1, ring.times(ring.polynomial(multiplier, lines), self.gap)))
+        taus = piece["tau"].items(len(self.held), len(self.held)) if self.held else []
+        for node, held in zip(taus, self.held, strict=True):
+            tau = node.members("columns squares")
+            sides = read_basis(stated["sides"], tau["columns"], ring)
+            squares = expanded(read_squares(tau["squares"], sides), ring)
+            parts.append((-1, ring.times(squares, held)))
+        return ring.weighted(parts)
+
+
+def _growth(
+    ring: Ring, equations: list[list[tuple[list[int], Fraction]]], Px: list[Polynomial],
+    forms: list[Polynomial], scale: Fraction,
+) -> dict[tuple[int, ...], Polynomial]:  # fmt: skip
+    """scale x̄'Pf by its monomials in w, for the variables t, x, u as forms in x̄ and s."""
+    known = {(0,) * len(forms): ring.constant(1)}
+
+    def power(exponents: tuple[int, ...]) -> Polynomial:
+        if exponents not in known:
+            last = max(j for j, e in enumerate(exponents) if e)
+            lower = tuple(e - (j == last) for j, e in enumerate(exponents))
+            known[exponents] = ring.times(power(lower), forms[last])
+        return known[exponents]
+
+    growth: dict[tuple[int, ...], list[tuple[Fraction, Polynomial]]] = {}
+    for Px_i, equation in zip(Px, equations, strict=True):
+        rates: dict[tuple[int, ...], list[tuple[Fraction, Polynomial]]] = {}
+        for exponents, coefficient in equation:
+            value = power(tuple(exponents[: len(forms)]))
+            rates.setdefault(tuple(exponents[len(forms) :]), []).append((coefficient, value))
+        for used, terms in rates.items():
+            growth.setdefault(used, []).append((scale, ring.times(Px_i, ring.weighted(terms))))
+    return {used: ring.weighted(terms) for used, terms in growth.items()}

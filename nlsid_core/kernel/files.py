@@ -1,0 +1,232 @@
+"""Reading untrusted files: strict JSON, exact numbers, digests of bytes, plain names.
+
+A JSON number stands for the float64 nearest to it, and is refused unless it is that float64's own
+shortest decimal form (or an equal one): so no changed digit goes unnoticed. Whole numbers beyond
+2^53, NaN, infinities, duplicate keys and unknown members are refused. Numbers arrive as `int` or
+`Fraction`, never as `float`.
+"""
+
+import hashlib
+import json
+import os
+import re
+import stat
+from collections.abc import Callable
+from dataclasses import dataclass
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+
+MAX_BYTES = 32 * 2**20  # of one file; real proofs are a few MB
+MAX_TOTAL = 48 * 2**20  # of all files of a claim: reading takes a second a MB and 50 times that
+MAX_WHOLE = 2**53  # beyond it a float64 no longer holds every whole number
+MAX_DIGITS = 4000  # of one integer of a "p/q": bounds what one number can cost
+MAX_NAME = 200
+MAX_NUMBER = 60  # characters of a JSON number; a float64 needs at most 25
+
+_LABEL = re.compile(r"(?!e[-+0-9])(1/|[A-Za-z_/%°µ])[A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
+
+Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
+
+
+class Rejected(Exception):  # noqa: N818 - a verdict
+    """The proof does not prove its claim; the message says why."""
+
+
+class Mismatch(Rejected):
+    """A file is not the one that the proof is about."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A JSON value and where it stands, for messages; every reader below refuses what is wrong."""
+
+    value: object
+    where: str
+
+    def members(self, required: str, optional: str = "") -> dict[str, "Node"]:
+        """An object with exactly these members (names separated by spaces)."""
+        wanted, allowed = required.split(), optional.split()
+        if type(self.value) is not dict:
+            raise Rejected(f"{self.where} should be an object")
+        for name in wanted:
+            if name not in self.value:
+                raise Rejected(f"{self.where}: '{name}' is missing")
+        for name in self.value:
+            if name not in wanted and name not in allowed:
+                raise Rejected(f"{self.where}: unknown member {plain(name)!r}")
+        return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
+
+    def items(self, least: int = 0, most: int = 10**6) -> list["Node"]:
+        """A list of `least` to `most` entries."""
+        if type(self.value) is not list or not least <= len(self.value) <= most:
+            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
+        return [Node(entry, f"{self.where}[{i}]") for i, entry in enumerate(self.value)]
+
+    def text(self) -> str:
+        """A printable text of at most MAX_NAME characters."""
+        if type(self.value) is not str or len(self.value) > MAX_NAME:
+            raise Rejected(f"{self.where} should be a text of at most {MAX_NAME} characters")
+        if not self.value.isprintable():
+            raise Rejected(f"{self.where} should have no control characters")
+        return self.value
+
+    def number(self) -> Fraction:
+        """A float64, exactly."""
+        if type(self.value) is int or type(self.value) is Fraction:
+            return Fraction(self.value)
+        raise Rejected(f"{self.where} should be a number")
+
+    def whole(self, least: int, most: int = MAX_WHOLE) -> int:
+        """A whole number in [least, most]."""
+        if type(self.value) is not int or not least <= self.value <= most:
+            raise Rejected(f"{self.where} should be a whole number from {least} to {most}")
+        return self.value
+
+    def rational(self) -> Fraction:
+        """A float64, or a text "p/q" or "p" of whole numbers."""
+        if type(self.value) is not str:
+            return self.number()
+        above, slash, below = self.value.partition("/")
+        digits = above.removeprefix("-")
+        parts = [digits] + ([below] if slash else [])
+        for part in parts:
+            if not (part.isascii() and part.isdigit() and len(part) <= MAX_DIGITS):
+                raise Rejected(f"{self.where} should be a number or a text p/q of whole numbers")
+        if slash and not int(below):
+            raise Rejected(f"{self.where} divides by zero")
+        return Fraction(int(above), int(below) if slash else 1)
+
+    def integers(self, least: int, most: int) -> tuple[int, ...]:
+        """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
+        entries = self.items(least, most) if type(self.value) is not list else self.value
+        if not least <= len(entries) <= most or not all(type(e) is int for e in entries):
+            numbers = [entry.rational() for entry in self.items(least, most)]
+            if any(number.denominator != 1 for number in numbers):
+                raise Rejected(f"{self.where} should hold whole numbers only")
+            return tuple(number.numerator for number in numbers)
+        return tuple(entries)
+
+    def array(self, *shape: int | None) -> list:  # type: ignore[type-arg]
+        """Nested lists of float64s of this shape, as Fractions; None: any length."""
+        return self._nested(self.value, shape, Fraction)
+
+    def wholes(self, *shape: int | None) -> list:  # type: ignore[type-arg]
+        """Nested lists of whole numbers (at most 2^53 in size) of this shape."""
+        return self._nested(self.value, shape, int)
+
+    def _nested(self, value: object, shape: tuple[int | None, ...], kind: type) -> list:  # type: ignore[type-arg]
+        if type(value) is not list or (shape[0] is not None and len(value) != shape[0]):
+            wanted = " x ".join("any" if size is None else str(size) for size in shape)
+            raise Rejected(f"{self.where} should have shape {wanted}")
+        if len(shape) > 1:
+            return [self._nested(entry, shape[1:], kind) for entry in value]
+        for entry in value:
+            if type(entry) is not int and (kind is int or type(entry) is not Fraction):
+                raise Rejected(
+                    f"{self.where} should hold {'whole ' if kind is int else ''}numbers only"
+                )
+        return list(value) if kind is int else [Fraction(entry) for entry in value]
+
+
+def parse(content: bytes, where: str) -> Node:
+    """One JSON object."""
+    if len(content) > MAX_BYTES:
+        raise Rejected(f"{where}: {len(content)} bytes; at most {MAX_BYTES} are read")
+    try:
+        value = json.loads(
+            content.decode("utf-8"),
+            object_pairs_hook=_unique,
+            parse_float=_float64,
+            parse_int=_whole,
+            parse_constant=_refused,
+        )
+    except (ValueError, RecursionError, ArithmeticError) as error:
+        raise Rejected(f"{where}: not a valid document: {plain(str(error))}") from error
+    if type(value) is not dict:
+        raise Rejected(f"{where}: expected a JSON object")
+    return Node(value, where)
+
+
+def digest(content: bytes) -> str:
+    """`sha256:<hex>` of a file's bytes."""
+    return "sha256:" + hashlib.sha256(content).hexdigest()
+
+
+def bound_files(about: Node, read: Read, roles: str) -> tuple[dict[str, Node], dict[str, str]]:
+    """The documents that `about` names by file and digest, and their digests, by role."""
+    documents: dict[str, Node] = {}
+    digests: dict[str, str] = {}
+    for role, binding in about.members(roles).items():
+        entry = binding.members("file digest")
+        name, stated = entry["file"].text(), entry["digest"].text()
+        if not name or name in (".", "..") or any(sign in name for sign in "/\\:\0"):
+            raise Rejected(f"{role} file {name!r} is not a plain file name")
+        try:
+            content = read(name)
+        except OSError as error:
+            raise Mismatch(f"{role} file {name} cannot be read: {error.strerror}") from error
+        found = digest(content)
+        if found != stated:
+            raise Mismatch(
+                f"{name} is not the {role} this proof is about: digest {found[:23]}..., "
+                f"the proof says {plain(stated[:23])}..."
+            )
+        documents[role], digests[role] = parse(content, role), found
+    return documents, digests
+
+
+def read_regular(path: Path) -> bytes:
+    """A regular file's bytes; OSError for anything else, Rejected if it is too large."""
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with os.fdopen(handle, "rb") as stream:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(0, "not a regular file", str(path))
+        content = stream.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise Rejected(f"{plain(path.name)}: more than {MAX_BYTES} bytes")
+    return content
+
+
+def plain(text: str) -> str:
+    """`text` on one line, without control characters, for messages."""
+    shown = "".join(sign if sign.isprintable() else "?" for sign in text[:MAX_NAME])
+    return shown + ("..." if len(text) > MAX_NAME else "")
+
+
+def label(text: str) -> str:
+    """A name or a unit as one word of a sentence: as it is if it is plain, else quoted.
+
+    Quoted are spaces, punctuation, other scripts, and what could be read as a number's end.
+    """
+    return text if _LABEL.fullmatch(text) else json.dumps(text)
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        raise ValueError("a key occurs twice")
+    return result
+
+
+def _refused(name: str) -> object:
+    raise ValueError(f"{name} is not a number")
+
+
+def _float64(text: str) -> Fraction:
+    if len(text) > MAX_NUMBER:
+        raise ValueError(f"{text[:24]}... has too many digits")
+    nearest = float(text)
+    if nearest - nearest != 0.0:
+        raise ValueError(f"{text} does not fit a float64")
+    if repr(nearest) != text and Decimal(repr(nearest)) != Decimal(text):
+        raise ValueError(f"{text} is not a float64; the nearest one is {nearest!r}")
+    return Fraction(*nearest.as_integer_ratio())
+
+
+def _whole(text: str) -> int:
+    value = int(text) if len(text) <= 20 else 2**64
+    if abs(value) > MAX_WHOLE:
+        raise ValueError(f"{text[:24]} is a whole number beyond 2^53")
+    return value

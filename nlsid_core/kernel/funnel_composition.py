@@ -1,0 +1,69 @@
+"""Claim: funnels that follow each other in time, each ending inside the next, are one funnel.
+
+With F_a on [t_a, t_b] and F_b on [t_b, t_c], F_a(t_b) ⊂ F_b(t_b) is all that is needed: the
+S-lemma. Every stage's own proof is decided here too; it binds its own files. Dynamics and policy
+may change from stage to stage. Source: thesis Section 5.1.3.
+"""
+
+from fractions import Fraction
+from itertools import pairwise
+
+from . import text
+from .checking import opened
+from .continuous_funnel import Funnel, decide_funnel, inside
+from .decision import Decision
+from .files import Node, Read, Rejected, bound_files
+from .polynomials import Work
+
+MAX_STAGES = 100
+
+
+def decide(claim: Node, proof: Node, read: Read) -> Decision:
+    """Decide every stage, and that each but the last ends inside the next."""
+    multipliers = proof.members("multipliers")["multipliers"].array(None)
+    count = len(multipliers) + 1
+    if not 2 <= count <= MAX_STAGES:
+        raise Rejected(f"a composition has 2 to {MAX_STAGES} stages, not {count}")
+    roles = [f"stage{i}" for i in range(1, count + 1)]
+    documents, digests = bound_files(claim.members("kind about")["about"], read, " ".join(roles))
+    decisions, funnels, work = [], [], Work()
+    for role in roles:
+        try:
+            kind, stage, witnesses = opened(documents[role])
+            if kind != "continuous_funnel":
+                raise Rejected(f"a stage should claim a continuous_funnel, not {kind!r}")
+            decision, funnel = decide_funnel(stage, witnesses, read, work)
+        except Rejected as refusal:
+            raise type(refusal)(f"{role}: {refusal}") from refusal
+        decisions.append(decision)
+        funnels.append(funnel)
+        digests |= {f"{role}.{part}": digest for part, digest in decision.digests.items()}
+    for role, multiplier, pair in zip(roles, multipliers, pairwise(funnels), strict=False):
+        _decide_step(role, multiplier, *pair)
+    start, *changes, end = [text.exact(f.t[0]) for f in funnels] + [text.exact(funnels[-1].t[-1])]
+    return Decision(
+        f"composition of {count} funnels from {start} to {end} s, changing at "
+        f"{', '.join(changes)} s: every solution that is in one of them at a time of its own stays "
+        f"in it and in those that follow; the last is a {decisions[-1].statement}",
+        min(decision.margin for decision in decisions),
+        tuple(
+            f"{role}: {assumption}"
+            for role, decision in zip(roles, decisions, strict=True)
+            for assumption in decision.assumptions
+        ),
+        digests,
+    )
+
+
+def _decide_step(role: str, multiplier: Fraction, before: Funnel, after: Funnel) -> None:
+    """`before` ends when `after` starts, and inside it there."""
+    if len(before.x[0][0]) != len(after.x[0][0]):
+        raise Rejected(f"{role} and the next differ in their states")
+    end, start = before.t[-1], after.t[0]
+    if end != start:
+        raise Rejected(
+            f"{role} ends at {text.exact(end)} s, the next starts at {text.exact(start)} s"
+        )
+    shape = [[entry / after.rho[0] for entry in row] for row in after.P[0]]
+    what = f"that {role} ends inside the next at {text.exact(end)} s, by the S-lemma,"
+    inside(before.x[-1][-1], before.P[-1], before.rho[-1], after.x[0][0], shape, multiplier, what)

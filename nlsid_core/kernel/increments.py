@@ -1,0 +1,456 @@
+"""The increment form of an identified model: how two of its solutions under one input differ.
+
+With ζ = (ν, x̄), x̄ the difference of the states and ν those of quantities that the model defines by
+an equation,
+    E(θ) ζ = 0,    x̄⁺ = F ζ,    o = H ζ,    E(θ) in the convex hull of finitely many matrices,
+plus multiples of [1, 0] where the form has a ray. θ is what is not known: the input where the model
+is affine in its outputs, the slope of a nonlinearity elsewhere. A quadratic form that is positive
+at each of the matrices is so at every E(θ). docs/certificate_stability.md has the forms and why.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise, product
+from math import comb, prod
+
+from . import text
+from .exact import Matrix, combined, congruence, definite, transposed
+from .exact import product as times
+from .files import Node, Rejected, label, plain
+
+MAX_STATES = 120
+MAX_PHASES = 8  # a cascade has 2^phases matrices
+MAX_POWER = 20  # of a variable of the window in a monomial
+MAX_WORK = 2 * 10**8  # order³ over all matrices that are decided: about a minute
+MAX_SPLITS = 40  # of one box, one inside the other
+
+Box = list[tuple[Fraction, Fraction]]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal's name and unit, as words of a sentence."""
+
+    name: str
+    unit: str
+
+    def quantity(self, number: str) -> str:
+        """The number with the unit, if there is one."""
+        return f"{number} {self.unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Linear:
+    """x⁺ = A x + B u + f, y = x_1 + D u + c, in the increment form's own state."""
+
+    B: list[Fraction]
+    D: Fraction
+    f: list[Fraction]
+    input_range: tuple[Fraction, Fraction]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model file in increment form.
+
+    F: (n, m + n), H: (p, m + n) for m quantities ν. vertices: matrices E, each (m, m + n), whose
+    convex hull holds E(θ) for θ in a box inside `box`, perhaps by stated ends. ray: E(θ) may have
+    any multiple of [1, 0] added. inputs: for which inputs this is so, in words.
+    """
+
+    period: Fraction
+    y: tuple[Signal, ...]
+    u: tuple[Signal, ...]
+    F: Matrix
+    H: Matrix
+    inputs: str
+    box: Box
+    vertices: Callable[[Box, Node | None], list[Matrix]]
+    ray: bool = False
+    linear: Linear | None = None
+    effort: int = 0  # of finding the vertices, in products
+
+    @property
+    def states(self) -> int:
+        """n."""
+        return len(self.F)
+
+    @property
+    def unknowns(self) -> int:
+        """m."""
+        return len(self.F[0]) - len(self.F)
+
+
+def decreases(model: Model, multipliers: Node | None, P: Matrix, rho: Fraction) -> None:
+    """Raise Rejected unless diag(0, ρP) - F'PF + sym(N E) ≻ 0 at every vertex E of every leaf.
+
+    `multipliers` is a leaf {N}, N (m + n, m), or {split, parts}: the variable of the box that is
+    halved, and the multipliers of the lower and of the upper half. A leaf may state `ends` beside
+    N: bounds of the one entry of E that varies, in the place of the vertices (`_between`).
+    """
+    m, n = model.unknowns, model.states
+    supply = _block_diagonal([[Fraction(0)] * m for _ in range(m)], P, rho)
+    gap = combined(supply, congruence(model.F, P), -1)
+    what = "the decrease of V = x'Px at the stated rate"
+    if multipliers is None:
+        if m:
+            raise Rejected("the proof needs multipliers for this class of models")
+        definite(gap, what)
+        return
+    if not m:
+        raise Rejected("this class of models has no multipliers")
+    work = 0
+    for box, leaf in _leaves(multipliers, model.box, 0):
+        N = leaf["N"].array(m + n, m)
+        work += 30 * model.effort
+        if model.ray and (N[0][0] < 0 or any(row[0] for row in N[1:])):
+            raise Rejected("the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0")
+        if work > MAX_WORK:
+            raise Rejected(f"{what} takes too long to decide: too many coefficients")
+        for E in model.vertices(box, leaf.get("ends")):
+            work += (m + n) ** 3
+            if work > MAX_WORK:
+                raise Rejected(f"{what} takes too long to decide: too many matrices")
+            cross = times(N, E)
+            definite(combined(gap, combined(cross, transposed(cross))), what)
+
+
+def _leaves(node: Node, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
+    parts = node.members("", "N ends split parts")
+    if set(parts) == {"N"} or (set(parts) == {"N", "ends"} and box):
+        yield box, parts
+        return
+    if set(parts) != {"split", "parts"} or not box:
+        raise Rejected(
+            f"{node.where} should be a multiplier N, or the split of a box and its parts"
+        )
+    if depth == MAX_SPLITS:
+        raise Rejected(f"{node.where}: more than {MAX_SPLITS} splits, one inside the other")
+    i = parts["split"].whole(0, len(box) - 1)
+    low, high = box[i]
+    halves = ((low, (low + high) / 2), ((low + high) / 2, high))
+    for half, part in zip(halves, parts["parts"].items(2, 2), strict=True):
+        yield from _leaves(part, [*box[:i], half, *box[i + 1 :]], depth + 1)
+
+
+def read_model(node: Node) -> Model:
+    """The increment form of a model file's content."""
+    if type(node.value) is not dict or type(node.value.get("kind")) is not str:
+        raise Rejected(f"{node.where}: 'kind' is missing")
+    kind = node.value["kind"]
+    if kind not in _READERS:
+        known = ", ".join(_READERS)
+        raise Rejected(f"{node.where}: kind is {plain(kind)!r}; known: {known}")
+    model = _READERS[kind](node)
+    if not 0 < model.states <= MAX_STATES:
+        raise Rejected(f"{node.where}: {model.states} states; 1 to {MAX_STATES} are decided")
+    return model
+
+
+def _difference_equation(node: Node) -> Model:
+    """ŷ = x_1 + b_0 u + c, x⁺ = a ŷ + shift(x) + b_1..n u: no ν, F = A, H = [1, 0 ...]."""
+    parts = _members(node, "y u a b c u_range")
+    a = parts["a"].array(None)
+    n = _size(len(a), parts["a"])
+    direct, *b = parts["b"].array(n + 1)
+    c = parts["c"].number()
+    low, high = parts["u_range"].array(2)
+    if low > high:
+        raise Rejected(f"{node.where} u_range is empty")
+    A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
+    return Model(
+        _period(parts), (_signal(parts["y"]),), (_signal(parts["u"]),),
+        A, [_unit(0, n)], "for every input", [], lambda _, __: [],
+        linear=Linear(
+            [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)],
+            direct, [a_i * c for a_i in a], (low, high),
+        ),
+    )  # fmt: skip
+
+
+def _state_affine(node: Node) -> Model:
+    """0 = Σ_k G_k(w) ȳ(t-k) + p(w): x stacks ȳ(t-1) … ȳ(t-n), ν = ȳ(t), E = [G_0 … G_n](w)."""
+    parts = _members(
+        node,
+        "y u window G p y_offset y_scale u_offset u_scale u_range on_out_of_range",
+    )
+    y, u = (tuple(_signal(s) for s in parts[key].items(1, 50)) for key in ("y", "u"))
+    p, n_u = len(y), len(u)
+    window = parts["window"].wholes(None, 2)
+    G = [_polynomials(entry, len(window), p, p) for entry in parts["G"].items(2, MAX_STATES)]
+    _polynomials(parts["p"], len(window), p)
+    parts["y_offset"].array(p)
+    y_scale, u_scale = parts["y_scale"].array(p), parts["u_scale"].array(n_u)
+    ranges, offsets = parts["u_range"].array(n_u, 2), parts["u_offset"].array(n_u)
+    if min(y_scale + u_scale) <= 0 or any(low >= high for low, high in ranges):
+        raise Rejected(f"{node.where}: scales should be positive and input ranges not empty")
+    if any(not (0 <= i < n_u and 0 <= d < len(G)) for i, d in window):
+        raise Rejected(f"{node.where} window names inputs or delays that are not there")
+    degrees = _degrees(G, len(window))
+    terms = sum(len(g) for g in G)
+    box = [tuple((end - offsets[i]) / u_scale[i] for end in ranges[i]) for i, _ in window]
+    longest = [max(end.numerator.bit_length() + end.denominator.bit_length() for end in ends)
+               for ends in box]  # fmt: skip
+    bits = sum(d * long for d, long in zip(degrees, longest, strict=True))
+    size = p * (len(G) - 1)
+    F = [_unit(i, p + size) for i in range(size)]  # x⁺ = [ν; all but the oldest of x]
+    H = [[y_scale[i] * entry for entry in _unit(i, p + size)] for i in range(p)]
+    return Model(
+        _period(parts), y, u, F, H,
+        _inputs_in_range(parts["on_out_of_range"].text(), u, ranges),
+        [(low, high) for low, high in box],
+        lambda part, ends: _bernstein(G, part) if ends is None else _between(G, part, ends),
+        effort=prod(d + 1 for d in degrees) * terms * (p * p + len(window))
+        * (1 + (bits >> 11) ** 2),
+    )  # fmt: skip
+
+
+def _block_cascade(node: Node) -> Model:
+    """Two linear filters around a spline: ν_j = f(x_j) - f(x̂_j), E = [I, -diag(s_j) C_j, 0].
+
+    x stacks v(t-1) … v(t-n₁) of the first filter and the observer form of the second. f' is a
+    convex combination of (c_{j+1} - c_j)/spacing everywhere, and constant beyond the knots.
+    """
+    parts = _members(node, "y u a1 b1 f a2 b2")
+    a1, a2 = parts["a1"].array(None), parts["a2"].array(None)
+    b1, b2 = parts["b1"].array(None, None), parts["b2"].array(None, None)
+    M = len(b1)
+    if not 0 < M <= MAX_PHASES or len(b2) != M:
+        raise Rejected(f"{node.where}: b1 and b2 should have as many rows, 1 to {MAX_PHASES}")
+    if any(len(row) != len(rows[0]) or not row for rows in (b1, b2) for row in rows):
+        raise Rejected(f"{node.where}: the rows of b1, and of b2, should have equal lengths")
+    spline = parts["f"].members("low spacing coefficients")
+    spline["low"].number()
+    spacing, c = spline["spacing"].number(), spline["coefficients"].array(None)
+    if spacing <= 0 or len(c) < 4:
+        raise Rejected(f"{node.where} f: a positive spacing and 4 coefficients or more")
+    slopes = [(after - before) / spacing for before, after in pairwise(c)]
+    least, most = min(slopes), max(slopes)
+    n1, n2 = max(len(a1), len(b1[0]) - 1), max(len(a2), len(b2[0]) - 1)
+    n = _size(n1 + n2, node)
+    a1, a2 = _padded(a1, n1), _padded(a2, n2)
+    F = [[Fraction(0)] * M + a1 + [Fraction(0)] * n2] if n1 else []
+    F += [_unit(M + k, M + n) for k in range(n1 - 1)]
+    # x_j = b1_j0 v(t) + … with v(t) = u + a1·past gives C_j; the same way behind f gives g_j.
+    C = [[row[0] * a + b for a, b in zip(a1, _padded(row[1:], n1), strict=True)] for row in b1]
+    g = [[row[0] * a + b for a, b in zip(a2, _padded(row[1:], n2), strict=True)] for row in b2]
+    for i in range(n2):
+        row = [g[j][i] for j in range(M)] + [Fraction(0)] * n1 + _unit(i + 1, n2 + 1)[:n2]
+        row[M + n1] += a2[i]
+        F.append(row)
+    H = [row[0] for row in b2] + [Fraction(0)] * n1 + _unit(0, n2)
+
+    def corners(_: Box, __: Node | None) -> list[Matrix]:
+        return [
+            [_unit(j, M) + [-s[j] * entry for entry in C[j]] + [Fraction(0)] * n2 for j in range(M)]
+            for s in product(sorted({least, most}), repeat=M)
+        ]
+
+    covered = f"[{text.below(least)}, {text.above(most)}]"
+    return Model(
+        _period(parts), (_signal(parts["y"]),), (_signal(parts["u"]),), F, [H],
+        f"for every input (the slopes of its nonlinearity are in {covered} everywhere)",
+        [], corners,
+    )  # fmt: skip
+
+
+def _monotone_equation(node: Node) -> Model:
+    """e(ȳ(t)) = affine in the past, ν = ȳ(t), E = [e', -a]: e' at least its least value, a ray."""
+    parts = _members(node, "y u e a b c window y_offset u_offset")
+    first, second, third = parts["e"].array(3)
+    a = parts["a"].array(None)
+    n = _size(len(a), parts["a"])
+    u = tuple(_signal(s) for s in parts["u"].items(0, 50))
+    window = parts["window"].wholes(None, 2)
+    parts["b"].array(len(window))
+    parts["u_offset"].array(len(u))
+    parts["c"].number()
+    parts["y_offset"].number()
+    if any(not (0 <= i < len(u) and d >= 0) for i, d in window):
+        raise Rejected(f"{node.where} window names inputs or delays that are not there")
+    if third < 0 or (third == 0 and second != 0):
+        raise Rejected(f"{node.where} e is not increasing everywhere")
+    least = first - second**2 / (3 * third) if third else first
+    E = [[least, *(-entry for entry in a)]]
+    F = [_unit(i, n + 1) for i in range(n)]
+    return Model(
+        _period(parts), (_signal(parts["y"]),), u, F, [_unit(0, n + 1)],
+        "for every input", [], lambda _, __: [E], ray=True,
+    )  # fmt: skip
+
+
+_READERS: dict[str, Callable[[Node], Model]] = {
+    "difference_equation": _difference_equation,
+    "state_affine": _state_affine,
+    "block_cascade": _block_cascade,
+    "monotone_equation": _monotone_equation,
+}
+
+Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
+
+
+def _bernstein(G: list[Terms], box: Box) -> list[Matrix]:
+    """The Bernstein coefficients of [G_0 … G_n](w) on a box: their convex hull holds its values.
+
+    On [lo, hi], w^e has the coefficient Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j) at index k
+    of degree d.
+    """
+    degrees = _degrees(G, len(box))
+    tables = [
+        [
+            [
+                sum(
+                    (
+                        comb(e, j)
+                        * low ** (e - j)
+                        * (high - low) ** j
+                        * Fraction(comb(k, j), comb(d, j))
+                        for j in range(min(e, k) + 1)
+                    ),
+                    Fraction(0),
+                )
+                for k in range(d + 1)
+            ]
+            for e in range(d + 1)
+        ]
+        for d, (low, high) in zip(degrees, box, strict=True)
+    ]
+    found: set[tuple[tuple[Fraction, ...], ...]] = set()
+    rows = len(G[0][0][1]) if G[0] else 0
+    for k in product(*(range(d + 1) for d in degrees)):
+        E: list[list[Fraction]] = [[] for _ in range(rows)]
+        for g in G:
+            value = [[Fraction(0)] * rows for _ in range(rows)]
+            for powers, coefficients in g:
+                weight = prod(
+                    (tables[i][e][k[i]] for i, e in enumerate(powers) if e), start=Fraction(1)
+                )
+                value = combined(value, coefficients, weight)
+            E = [left + right for left, right in zip(E, value, strict=True)]
+        found.add(tuple(map(tuple, E)))
+    return _extreme([[list(row) for row in E] for E in sorted(found)])
+
+
+def _degrees(G: list[Terms], variables: int) -> list[int]:
+    return [max(powers[i] for g in G for powers, _ in g) for i in range(variables)]
+
+
+def _between(G: list[Terms], box: Box, node: Node) -> list[Matrix]:
+    """[G_0 … G_n] at the stated ends of one quadratic G_0 = q, the others being constant.
+
+    low <= q(w) <= high on the box by the S-procedure: with weights a, b >= 0, as forms in [1; w],
+        q - low - Σ a_i (w_i - lo_i)(hi_i - w_i) ≻ 0,
+        high - q - Σ b_i (w_i - lo_i)(hi_i - w_i) ≻ 0.
+    """
+    q, *lagged = G
+    if len(q[0][1]) != 1 or any(any(e) for g in lagged for e, _ in g):
+        raise Rejected(f"{node.where}: ends are for one output whose lags have constant factors")
+    if any(sum(e) > 2 for e, _ in q):
+        raise Rejected(f"{node.where}: ends are for a leading coefficient of degree 2 at most")
+    parts = node.members("low high low_weights high_weights")
+    ends = parts["low"].number(), parts["high"].number()
+    for name, sign, end in (("low", 1, ends[0]), ("high", -1, ends[1])):
+        weights = parts[f"{name}_weights"].array(len(box))
+        if min(weights) < 0:
+            raise Rejected(f"{node.where}: weights should be 0 or more")
+        M = [[Fraction(0)] * (len(box) + 1) for _ in range(len(box) + 1)]
+        M[0][0] = -sign * end
+        for e, ((c,),) in q:
+            used = [i + 1 for i, power in enumerate(e) for _ in range(power)]
+            i, j = [0] * (2 - len(used)) + used
+            M[i][j] += sign * c / 2
+            M[j][i] += sign * c / 2
+        for i, (weight, (low, high)) in enumerate(zip(weights, box, strict=True), 1):
+            M[0][0] += weight * low * high
+            M[i][i] += weight
+            M[0][i] -= weight * (low + high) / 2
+            M[i][0] -= weight * (low + high) / 2
+        definite(M, f"the {name} end of the leading coefficient")
+    rest = [sum((c[0][0] for _, c in g), Fraction(0)) for g in lagged]
+    return [[[end, *rest]] for end in ends]
+
+
+def _extreme(E: list[Matrix]) -> list[Matrix]:
+    """Matrices with the same convex hull: the two ends where only one entry differs."""
+    varying = [
+        (i, j)
+        for i, row in enumerate(E[0])
+        for j, entry in enumerate(row)
+        if any(other[i][j] != entry for other in E)
+    ]
+    if len(varying) != 1:
+        return E
+    ((i, j),) = varying
+    return [min(E, key=lambda e: e[i][j]), max(E, key=lambda e: e[i][j])]
+
+
+def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
+    parts = node.members("exponents coefficients")
+    exponents = parts["exponents"].wholes(None, variables)
+    coefficients = parts["coefficients"].array(len(exponents), *shape)
+    if len({tuple(row) for row in exponents}) != len(exponents) or not exponents:
+        raise Rejected(f"{node.where} should have monomials, each once")
+    if any(not 0 <= power <= MAX_POWER for row in exponents for power in row):
+        raise Rejected(f"{node.where}: powers should be from 0 to {MAX_POWER}")
+    return list(zip(exponents, coefficients, strict=True))
+
+
+def _members(node: Node, names: str) -> dict[str, Node]:
+    parts = node.members(f"format version kind period training bags {names}", "equation")
+    if parts["format"].text() != "nlsid/model" or parts["version"].whole(0) != 2:
+        raise Rejected(f"{node.where} should be of format nlsid/model, version 2")
+    if "equation" in parts:
+        parts["equation"].text()
+    parts["training"].text()
+    for bag in parts["bags"].items():
+        for entry in bag.members("name digest").values():
+            entry.text()
+    return parts
+
+
+def _period(parts: dict[str, Node]) -> Fraction:
+    period = parts["period"].number()
+    if period <= 0:
+        raise Rejected("the model's period should be positive")
+    return period
+
+
+def _signal(node: Node) -> Signal:
+    parts = node.members("name unit path")
+    parts["path"].text()
+    name, unit = parts["name"].text(), parts["unit"].text()
+    return Signal(label(name), label(unit) if unit else "")
+
+
+def _inputs_in_range(beyond: str, u: Sequence[Signal], ranges: Sequence[Sequence[Fraction]]) -> str:
+    if beyond not in ("clip", "refuse"):
+        raise Rejected(f"on_out_of_range is {beyond!r}; known: clip, refuse")
+    shown = ", ".join(
+        signal.quantity(f"{signal.name} in [{text.above(low)}, {text.below(high)}]")
+        for signal, (low, high) in zip(u, ranges, strict=True)
+    )
+    if beyond == "clip":
+        return f"for every input (the model clips its inputs: {shown})"
+    return f"for every input in the model's range ({shown}; it refuses others)"
+
+
+def _size(n: int, node: Node) -> int:
+    if not 0 < n <= MAX_STATES:
+        raise Rejected(f"{node.where}: {n} states; 1 to {MAX_STATES} are decided")
+    return n
+
+
+def _unit(i: int, size: int) -> list[Fraction]:
+    return [Fraction(int(j == i)) for j in range(size)]
+
+
+def _padded(values: list[Fraction], size: int) -> list[Fraction]:
+    return values + [Fraction(0)] * (size - len(values))
+
+
+def _block_diagonal(zero: Matrix, P: Matrix, rho: Fraction) -> Matrix:
+    m, n = len(zero), len(P)
+    return [row + [Fraction(0)] * n for row in zero] + [
+        [Fraction(0)] * m + [rho * entry for entry in row] for row in P
+    ]

@@ -1,0 +1,234 @@
+"""Exact polynomials in s and x: dictionaries of packed integers over one denominator.
+
+A monomial of x is one integer, six bits an exponent; the total degree is tracked and kept below 64,
+so exponents never run into each other. A coefficient is a polynomial in s, packed into one integer
+by s = 2^width (Kronecker substitution). `norm` bounds the sum of the absolute values of all its
+integers, and below 2^(width - 1) the packing can be undone: `unpacked` refuses to otherwise, and
+`at_width` tries a larger width.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import lru_cache
+from itertools import pairwise
+from math import comb, lcm
+
+from .files import Rejected
+
+BITS = 6  # of an exponent
+MAX_DEGREE = 2**BITS - 1  # total, in x
+MAX_WORK = 2 * 10**8  # products of coefficients in one claim: minutes
+MAX_TERMS = 10**6  # of one polynomial: a few hundred MB
+MAX_HELD = 2**31  # bytes of the results of one ring, about
+TERM = 128  # bytes of a term without its digits
+LONG = 22  # a product of integers whose bits multiply to more than 2^22 counts as several
+VERY_LONG = 24  # and 2^24 as eight times that: nothing else takes time then
+WIDTHS = (64, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 16384)
+
+MOST_WORK = 10**7  # the same of a claim without pieces: seconds
+FREE_OF_S = 1024  # a width for polynomials in x alone: nothing is packed, so it costs nothing
+
+
+class TooNarrow(Exception):  # noqa: N818 - a signal to try again
+    """The width of a ring does not hold a result."""
+
+
+@dataclass
+class Work:
+    """How many products of coefficients a claim may still take."""
+
+    left: int = MAX_WORK
+
+    def spend(self, amount: int) -> None:
+        """Raise Rejected when it is used up."""
+        self.left -= amount
+        if self.left < 0:
+            raise Rejected("the claim takes more products to decide than are spent on one")
+
+
+@dataclass(frozen=True)
+class Polynomial:
+    """Σ terms[monomial] / denominator; degree in x, order in s, norm: upper bounds."""
+
+    terms: dict[int, int]
+    denominator: int
+    degree: int
+    order: int
+    norm: int
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Polynomials in s and in x0 … x(count - 1), packed at one width."""
+
+    count: int
+    width: int
+    work: Work
+    held: list[int] = field(default_factory=lambda: [0], compare=False)
+
+    def key(self, exponents: Sequence[int]) -> int:
+        """The integer that stands for a monomial of x."""
+        if len(exponents) != self.count or min(exponents, default=0) < 0:
+            raise Rejected(f"a monomial should have {self.count} exponents of 0 or more")
+        if sum(exponents) > MAX_DEGREE:
+            raise Rejected(f"degree {sum(exponents)} is above {MAX_DEGREE}")
+        return sum(e << (BITS * i) for i, e in enumerate(exponents))
+
+    def exponents(self, key: int) -> tuple[int, ...]:
+        """The exponents of the monomial that `key` stands for."""
+        return tuple((key >> (BITS * i)) & MAX_DEGREE for i in range(self.count))
+
+    def in_s(self, coefficients: Sequence[Fraction]) -> Polynomial:
+        """Σ_k coefficients[k] s^k."""
+        common = lcm(*(c.denominator for c in coefficients))
+        whole = [c.numerator * (common // c.denominator) for c in coefficients]
+        return self._packed(whole, common)
+
+    def bernstein(self, points: Sequence[Fraction], level: int = 0, index: int = 0) -> Polynomial:
+        """Σ_j B_j(r) points[j] with r = (index + s) / 2^level."""
+        d = len(points) - 1
+        common = lcm(*(point.denominator for point in points))
+        row = [point.numerator * (common // point.denominator) for point in points]
+        whole = [0] * (d + 1)
+        for k in range(d + 1):
+            power = comb(d, k) * row[0] << level * (
+                d - k
+            )  # of r^k, times 2^(level d) / 2^(level k)
+            for j in range(k + 1):
+                whole[j] += power * comb(k, j) * index ** (k - j)
+            row = [after - before for before, after in pairwise(row)]
+        return self._packed(whole, common << level * d)
+
+    def polynomial(
+        self, monomials: Sequence[Sequence[int]], coefficients: Sequence[Sequence[Fraction]]
+    ) -> Polynomial:
+        """Σ_i Σ_k coefficients[i][k] s^k x^monomials[i]; the monomials are distinct."""
+        parts = []
+        for monomial, row in zip(monomials, coefficients, strict=True):
+            p, key = self.in_s(row), self.key(monomial)
+            parts.append(
+                Polynomial({key: p.terms.get(0, 0)}, p.denominator, sum(monomial), p.order, p.norm)
+            )
+        return self.sum(parts)
+
+    def constant(self, value: Fraction | int) -> Polynomial:
+        """A number."""
+        return self.in_s([Fraction(value)])
+
+    def variable(self, i: int) -> Polynomial:
+        """x_i."""
+        return Polynomial({1 << (BITS * i): 1}, 1, 1, 0, 1)
+
+    def linear(self, row: Sequence[Polynomial]) -> Polynomial:
+        """Σ_i row[i] x_i, the row's entries being polynomials in s alone."""
+        return self.sum([self.times(entry, self.variable(i)) for i, entry in enumerate(row)])
+
+    def weighted(self, parts: Sequence[tuple[Fraction | int, Polynomial]]) -> Polynomial:
+        """Σ weight part."""
+        common = lcm(*(p.denominator * weight.denominator for weight, p in parts))
+        terms: dict[int, int] = {}
+        norm = degree = order = 0
+        for weight, p in parts:
+            factor = weight.numerator * (common // (p.denominator * weight.denominator))
+            if factor:
+                norm += abs(factor) * p.norm
+                degree, order = max(degree, p.degree), max(order, p.order)
+                for key, value in p.terms.items():
+                    terms[key] = terms.get(key, 0) + value * factor
+        self.work.spend(sum(len(p.terms) for _, p in parts))
+        self._hold(len(terms), self.width * order + norm.bit_length())
+        return Polynomial(terms, common, degree, order, norm)
+
+    def sum(self, parts: Sequence[Polynomial]) -> Polynomial:
+        """The sum of the parts."""
+        return self.weighted([(1, p) for p in parts])
+
+    def minus(self, p: Polynomial, q: Polynomial) -> Polynomial:
+        """p - q."""
+        return self.weighted([(1, p), (-1, q)])
+
+    def scaled(self, p: Polynomial, factor: Fraction | int) -> Polynomial:
+        """factor p."""
+        return self.weighted([(factor, p)])
+
+    def times(self, p: Polynomial, q: Polynomial) -> Polynomial:
+        """p q."""
+        degree = p.degree + q.degree
+        if degree > MAX_DEGREE:
+            raise Rejected(f"degree {degree} is above {MAX_DEGREE}")
+        norm = p.norm * q.norm
+        if norm.bit_length() > WIDTHS[-1]:
+            raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits")
+        bits = [self.width * f.order + f.norm.bit_length() for f in (p, q)]
+        cost = bits[0] * bits[1]
+        long = 1 + (cost >> LONG - 3 * (cost >> VERY_LONG > 0))
+        self.work.spend((len(p.terms) * len(q.terms) + 1) * long)
+        most = min(MAX_TERMS, (MAX_HELD - self.held[0]) // (TERM + sum(bits) // 7))
+        terms: dict[int, int] = {}
+        for left, a in p.terms.items():
+            for right, b in q.terms.items():
+                key = left + right
+                terms[key] = terms.get(key, 0) + a * b
+            if len(terms) > most:
+                raise Rejected(f"a polynomial of more than {most} terms")
+        self._hold(len(terms), sum(bits))
+        return Polynomial(terms, p.denominator * q.denominator, degree, p.order + q.order, norm)
+
+    def _hold(self, terms: int, bits: int) -> None:
+        self.held[0] += terms * (TERM + bits // 7)
+        if self.held[0] > MAX_HELD:
+            raise Rejected("the claim takes too much memory to decide")
+
+    def _packed(self, whole: Sequence[int], denominator: int) -> Polynomial:
+        packed = sum(c << (self.width * k) for k, c in enumerate(whole))
+        terms = {0: packed} if packed else {}
+        return Polynomial(terms, denominator, 0, len(whole) - 1, sum(map(abs, whole)))
+
+    def digits(self, p: Polynomial) -> dict[int, bytes]:
+        """Each monomial's whole coefficients of s^0 … s^order, over p.denominator.
+
+        width / 8 bytes each, the lowest first, with half of the range added.
+        """
+        if p.norm >> (self.width - 1):
+            raise TooNarrow
+        size = self.width // 8
+        halves = _halves(size, p.order + 1)
+        return {
+            key: (value + halves).to_bytes(size * (p.order + 1), "little")
+            for key, value in p.terms.items()
+            if value
+        }
+
+
+def packed(row: Sequence[int], width: int) -> int:
+    """Σ_k row[k] 256^(width k): lanes of `width` bytes, signed."""
+    half = 1 << (8 * width - 1)
+    lanes = b"".join([(entry + half).to_bytes(width, "little") for entry in row])
+    return int.from_bytes(lanes, "little") - _halves(width, len(row))
+
+
+def unpacked(line: int, width: int, count: int, first: int = 0) -> list[int]:
+    """The row of `packed` from `first` on, if every entry is below half of its lane."""
+    half = 1 << (8 * width - 1)
+    lanes = (line + _halves(width, count)).to_bytes(width * count, "little")
+    starts = range(width * first, width * count, width)
+    return [int.from_bytes(lanes[i : i + width], "little") - half for i in starts]
+
+
+@lru_cache(maxsize=64)
+def _halves(width: int, count: int) -> int:
+    """Half of the range of each of `count` lanes of `width` bytes."""
+    return int.from_bytes((bytes(width - 1) + b"\x80") * count, "little")
+
+
+def at_width(count: int, work: Work, build: Callable[[Ring], None], first: int = WIDTHS[0]) -> int:
+    """Run `build` in the narrowest of WIDTHS, from `first` on, that holds it; returns the width."""
+    for width in WIDTHS:
+        if width >= first:
+            try:
+                build(Ring(count, width, work))
+            except TooNarrow:
+                continue
+            return width
+    raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits")

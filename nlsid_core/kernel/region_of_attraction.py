@@ -1,0 +1,66 @@
+"""Claim: solutions of dx/dt = f(x) that start in {V <= level} stay there and tend to the origin.
+
+Obligations: f(0) = 0;
+    V > 0 and -dV/dt - σ·(level - V) > 0 except at the origin, where both are 0,
+V unbounded with |x|, σ a sum of squares, dV/dt = Σ_j ∂V/∂x_j f_j. So {V <= level} is compact and
+dV/dt < 0 on it except at the origin. Without a level σ = 0, and every solution is attracted.
+Source: Lyapunov's theorem; Parrilo 2000, Section 7.3.
+"""
+
+from fractions import Fraction
+
+from . import text
+from .decision import Decision
+from .files import Node, Read, Rejected, bound_files
+from .polynomials import FREE_OF_S, MOST_WORK, Ring, Work, at_width
+from .positivity import expanded, positive_except_origin, read_witness
+from .terms import derivative, read_names, read_terms, shown, substituted
+
+LEVEL_DIGITS = 12  # of the level in the sentence
+
+
+def decide(claim: Node, proof: Node, read: Read) -> Decision:
+    """Rebuild V and its derivative along the field from the claim's numbers."""
+    parts = claim.members("kind about variables field V", "level")
+    _, digests = bound_files(parts["about"], read, "")
+    names = read_names(parts["variables"])
+    n = len(names)
+    field = [read_terms(entry, n) for entry in parts["field"].items(n, n)]
+    V = read_terms(parts["V"], n)
+    level = parts["level"].rational() if "level" in parts else None
+    if any(c and not any(e) for f in field for e, c in f):
+        raise Rejected("the origin is not an equilibrium: f(0) is not zero")
+    if level is not None and level <= 0:
+        raise Rejected("the level should be positive")
+    witnesses = proof.members("V decrease" + (" multiplier" if level is not None else ""))
+    margin = Fraction(0)
+
+    def build(ring: Ring) -> None:
+        nonlocal margin
+        x = [ring.variable(i) for i in range(n)]
+        value = substituted(V, x, ring)
+        positive_except_origin(value, read_witness(witnesses["V"], ring), ring, "V")
+        rate = [
+            ring.times(substituted(derivative(V, j), x, ring), substituted(f, x, ring))
+            for j, f in enumerate(field)
+        ]
+        terms = [ring.scaled(ring.sum(rate), -1)]
+        if level is not None:
+            sigma = expanded(read_witness(witnesses["multiplier"], ring), ring)
+            terms.append(ring.times(sigma, ring.minus(value, ring.constant(level))))
+        decrease = read_witness(witnesses["decrease"], ring)
+        margin = positive_except_origin(ring.sum(terms), decrease, ring, "the decrease of V")
+
+    at_width(n, Work(MOST_WORK), build, first=FREE_OF_S)
+    dynamics = ", ".join(
+        f"d{name}/dt = {shown(f, names)}" for name, f in zip(names, field, strict=True)
+    )
+    if level is None:
+        return Decision(f"every solution of {dynamics} tends to the origin", margin, (), digests)
+    inside = f"{{{shown(V, names)} <= {text.below(level, LEVEL_DIGITS)}}}"
+    return Decision(
+        f"every solution of {dynamics} that starts in {inside} tends to the origin",
+        margin,
+        (),
+        digests,
+    )

@@ -1,0 +1,451 @@
+"""Claim `sampled_funnel`: a tube and an inlet around a motion of an identified model hold.
+
+With x̄ = xhat - x_k and d_k the observer's correction, x̄⁺ = f̄_k(x̄) + d_k exactly. Sizes are |S_k x̄|.
+For both chains of radii, the tube and the inlet, and at each step: `positive` proves that
+|ξ| <= radius implies |f̄_k(ξ)| <= reach. With the disturbance's form and bound η, then
+    peak      |d| <= η:                reach + η <= next radius, and |x̄| <= radius;
+    response  |r| <= η, r⁺ = A r + d:  ξ = x̄ - r, reach + |f̄(ξ + r) - f̄(ξ) - A r| <= next radius;
+    energy, fading  E <= η², E⁺ = rate E + gain |d|²:  ξ⁺ = f̄(ξ), reach <= next radius, and
+              |f̄(ξ + w) - f̄(ξ)| <= μ|w| with gain μ² <= (gain - 1) rate, so that |x̄ - ξ|² <= E.
+A trapezoidal model's f̄ is any root of its equation h(z, w) = 0 within the stated bound. For the
+form response, ξ has a root at most spread·|r| from that of ξ + r, by Brouwer's theorem: with
+M h = c + B z + C w + N(z, w) and N's stretch μ, the map w -> w - M h(ξ, w) takes that ball into
+itself. Source: docs/certificate_sampled_funnel.md.
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from math import comb
+
+from .decision import Decision
+from .exact import Matrix, at_most, combined, product, semidefinite, transposed
+from .files import Mismatch, Node, Read, Rejected, bound_files, label
+from .polynomials import FREE_OF_S, Polynomial, Ring, Work, at_width
+from .positivity import expanded, positive, read_basis, read_squares
+from .sampled_steps import (
+    Map,
+    Sample,
+    explicit_step,
+    implicit_step,
+    linear_part,
+    mapped,
+    prove_curvature,
+    prove_inverse,
+    prove_norm,
+    square,
+    stretch,
+)
+from .text import above, below
+
+CHAINS = ("tube", "inlet")
+MAX_SAMPLES = 10**6  # times the cube of the states
+MAX_SIGNALS = 16
+MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
+
+
+@dataclass(frozen=True)
+class Model:
+    """A map (trapezoidal: of accelerations); signals: name, unit and box, states first."""
+
+    trapezoidal: bool
+    map: Map
+    period: Fraction
+    signals: list[tuple[str, str, Fraction, Fraction]]
+    states: int
+    bags: set[str]
+
+    @property
+    def variables(self) -> int:
+        """z, and of an implicit model w."""
+        return self.states + self.states // 2 * self.trapezoidal
+
+
+@dataclass(frozen=True)
+class Funnel:
+    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption."""
+
+    S: list[Matrix]
+    A: list[Matrix]
+    radii: dict[str, list[Fraction]]
+    half_widths: Matrix
+    roots: list[Fraction]
+    form: str
+    bound: Fraction
+    rate: Fraction
+    gain: Fraction
+    measured: str
+
+    @property
+    def widens(self) -> Fraction:
+        """What the disturbance adds to a radius."""
+        return Fraction(0) if self.form == "peak" else self.bound
+
+
+@dataclass(frozen=True)
+class Link:
+    """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
+
+    ring: Ring
+    rows: list[Polynomial]
+    h: list[Polynomial]
+    size: Polynomial
+    bounds: dict[str, Fraction]
+    curvature: list[Fraction]
+
+
+def decide(claim: Node, proof: Node, read: Read) -> Decision:
+    """Decide {kind, about: {model, policy, funnel}} by {basis, ball_basis, ..., steps}."""
+    about = claim.members("kind about")["about"]
+    documents, digests = bound_files(about, read, "model policy funnel")
+    model = _read_model(documents["model"])
+    x, u, K = _read_policy(documents["policy"], model, digests)
+    funnel = _read_funnel(documents["funnel"], model, len(u), digests)
+    for k in range(len(x)):
+        _prove_box(model, funnel, k, x[k], u[k : k + 1], K[k : k + 1])
+    bases = proof.members(
+        "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
+    )
+    rooms: list[Fraction] = []
+
+    def prove(ring: Ring) -> None:
+        rooms.clear()
+        for k, node in enumerate(bases["steps"].items(len(u), len(u))):
+            stated = node.members(
+                "T kappa curvature tube inlet"
+                + " T_next kappa_next inverse state rates direct through" * model.trapezoidal
+            )
+            at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
+            step = Ring(ring.count, ring.width, ring.work)  # what a step holds is not kept
+            link = _link(stated, model, at, funnel.form, step)
+            rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
+
+    at_width(model.variables, Work(), prove, first=FREE_OF_S)
+    return Decision(
+        _sentence(model, funnel, len(u)), min(rooms), _assumptions(model, funnel), digests
+    )
+
+
+def _link(stated: dict[str, Node], model: Model, at: Sample, form: str, ring: Ring) -> Link:
+    """The step's polynomials, and its stated bounds verified."""
+    n, d = model.states, model.states // 2
+    z = [ring.variable(i) for i in range(n)]
+    T = _triangular(stated["T"].array(n, n), stated["T"].where)
+    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
+    names = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
+    bounds = {name: _nonnegative(stated[name]) for name in names.split()}
+    curvature = [_nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
+    size, where = square(mapped(ST, z, ring), ring), stated["T"].where
+    prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
+    if not model.trapezoidal:
+        rows = explicit_step(model.map, at, T, ring)
+        carried = mapped(unit, z, ring) if form == "response" else []
+        moved = [ring.minus(p, q) for p, q in zip(rows, carried, strict=True)] if carried else rows
+        prove_curvature(moved, curvature, ring, least=1)
+        return Link(ring, rows, [], size, bounds, curvature)
+    T_next = stated["T_next"].array(d, d)
+    S_rates = [row[d:] for row in at.S_next[d:]]
+    prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
+    rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
+    normal = mapped(stated["inverse"].array(d, d), h, ring)
+    B, C = _split(linear_part(normal, ring), n)
+    L_z, L_w = _split(linear_part(rows, ring), n)
+    identity = [[Fraction(i == j) for j in range(d)] for i in range(d)]
+    direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
+    for name, M in (
+        ("state", B),
+        ("rates", combined(C, identity, -1)),
+        ("direct", direct),
+        ("through", L_w),
+    ):
+        prove_norm(M, bounds[name], f"{where}: the bound {name}")
+    prove_curvature(normal, curvature, ring, least=2)
+    return Link(ring, rows, h, size, bounds, curvature)
+
+
+def _prove_step(
+    link: Link, node: Node, bases: dict[str, Node], funnel: Funnel, chain: str, k: int
+) -> Fraction:
+    """Prove one step of one chain; the part of the next radius that it leaves free."""
+    ring, d, what = link.ring, len(link.h), f"{chain}, step {k}"
+    stated = node.members(
+        "reach columns squares ball"
+        + " roots equations" * bool(d)
+        + " spread extents" * (bool(d) and funnel.form == "response")
+    )
+    reach, (radius, following) = _nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
+    parts = [ring.constant(reach**2), ring.scaled(square(link.rows, ring), -1)]
+    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size, ring))
+    if d:
+        far, added = _implicit_addition(link, stated, funnel, radius, reach, k, what)
+        size = square([ring.variable(i) for i in range(2 * d, 3 * d)], ring)
+        parts.append(_ball(stated["roots"], bases["roots_basis"], far, size, ring))
+        parts += _equations(stated["equations"], bases["equation_basis"], link)
+    else:
+        added = _explicit_addition(link, funnel, radius, what)
+    at_most(
+        reach + added,
+        following,
+        f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius",
+    )
+    squares = read_squares(stated["squares"], read_basis(bases["basis"], stated["columns"], ring))
+    positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
+    return (following - reach - added) / following
+
+
+def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial, ring: Ring) -> Polynomial:
+    """-σ (radius² - size), σ a sum of squares: not positive where size <= radius²."""
+    stated = node.members("columns squares")
+    squares = read_squares(stated["squares"], read_basis(basis, stated["columns"], ring))
+    return ring.times(expanded(squares, ring), ring.sum([size, ring.constant(-(radius**2))]))
+
+
+def _equations(node: Node, monomials: Node, link: Link) -> list[Polynomial]:
+    """-ν_i h_i, zero at a root: ν_i = Σ_m rows[i][m] 2^columns[m] monomial_m."""
+    stated, ring = node.members("columns rows"), link.ring
+    basis = read_basis(monomials, stated["columns"], ring)
+    lowest, result = min(basis.columns), []
+    for row, h in zip(stated["rows"].wholes(len(link.h), len(basis.keys)), link.h, strict=True):
+        entries = [e << (shift - lowest) for e, shift in zip(row, basis.columns, strict=True)]
+        terms = dict(zip(basis.keys, entries, strict=True))
+        nu = Polynomial(terms, 1, basis.degree, 0, sum(map(abs, entries)))
+        result.append(ring.scaled(ring.times(nu, h), -(Fraction(2) ** lowest)))
+    return result
+
+
+def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) -> Fraction:
+    """What the disturbance adds to the reach of an explicit model from `radius`."""
+    if funnel.form == "peak":
+        return funnel.bound
+    kappa, rate, gain = link.bounds["kappa"], funnel.rate, funnel.gain
+    mu = kappa * stretch(link.curvature, kappa * radius, kappa * funnel.bound, least=1)
+    if funnel.form == "response":
+        return mu * funnel.bound
+    at_most(gain * mu**2, (gain - 1) * rate, f"{what}: deviations stretch by {above(mu)}, too "
+            f"much for rate {above(rate)} and gain {above(gain)}")  # fmt: skip
+    return Fraction(0)
+
+
+def _implicit_addition(
+    link: Link,
+    stated: dict[str, Node],
+    funnel: Funnel,
+    radius: Fraction,
+    reach: Fraction,
+    k: int,
+    what: str,
+) -> tuple[Fraction, Fraction]:
+    """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
+    b = link.bounds
+    far = b["kappa_next"] * funnel.roots[k + 1]
+    if funnel.form == "peak":
+        return far, funnel.bound
+    z, r, spread = b["kappa"] * radius, b["kappa"] * funnel.bound, _nonnegative(stated["spread"])
+    wide, near = (_nonnegative(entry) for entry in stated["extents"].items(2, 2))
+    # The root of ξ: Δ, with |Δ| <= spread |r|, is mapped to at most (state + ...) |r|.
+    far += spread * r
+    at_most(z**2 + far**2, wide**2, f"{what}: the first extent is too small")
+    mu = stretch(link.curvature, wide, (1 + spread) * r, least=2)
+    mapped_to = b["state"] + b["rates"] * spread + mu * (1 + spread)
+    if b["rates"] >= 1 or mapped_to > spread:
+        raise Rejected(f"{what}: two roots may differ by more than the stated spread")
+    # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
+    at_most(
+        z**2 + (b["kappa_next"] * reach) ** 2, near**2, f"{what}: the second extent is too small"
+    )
+    mu = stretch(link.curvature, near, (1 + spread) * r, least=2)
+    shrink = 1 - b["rates"] - mu
+    if shrink > 0:
+        spread = min(spread, (b["state"] + mu) / shrink)
+    return far, (b["direct"] + b["through"] * (b["rates"] * spread + mu * (1 + spread))) * r
+
+
+def _prove_box(
+    model: Model, funnel: Funnel, k: int, x: list[Fraction], u: Matrix, K: list[Matrix]
+) -> None:
+    """At sample k both chains stay in the box of the data, inputs included; and the half-widths."""
+    tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
+    rows = [[Fraction(i == j) for j in range(len(x))] for i in range(len(x))]
+    bounds = [
+        (row, tube, width, "its stated half-width")
+        for row, width in zip(rows, funnel.half_widths[k], strict=True)
+    ]
+    rows += [row for gain in K for row in gain]
+    centres = x + [entry for row in u for entry in row]
+    for row, centre, (_, _, low, high) in zip(rows, centres, model.signals, strict=False):
+        room = min(high - centre, centre - low)
+        bounds.append((row, max(tube, inlet), room, "the box of the model's data"))
+    square = product(transposed(funnel.S[k]), funnel.S[k])
+    for i, (row, radius, width, kept) in enumerate(bounds):
+        what = f"sample {k}: {model.signals[max(i - len(x), i % len(x))][0]} can leave {kept}"
+        # |row x̄| <= width where x̄'square x̄ <= radius²
+        edge = [radius * entry for entry in row]
+        bordered = [[*line, entry] for line, entry in zip(square, edge, strict=True)]
+        at_most(0, width, what)
+        semidefinite([*bordered, [*edge, width**2]], f"{what}: its room")
+
+
+def _read_model(node: Node) -> Model:
+    parts = node.members(
+        "format version kind equation period x u exponents coefficients x_range u_range noise "
+        "disturbance bags"
+    )
+    trapezoidal = _header(parts, "nlsid/model", "state_map", "trapezoidal") == "trapezoidal"
+    x, u = (parts[key].items(1, MAX_SIGNALS) for key in "xu")
+    box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
+    signals = []
+    for entry, (low, high) in zip(x + u, box, strict=True):
+        named = entry.members("name unit path")
+        name, unit = named["name"].text(), named["unit"].text()
+        signals.append((label(name), label(unit) if unit else "", low, high))
+    exponents = [tuple(row) for row in parts["exponents"].wholes(None, len(signals))]
+    outputs = len(x) // 2 if trapezoidal else len(x)
+    degree, period = max(map(sum, exponents), default=0), parts["period"].number()
+    if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
+        raise Rejected("a model needs a positive period, monomials, and a rate for each position")
+    if len(set(exponents)) != len(exponents) or min(map(min, exponents)) < 0:
+        raise Rejected("the model's monomials should be distinct, with exponents of 0 or more")
+    polynomials = Map(exponents, parts["coefficients"].array(len(exponents), outputs))
+    bags = set(_digests(parts["bags"]))
+    model = Model(trapezoidal, polynomials, period, signals, len(x), bags)
+    if degree > MAX_MONOMIALS or comb(model.variables + degree, degree) > MAX_MONOMIALS:
+        raise Rejected(f"degree {degree} in {model.variables} variables is too large to decide")
+    return model
+
+
+def _read_policy(
+    node: Node, model: Model, digests: dict[str, str]
+) -> tuple[Matrix, Matrix, list[Matrix]]:
+    parts = node.members("format version kind law model period L u x K")
+    _header(parts, "nlsid/policy", "sampled")
+    _same(parts["model"], digests["model"])
+    if parts["period"].number() != model.period:
+        raise Rejected("the policy has another sample time than the model")
+    n, p = model.states, len(model.signals) - model.states
+    u = parts["u"].array(None, p)
+    if not 0 < len(u) * n**3 <= MAX_SAMPLES:
+        raise Rejected(f"a policy of {n} states should have 1 to {MAX_SAMPLES // n**3} steps")
+    parts["L"].array(n, n)
+    return parts["x"].array(len(u) + 1, n), u, parts["K"].array(len(u), p, n)
+
+
+def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) -> Funnel:
+    parts = node.members(
+        "format version kind set model policy assumption tube inlet half_widths S A"
+        + " roots" * model.trapezoidal
+    )
+    _header(parts, "nlsid/funnel", "sampled")
+    for role in ("model", "policy"):
+        _same(parts[role], digests[role])
+    n = model.states
+    radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
+    roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
+    if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
+        raise Rejected("radii and roots should be positive, and the tube start in the inlet")
+    stated = parts["assumption"].members("form bound rate gain measured safety_factor measured_on")
+    form, runs = stated["form"].text(), _digests(stated["measured_on"])
+    bound, rate, gain, measured, factor = (
+        _nonnegative(stated[key]) for key in ("bound", "rate", "gain", "measured", "safety_factor")
+    )
+    if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
+        raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
+    if not runs or not all(runs) or model.bags.intersection(runs):
+        raise Rejected("the assumption needs commissioning runs that the model was not fitted on")
+    plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
+    if rate > 1 or gain < 1 or plain:
+        raise Rejected(f"rate {above(rate)} or gain {above(gain)} is none of form {form}")
+    at_most(1, factor, "the safety factor is below 1")
+    at_most(factor * measured, bound, "the bound is below safety_factor x measured")
+    return Funnel(
+        [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)],
+        parts["A"].array(steps, n, n),
+        radii,
+        parts["half_widths"].array(steps + 1, n),
+        roots,
+        form,
+        bound,
+        rate,
+        gain,
+        f"largest of {len(set(runs))} distinct commissioning runs {above(measured)}, safety factor "
+        f"{below(factor)}",
+    )
+
+
+def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
+    """What is proved, its numbers rounded outward."""
+    tube, inlet = (funnel.radii[chain] for chain in CHAINS)
+    ends, goal = (
+        ", ".join(
+            f"{name} {above(width * wider)} {unit}".rstrip()
+            for (name, unit, _, _), width in zip(
+                model.signals, funnel.half_widths[-1], strict=False
+            )
+        )
+        for wider in (Fraction(1), (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens))
+    )
+    box = ", ".join(
+        f"{name} in [{below(low)}, {above(high)}] {unit}".rstrip()
+        for name, unit, low, high in model.signals
+    )
+    start, size = "starts with |S[0] (xhat - x[0])| <=", "|S[k] (xhat - x[k])| <= tube[k]"
+    return (
+        f"funnel: a state estimate that {start} {below(tube[0])} stays in the tube, {size}"
+        f"{' + bound' * bool(funnel.widens)}, at all {steps + 1} samples over "
+        f"{below(steps * model.period)} s and ends within {ends} of the nominal; one that {start} "
+        f"{below(inlet[0])} ends within {goal} of it; at the samples both stay in the box of the "
+        f"model's data, {box}"
+    )
+
+
+def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
+    bound, rate, gain = below(funnel.bound), above(funnel.rate), above(funnel.gain)
+    kept = {
+        "response": f"|S r| <= {bound}, r+ = A r + d from r = 0,",
+        "peak": f"|S d| <= {bound}",
+        "energy": f"sqrt(E) <= {bound}, E+ = E + {gain} |S d|^2 from E = 0,",
+        "fading": f"sqrt(E) <= {bound}, E+ = {rate} E + {gain} |S d|^2 from E = 0,",
+    }[funnel.form]
+    assumptions = (
+        f"disturbance {funnel.form} {kept} at every sample, d = xhat+ - f(xhat, u) "
+        f"({funnel.measured})",
+        "the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])",
+    )
+    if not model.trapezoidal:
+        return assumptions
+    low, high = min(funnel.roots[1:]), max(funnel.roots[1:])
+    near = "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1]"
+    return (*assumptions, f"{near}, {below(low)} to {above(high)}")
+
+
+def _header(parts: dict[str, Node], name: str, *kinds: str) -> str:
+    """The document's kind; Rejected unless its format, version and kind are as they should be."""
+    kind = parts["kind"].text()
+    if parts["format"].text() != name or parts["version"].whole(0) != 2 or kind not in kinds:
+        raise Rejected(f"expected a {name} of version 2 and kind {' or '.join(kinds)}")
+    return kind
+
+
+def _same(node: Node, digest: str) -> None:
+    if node.text() != digest:
+        raise Mismatch(f"{node.where}: made for another one")
+
+
+def _digests(node: Node) -> list[str]:
+    """The digests of recordings."""
+    return [entry.members("name digest")["digest"].text() for entry in node.items()]
+
+
+def _nonnegative(node: Node) -> Fraction:
+    value = node.number()
+    at_most(0, value, f"{node.where} should not be negative")
+    return value
+
+
+def _triangular(M: Matrix, what: str) -> Matrix:
+    size = range(len(M))
+    if not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)):
+        raise Rejected(f"{what} should be upper triangular with a nonzero diagonal")
+    return M
+
+
+def _split(M: Matrix, n: int) -> tuple[Matrix, Matrix]:
+    return [row[:n] for row in M], [row[n:] for row in M]

@@ -1,0 +1,1 @@
+"""Policies: what drives a robot in a funnel."""

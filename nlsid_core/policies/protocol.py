@@ -1,0 +1,58 @@
+"""What policies of every kind have in common, so that one controller runs them all."""
+
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import DocumentError
+from nlsid_core.policies import continuous, linear, sampled
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.linear import LinearPolicy
+from nlsid_core.policies.sampled import SampledPolicy
+
+AnyPolicy: TypeAlias = LinearPolicy | SampledPolicy | ContinuousPolicy
+
+
+class Policy(Protocol):
+    """A plan and the feedback around it; `when`: a sample, or s of a continuous policy."""
+
+    @property
+    def made_for(self) -> str:
+        """The digest of the model or vector field."""
+
+    @property
+    def planned(self) -> FloatArray:
+        """The inputs of the plan, one row for each moment."""
+
+    @property
+    def last(self) -> float:
+        """The last moment that has an input."""
+
+    def __call__(self, when: Any, x: FloatArray, /) -> Any:
+        """The input at `when` for the state x (n,): a number, or an array of several."""
+
+    def covers(self, when: float, x: FloatArray) -> tuple[Any, Any]:
+        """The least and greatest input that the proof covers at `when` for the state x."""
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+
+
+def read_policy(document: Json, *, source: str = "policy") -> AnyPolicy:
+    """The policy of a document, by its kind; DocumentError says what is wrong with it."""
+    kinds: dict[object, type[AnyPolicy]] = {
+        linear.KIND: LinearPolicy,
+        sampled.KIND: SampledPolicy,
+        continuous.KIND: ContinuousPolicy,
+    }
+    kind = document.get("kind")
+    if kind not in kinds:
+        known = ", ".join(map(str, kinds))
+        raise DocumentError(f"{source}: kind is {kind!r}, expected one of {known}")
+    return kinds[kind].from_document(document, source=source)
+
+
+def load_policy(path: Path | str) -> AnyPolicy:
+    """Read a policy file of any kind; DocumentError says what is wrong with it."""
+    return read_policy(files.load_document(path), source=str(path))

@@ -1,0 +1,107 @@
+"""`SampledPolicy`: a nominal motion of a state model, its feedback and observer."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.policies.linear import FORMAT
+
+KIND = "sampled"
+
+
+@dataclass(frozen=True, eq=False)
+class SampledPolicy:
+    """u = u_k - K_k(x̂ - x_k), x̂⁺ = f(x̂, u) + L(y⁺ - f(x̂, u)), y the measured state.
+
+    x: (N + 1, n) nominal states, u: (N, p) nominal inputs, K: (N, p, n), L: (n, n), in the units of
+    the model whose digest is `model`. Sample k is `period` s after sample k - 1.
+
+    Raises ShapeError or DataError on arrays that do not fit or are not finite.
+    """
+
+    x: FloatArray
+    u: FloatArray
+    K: FloatArray
+    L: FloatArray
+    period: float
+    model: str
+
+    def __post_init__(self) -> None:
+        for key in ("x", "u", "K", "L"):
+            values = np.array(getattr(self, key), dtype=np.float64)
+            if not np.isfinite(values).all():
+                raise DataError(f"policy: {key} holds NaN or infinity")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        if self.x.ndim != 2 or self.u.ndim != 2 or not len(self.u):
+            raise ShapeError("policy: x should be (N + 1, n), u (N, p) with N > 0")
+        n, (steps, p) = self.x.shape[1], self.u.shape
+        if len(self.x) != steps + 1 or self.K.shape != (steps, p, n) or self.L.shape != (n, n):
+            raise ShapeError(
+                f"policy: x should be (N + 1, n), u (N, p), K (N, p, n), L (n, n); they are "
+                f"{self.x.shape}, {self.u.shape}, {self.K.shape}, {self.L.shape}"
+            )
+
+    def __len__(self) -> int:
+        """The number of steps N."""
+        return len(self.u)
+
+    def __call__(self, k: int, x: FloatArray) -> FloatArray:
+        """The input (p,) at sample k for the observer's state x (n,)."""
+        u: FloatArray = self.u[k] - self.K[k] @ (x - self.x[k])
+        return u
+
+    @property
+    def made_for(self) -> str:
+        """The digest of the model."""
+        return self.model
+
+    @property
+    def planned(self) -> FloatArray:
+        """(N, p) the nominal inputs."""
+        return self.u
+
+    @property
+    def last(self) -> float:
+        """The last sample that has an input."""
+        return len(self) - 1
+
+    def covers(self, when: float, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The least and greatest input (p,) that the proof covers at sample `when`: its own."""
+        u = self(int(when), x)
+        return u, u
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "kind": KIND,
+            "law": "u = u[k] - K[k] (xhat - x[k]);  xhat+ = f(xhat, u) + L (y+ - f(xhat, u))",
+            "model": self.model,
+            "period": self.period,
+            "L": self.L.tolist(),
+            "u": self.u.tolist(),
+            "x": self.x.tolist(),
+            "K": self.K.tolist(),
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "policy") -> "SampledPolicy":
+        """Raises DocumentError if the document is not a sampled policy."""
+        files.header(document, FORMAT, source=source)
+        if document.get("kind") != KIND:
+            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        u = files.array(document, "u", (None, None), source=source)
+        L = files.array(document, "L", (None, None), source=source)
+        return cls(
+            x=files.array(document, "x", (len(u) + 1, len(L)), source=source),
+            u=u,
+            K=files.array(document, "K", (len(u), u.shape[1], len(L)), source=source),
+            L=L,
+            period=files.number(document, "period", source=source),
+            model=files.member(document, "model", str, source=source),
+        )

@@ -1,0 +1,105 @@
+"""What a funnel's proof assumes, measured sample by sample: which part of it is used, 1 = all."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.errors import DataError
+from nlsid_core.funnels.factor import UNIT
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.observer import StateObserver
+
+
+class EnergyMeter:
+    """E⁺ = ρE + R e² of one innovation over the budgets of m funnels.
+
+    What rounding could hide is added.
+    """
+
+    def __init__(self, funnels: Sequence[LinearFunnel]) -> None:
+        self._rho = np.array([funnel.rho for funnel in funnels])
+        self._R = np.array([funnel.R[0, 0] for funnel in funnels])
+        self._budget = np.array([funnel.assumption.budget for funnel in funnels])
+        rounding = [(funnel.assumption.samples + 3) * UNIT for funnel in funnels]
+        self._share = (1.0 + 2.0 * np.array(rounding)) / self._budget
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run: nothing is used."""
+        self._spent = np.zeros(len(self._budget))
+
+    def update(self, innovation: FloatArray) -> list[float]:
+        """The part of each budget that is used after these innovations (m,)."""
+        self._spent = self._rho * self._spent + self._R * (innovation * innovation)
+        used: list[float] = (self._spent * self._share).tolist()
+        return used
+
+    def excess(self, i: int) -> str:
+        """How funnel i's assumption is broken."""
+        return f"disturbance energy {self._spent[i]:.4g} above the budget {self._budget[i]:.4g}"
+
+
+class DisturbanceMeter:
+    """What an assumption bounds, sample by sample; see `DisturbanceAssumption`."""
+
+    def __init__(
+        self, S: FloatArray, A: FloatArray, form: str, rate: float = 1.0, gain: float = 1.0
+    ) -> None:
+        self._S, self._A, self._form, self._rate, self._gain = S, A, form, rate, gain
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run: nothing is used."""
+        self._r: FloatArray = np.zeros(self._S.shape[1])
+        self._energy = 0.0
+
+    def update(self, k: int, d: FloatArray) -> float:
+        """The quantity at sample k > 0, d (n,) being the observer's correction there."""
+        size = float(np.linalg.norm(self._S[k] @ d))
+        if self._form == "peak":
+            return size
+        if self._form == "response":
+            self._r = self._A[k - 1] @ self._r + d
+            return float(np.linalg.norm(self._S[k] @ self._r))
+        self._energy = self._rate * self._energy + self._gain * size**2
+        return math.sqrt(self._energy)
+
+
+def meter_of(funnel: SampledFunnel) -> DisturbanceMeter:
+    """The meter of what this funnel assumes."""
+    a = funnel.assumption
+    return DisturbanceMeter(funnel.S, funnel.A, a.form, a.rate, a.gain)
+
+
+def disturbance_of(
+    model: MeasuredState,
+    policy: SampledPolicy,
+    run: Trajectory,
+    *,
+    S: FloatArray,
+    A: FloatArray,
+    form: str = "response",
+    rate: float = 1.0,
+    gain: float = 1.0,
+) -> FloatArray:
+    """(N + 1,) what an assumption of this form bounds, along a run of the policy.
+
+    The run starts with sample 0 of the nominal; y is the measured state, u what was applied.
+    Raises DataError if it is shorter than the policy.
+    """
+    if len(run) < len(policy):
+        raise DataError(f"{run.name}: {len(run)} samples, the policy has {len(policy)} steps")
+    observer, meter = StateObserver(model, policy.L), DisturbanceMeter(S, A, form, rate, gain)
+    sizes = np.zeros(len(policy) + 1)
+    last = min(len(run) - 1, len(policy))
+    for k in range(last + 1):
+        observer.update(run.y[k], run.u[k - 1] if k else None)
+        if k:
+            sizes[k] = meter.update(k, observer.d)
+    return sizes

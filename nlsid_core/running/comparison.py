@@ -1,0 +1,458 @@
+"""One sample against the sets of one kind: the arithmetic of a monitor, without stamps or verdicts.
+
+A sample in, sizes out: how far out of its set the state is, 1 on the boundary, rounded up so that a
+size of at most 1 is inside in exact arithmetic.
+"""
+
+from collections.abc import Sequence
+from enum import Enum
+from itertools import pairwise
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, apart
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.factor import refuse_unmonitorable
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.linear import LinearPolicy
+from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.running.assumption import EnergyMeter, meter_of
+from nlsid_core.running.observer import StateObserver
+from nlsid_core.running.reading import Level
+
+COMMAND_TOLERANCE = 1e-9  # relative: rounding between computing a policy's input and recording it
+
+
+class Centre(Enum):
+    """What a linear tube is around: the model driven by the received commands, or the plan."""
+
+    COMMAND = "command"
+    PROFILE = "profile"
+
+
+class Compared(NamedTuple):
+    """One sample against m funnels: a list entry for each.
+
+    used: of the assumption, 1 = all. worst: names of axes. broken: how the assumption is broken,
+    empty if it is not. levels: None where being in the set is all there is to say.
+    """
+
+    sizes: list[float]
+    used: list[float]
+    worst: list[str]
+    broken: list[str]
+    nominal: list[tuple[float, ...]]
+    deviation: list[list[float]]
+    levels: list[Level] | None = None
+
+
+class Comparison(Protocol):
+    """A kind's arithmetic for one run; `when`: as its funnels count, samples or s.
+
+    lags: samples before sample 0 that it needs. last: of each funnel, the last `when` it covers.
+    assuming: of each funnel, its assumption in words.
+    """
+
+    period: float
+    lags: int
+    last: list[float]
+    assuming: list[str]
+    over: list[str]
+
+    def restart(self) -> None:
+        """A new run."""
+
+    def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
+        """The sample as this kind takes it, and what is measured; ShapeError if it does not fit."""
+
+    def fault(self, t: float, y: Any, u: Any, *, needs_input: bool) -> str:
+        """Why this sample cannot be judged, empty if it can."""
+
+    def when(self, k: int, t: float) -> float:
+        """Sample k at t s after the start, as the funnels count."""
+
+    def collect(self, y: Any, u: Any) -> list[str] | None:
+        """Take a sample before sample 0: how each assumption is broken if it was the last."""
+
+    def compare(self, when: float, t: float, y: Any, u: Any) -> Compared:
+        """The next sample against the sets; SolverError if the model has no next state."""
+
+
+class LinearComparison:
+    """x̂ and the nominal x of a difference equation against m of its funnels, stacked.
+
+    Ten cost little more than one; each funnel's numbers are the same bit for bit alone or stacked.
+    """
+
+    def __init__(
+        self,
+        model: DifferenceEquation,
+        policies: Sequence[LinearPolicy],
+        funnels: Sequence[LinearFunnel],
+        centre: Centre,
+    ) -> None:
+        for policy, funnel in zip(policies, funnels, strict=True):
+            if policy.period != model.period:
+                raise CertificateMismatch("the policy has another sample time than the model")
+            if centre is Centre.PROFILE and len(policy) < funnel.assumption.samples:
+                raise CertificateMismatch(
+                    f"the policy plans {len(policy)} samples, the funnel "
+                    f"{funnel.assumption.samples}"
+                )
+        self.model, self._centre, self._funnels = model, centre, tuple(funnels)
+        self.period, self.lags = model.period, len(model)
+        self.last = [funnel.last for funnel in funnels]
+        n, m = len(model), len(funnels)
+        self.axes = (*(f"{model.y.name} +{i}" for i in range(n)), "innovation")
+        # x̂⁺ = A x̂ + B u + f + L e, transposed, as one product with the row [x̂, u, 1, e]
+        self._step = np.array(
+            [np.vstack([model.A.T, model.B.T, model.offset, policy.L]) for policy in policies]
+        )
+        rounded_up = [funnel.factor.T * (1.0 + funnel.rounding) for funnel in funnels]
+        self._factor = np.array(rounded_up)  # [x̄, e] @ factor has length 1 on the boundary
+        self._half_widths = np.array([funnel.axis_half_widths for funnel in funnels])
+        self._meter = EnergyMeter(funnels)
+        if centre is Centre.PROFILE:
+            longest = max(funnel.assumption.samples for funnel in funnels) + 1
+            self._K = np.array([policy.K for policy in policies])
+            self._x_plan = np.array([_held(policy.x, longest) for policy in policies])
+            self._u_plan = np.array([_held(policy.u, longest) for policy in policies])
+        self._rows = np.zeros((m, 2, n + 3))  # [x̂, u, 1, e] and [x_k, u_k, 1, 0] of each funnel
+        self._rows[:, :, n + 1] = 1.0
+        self._deviation = np.empty((m, n + 1))  # [x̄, e]
+        self._unbroken = [""] * m
+        unit = f" ({model.y.unit})²" if model.y.unit else ""
+        self.assuming = [
+            f"{_energy(f)} ≤ {f.assumption.budget:.4g}{unit} over {f.assumption.samples} samples"
+            for f in funnels
+        ]
+        self.over = [f"{f.assumption.samples} samples" for f in funnels]
+        self._name_parts()
+        self.restart()
+
+    def _name_parts(self) -> None:
+        """Views of the stacked rows, made once: slicing is a third of an update otherwise."""
+        n, rows = len(self.model), self._rows
+        self._x, self._x_nominal = rows[:, 0, :n], rows[:, 1, :n]
+        self._x_both = rows[:, :, :n]
+        self._y_past, self._y_nominal = rows[:, 0, 0], rows[:, 1, 0]
+        self._u, self._u_nominal = rows[:, 0, n], rows[:, 1, n]
+        self._e = rows[:, 0, n + 2]
+        self._x_bar, self._e_bar = self._deviation[:, :n], self._deviation[:, n]
+        self._deviation_row = self._deviation[:, None, :]
+        self._D, self._c = self.model.D, self.model.c
+        self._lowest, self._highest = self.model.u_range
+
+    def restart(self) -> None:
+        """A new run."""
+        self._y_lags: list[float] = []
+        self._u_lags: list[float] = []
+        self._meter.restart()
+
+    def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
+        """Numbers as they are."""
+        return y, u, (y,)
+
+    def fault(self, t: float, y: float, u: float, *, needs_input: bool) -> str:  # noqa: ARG002
+        """Why this sample cannot be judged, empty if it can."""
+        if abs(y) < np.inf and abs(u) < np.inf:
+            return ""
+        if not abs(y) < np.inf:
+            return f"{self.model.y.name} is {y} at t = {t:g} s"
+        return f"no {self.model.u.name} at t = {t:g} s (it is {u})"
+
+    def when(self, k: int, _t: float) -> float:
+        """The sample's number."""
+        return k
+
+    def collect(self, y: float, u: float) -> list[str] | None:
+        """Gather the first n samples, which give the observers their exact state."""
+        n = len(self.model)
+        self._y_lags.append(y)
+        self._u_lags.append(u)
+        if len(self._y_lags) < n:
+            return None
+        x = self.model.state_after(self._y_lags, self._u_lags)
+        planned = self._x_plan[:, 0] if self._centre is Centre.PROFILE else x
+        self._x[:], self._x_nominal[:] = x, planned
+        broken = []
+        for funnel, x_bar in zip(self._funnels, self._x - self._x_nominal, strict=True):
+            size = funnel.start_size(x_bar)
+            far = f"started outside the inlet: {size:.3g} times as far out as its boundary"
+            broken.append("" if size <= 1.0 else far)
+        return broken
+
+    def compare(self, when: float, t: float, y: float, u: float) -> Compared:
+        """Sample k = `when` against the tubes, then every x̂ and x one sample on."""
+        k, played, D, c = int(when), self._centre is Centre.COMMAND, self._D, self._c
+        self._u[:] = u
+        self._u_nominal[:] = u if played else self._u_plan[:, k]
+        innovation = y - (self._y_past + (D * u + c))
+        self._e[:] = innovation
+        self._e_bar[:] = innovation
+        np.subtract(self._x, self._x_nominal, out=self._x_bar)
+        used = self._meter.update(innovation)
+        away = (self._deviation_row @ self._factor)[:, 0]
+        sizes: list[float] = np.sqrt((away * away).sum(axis=1)).tolist()
+        worst = (np.abs(self._deviation) / self._half_widths).argmax(axis=1).tolist()
+        output = self._y_nominal + (D * self._u_nominal + c)
+        broken = self._unbroken
+        in_range = self._lowest <= u <= self._highest
+        if not (played and in_range and _all_kept(used)):
+            broken = self._broken(k, t, u, used)
+        deviation = self._deviation.tolist()
+        self._x_both[:] = self._rows @ self._step
+        if not played:
+            self._x_nominal[:] = self._x_plan[:, k + 1]
+        return Compared(
+            sizes,
+            used,
+            [self.axes[i] for i in worst],
+            broken,
+            [(planned,) for planned in output.tolist()],
+            deviation,
+        )
+
+    def _broken(self, k: int, t: float, u: float, used: list[float]) -> list[str]:
+        """How each assumption is broken at this sample."""
+        name, lowest, highest = self.model.u.name, self._lowest, self._highest
+        m = len(self._funnels)
+        planned: list[float] = [u] * m
+        meant = planned
+        if self._centre is Centre.PROFILE:
+            planned = self._u_plan[:, k].tolist()
+            meant = (self._u_plan[:, k] - (self._K * self._x_bar).sum(axis=1)).tolist()
+        broken = []
+        for i in range(m):
+            low, high = min(planned[i], meant[i]), max(planned[i], meant[i])
+            room = COMMAND_TOLERANCE * (1.0 + abs(meant[i]))
+            if not used[i] <= 1.0:
+                broken.append(f"{self._meter.excess(i)} at t = {t:g} s")
+            elif not lowest <= u <= highest:
+                told = apart(u, lowest, highest)
+                broken.append(f"{name} {told[0]} outside the fitted range [{told[1]}, {told[2]}]")
+            elif not low - room <= u <= high + room:
+                broken.append(f"{name} {u:.6g} is not the policy's {meant[i]:.6g} at t = {t:g} s")
+            else:
+                broken.append("")
+        return broken
+
+
+class SampledComparison:
+    """The estimate of a measured state against its tube around a motion."""
+
+    lags = 0
+
+    def __init__(self, model: MeasuredState, policy: SampledPolicy, funnel: SampledFunnel) -> None:
+        self.model, self._policy, self._funnel = model, policy, funnel
+        refuse_unmonitorable(funnel)
+        self.period, self.last = model.period, [funnel.last]
+        a = funnel.assumption
+        self.assuming = [f"the disturbance's {a.form} ≤ {a.bound:.4g}"]
+        self.over = [f"{len(policy) * model.period:g} s"]
+        self._meter = meter_of(funnel)
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run."""
+        self._observer = StateObserver(self.model, self._policy.L)
+        self._meter.restart()
+        self._u_before: FloatArray | None = None
+
+    def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
+        """The state (n,) and the input (p,), None if there is none."""
+        return read_vectors(y, u, len(self.model))
+
+    def fault(self, t: float, y: FloatArray, u: FloatArray | None, *, needs_input: bool) -> str:
+        """Why this sample cannot be judged, empty if it can."""
+        return vectors_fault(t, y, u, len(self.model.u) if needs_input else 0)
+
+    def when(self, k: int, _t: float) -> float:
+        """The sample's number."""
+        return k
+
+    def collect(self, _y: FloatArray, _u: FloatArray | None) -> list[str] | None:
+        """There is nothing before sample 0."""
+        raise DataError("a sampled funnel takes no samples before its start")
+
+    def compare(self, when: float, t: float, y: FloatArray, u: FloatArray | None) -> Compared:
+        """Sample k = `when` against the tube."""
+        k, funnel = int(when), self._funnel
+        x = self._observer.update(y, self._u_before)
+        self._u_before = u
+        nominal = self._policy.x[k]
+        x_bar = x - nominal
+        disturbance = self._meter.update(k, self._observer.d) if k else 0.0
+        bound = funnel.assumption.bound
+        size = funnel.size(k, x_bar)
+        return Compared(
+            [size],
+            [disturbance / bound if bound else np.inf * bool(disturbance)],
+            [self.model.x[int(np.argmax(np.abs(x_bar) / funnel.widths(k)))].name],
+            [self._broken(k, t, x, x_bar, u, disturbance)],
+            [tuple(nominal.tolist())],
+            [x_bar.tolist()],
+            [self._level(k, size, x_bar)],
+        )
+
+    def _broken(
+        self,
+        k: int,
+        t: float,
+        x: FloatArray,
+        x_bar: FloatArray,
+        u: FloatArray | None,
+        disturbance: float,
+    ) -> str:
+        """How what the proof assumes is broken at this sample."""
+        a = self._funnel.assumption
+        if k == 0 and not (start := self._funnel.start_size(x_bar)) <= 1.0:
+            return f"started outside: {start:.4g} times as far out as the boundary of the start"
+        if self._farther_than_roots(k):
+            return f"the model's step ended at a root beyond the proved ones at t = {t:g} s"
+        if not disturbance <= a.bound:
+            return (
+                f"disturbance {a.form} {disturbance:.4g} above the assumed {a.bound:.4g} "
+                f"at t = {t:g} s"
+            )
+        if u is None or k > self._policy.last:
+            return ""
+        return not_the_policys(t, u, self._policy(k, x), [signal.name for signal in self.model.u])
+
+    def _farther_than_roots(self, k: int) -> bool:
+        """Whether an implicit step's next rates are farther from the nominal than was proved."""
+        predicted, roots = self._observer.predicted, self._funnel.roots
+        if roots is None or predicted is None:
+            return False
+        d = len(predicted) // 2
+        away = (predicted - self._policy.x[k])[d:]
+        return not float(np.linalg.norm(self._funnel.S[k][d:, d:] @ away)) <= float(roots[k])
+
+    def _level(self, k: int, size: float, x_bar: FloatArray) -> Level:
+        norm, inlet = self._funnel.norm(k, x_bar), float(self._funnel.inlet[k])
+        if k == self._funnel.last and norm <= inlet + self._funnel.margin:
+            return Level.GOAL
+        if size <= 1.0:
+            return Level.TUBE
+        return Level.INLET if norm <= inlet else Level.NONE
+
+
+class ContinuousComparison:
+    """A measured state against the funnels of a motion in continuous time, one stage after another.
+
+    The input is held from one sample to the next, `period` s later; the proof is about a policy
+    that is applied continuously. So the sets are the proved ones, and the assumption is not
+    measured: it is said in words.
+    """
+
+    lags = 0
+
+    def __init__(
+        self,
+        fields: Sequence[VectorField],
+        policies: Sequence[ContinuousPolicy],
+        funnels: Sequence[ContinuousFunnel],
+        period: float,
+    ) -> None:
+        if not period > 0.0:
+            raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+        for before, after in pairwise(funnels):
+            if before.tf != after.t0 or before.n != after.n:
+                raise CertificateMismatch("the stages do not follow each other")
+        for funnel in funnels:
+            refuse_unmonitorable(funnel)
+        self._policies, self._funnels = tuple(policies), tuple(funnels)
+        self.period, self.n, self.m = period, fields[0].n, fields[0].m
+        self.last = [funnels[-1].tf]
+        held = f"the policy is applied continuously; here each input is held for {period:g} s"
+        pushed = any(len(field.uncertain) for field in fields)
+        self.assuming = [held + (", and w stays in its box" if pushed else "")]
+        self.over = [f"{funnels[-1].tf - funnels[0].t0:g} s"]
+
+    def restart(self) -> None:
+        """A new run: there is nothing to forget."""
+
+    def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
+        """The state (n,) and the input (m,), None if there is none."""
+        return read_vectors(y, u, self.n)
+
+    def fault(self, t: float, y: FloatArray, u: FloatArray | None, *, needs_input: bool) -> str:
+        """Why this sample cannot be judged, empty if it can."""
+        return vectors_fault(t, y, u, self.m if needs_input else 0)
+
+    def when(self, _k: int, t: float) -> float:
+        """The time in s on the funnel's own clock."""
+        return max(self._funnels[0].t0 + t, self._funnels[0].t0)
+
+    def collect(self, _y: FloatArray, _u: FloatArray | None) -> list[str] | None:
+        """There is nothing before sample 0."""
+        raise DataError("a continuous funnel takes no samples before its start")
+
+    def compare(self, when: float, t: float, y: FloatArray, u: FloatArray | None) -> Compared:
+        """The state at `when` s against the set of the stage that is on."""
+        stage = sum(when >= funnel.tf for funnel in self._funnels[:-1])
+        funnel, policy = self._funnels[stage], self._policies[stage]
+        nominal = funnel.nominal(when)
+        x_bar = y - nominal
+        worst = int(np.argmax(np.abs(x_bar) / funnel.widths(when)))
+        broken = ""
+        if u is not None and when < self.last[0]:
+            broken = not_the_policys(t, u, policy(when, y), [f"u{i}" for i in range(self.m)])
+        return Compared(
+            [funnel.size(when, x_bar)],
+            [np.nan],
+            [f"x{worst}"],
+            [broken],
+            [tuple(nominal.tolist())],
+            [x_bar.tolist()],
+        )
+
+
+def read_vectors(y: Any, u: Any, n: int) -> tuple[Any, Any, tuple[float, ...]]:
+    """State (n,) and input as arrays, and what is measured; ShapeError if it is no state."""
+    state = np.asarray(y, dtype=np.float64)
+    if state.shape != (n,):
+        raise ShapeError(f"the state should have shape ({n},): {state.shape}")
+    applied = None if u is None else np.atleast_1d(np.asarray(u, dtype=np.float64))
+    return state, applied, tuple(state.tolist())
+
+
+def vectors_fault(t: float, y: FloatArray, u: FloatArray | None, inputs: int) -> str:
+    """Why a sample cannot be judged, empty if it can; `inputs`: how many it needs."""
+    if not np.isfinite(y).all():
+        return f"state {y} at t = {t:g} s"
+    if inputs and (u is None or u.shape != (inputs,) or not np.isfinite(u).all()):
+        return f"no input at t = {t:g} s (it is {u})"
+    return ""
+
+
+def not_the_policys(t: float, u: FloatArray, wanted: FloatArray, names: Sequence[str]) -> str:
+    """Which input is not what the policy wants, empty if all are."""
+    apart = np.abs(u - wanted)
+    if (apart <= COMMAND_TOLERANCE * (1.0 + np.abs(wanted))).all():
+        return ""
+    i = int(np.argmax(apart))
+    return f"{names[i]} {u[i]:.6g} is not the policy's {wanted[i]:.6g} at t = {t:g} s"
+
+
+def _all_kept(used: list[float]) -> bool:
+    """Whether no assumption is used up; NaN is no proof of that."""
+    return all(part <= 1.0 for part in used)
+
+
+def _energy(funnel: LinearFunnel) -> str:
+    """What the assumption bounds, in letters."""
+    weight = "" if funnel.R[0, 0] == 1.0 else f"{funnel.R[0, 0]:.3g} "
+    return f"Σ {weight}e²" if funnel.rho == 1.0 else f"E, E⁺ = {funnel.rho:.4g} E + {weight}e²,"
+
+
+def _held(plan: FloatArray, length: int) -> FloatArray:
+    """`plan` cut to `length` samples, or with its last one repeated."""
+    return plan[np.minimum(np.arange(length), len(plan) - 1)]

@@ -1,0 +1,253 @@
+"""`Controller`: runs a policy on samples as they come; the live twin of what was proved.
+
+Of a linear tube input k+1 depends on the samples up to k only, so it is known a period before it
+acts. Of the other kinds input k answers sample k and has the period to get there.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import DataError, SolverError
+from nlsid_core.funnels.protocol import AnyFunnel
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.policies.protocol import AnyPolicy
+from nlsid_core.running.grid import TOLERANCE, Grid
+from nlsid_core.running.monitor import Dynamics, refuse_mismatch
+from nlsid_core.running.observer import (
+    MeasuredStateObserver,
+    Observer,
+    PredictingObserver,
+    StateObserver,
+)
+
+Input = TypeVar("Input", float, FloatArray)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """lowest, highest: of the input, in its unit; stop_rate: its fastest change while stopping, in
+    unit/s; stop_at: the input of a robot at rest.
+
+    Raises DataError unless lowest <= stop_at <= highest and stop_rate > 0.
+    """
+
+    lowest: float
+    highest: float
+    stop_rate: float
+    stop_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        sound = self.lowest <= self.stop_at <= self.highest and math.isfinite(self.stop_at)
+        if not sound or not self.stop_rate > 0.0:
+            raise DataError(
+                f"limits: {self.stop_at} should be in [{self.lowest}, {self.highest}], "
+                f"stop_rate {self.stop_rate} positive"
+            )
+
+    def clip(self, u: Input) -> Input:
+        """The nearest input that is allowed; of several, each."""
+        allowed: Input = np.clip(u, self.lowest, self.highest)
+        return allowed
+
+    def towards_stop(self, u: Input, dt: float) -> Input:
+        """The input dt s later on the way to `stop_at`."""
+        step = self.stop_rate * dt
+        nearer: Input = u + np.clip(self.stop_at - u, -step, step)
+        return self.clip(nearer)
+
+    def at_rest(self, u: Input) -> bool:
+        """Whether every input is where a robot at rest has it."""
+        return bool(np.all(u == self.stop_at))
+
+
+class Controller:
+    """u = policy(k, x̂), x̂ the estimate of the policy's own observer, within what is proved.
+
+    Before sample 0 the plan's first input is held until the state is where the funnel may start, at
+    most for `settling` s. `k` is the number of the next sample, negative before. `ended` says why
+    it is over, empty while it runs: the sample is missing, not finite or off the grid of the start,
+    the input would not be finite or not one that the proof covers, or the proof ends. Stopping is
+    the caller's then. `lead`: s from a sample to the stamp of its input, not quite a period where
+    the input is that of the next sample, so that a sample off the grid still finds it in force.
+
+    model, policy, funnel, period: as for `Monitor`. Raises CertificateMismatch if the parts do not
+    belong together, DataError if the limits cut off an input of the plan.
+    """
+
+    def __init__(
+        self,
+        model: Dynamics,
+        policy: AnyPolicy,
+        funnel: AnyFunnel,
+        *,
+        limits: Limits,
+        settling: float,
+        period: float | None = None,
+    ) -> None:
+        self._follow([(model, policy, funnel)], limits, settling, period)
+
+    @classmethod
+    def of_stages(
+        cls,
+        stages: Sequence[tuple[Dynamics, AnyPolicy, AnyFunnel]],
+        *,
+        limits: Limits,
+        settling: float,
+        period: float,
+    ) -> "Controller":
+        """The policies of a composition, one stage after another."""
+        controller = cls.__new__(cls)
+        controller._follow(list(stages), limits, settling, period)
+        return controller
+
+    def _follow(
+        self,
+        stages: list[tuple[Any, Any, Any]],
+        limits: Limits,
+        settling: float,
+        period: float | None,
+    ) -> None:
+        for parts in stages:
+            refuse_mismatch(*parts)
+        model, policy, funnel = stages[0]
+        self._stages, self.limits, self._settling = stages, limits, settling
+        self._continuous = isinstance(model, VectorField)
+        if self._continuous:
+            if period is None or not period > 0.0:
+                raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+            self.period, self._origin = period, float(funnel.t0)
+            self._end = stages[-1][2].last - (1.0 - TOLERANCE) * period  # an input is held so long
+        else:
+            self.period, self._origin = float(model.period), 0.0
+            self._end = min(policy.last, funnel.last)
+        self._observer = _observer(model, policy)
+        self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
+        for _, planned, _ in stages:
+            self._refuse_cut(planned.planned)
+        self.ended = ""
+        self.k = -1
+        self.u: Any = limits.clip(policy.planned[0])  # the input in force at the next sample
+        if self._observer.ahead:
+            self.u = float(self.u)
+        self._grid = Grid(self.period)
+        self._recent: deque[tuple[Any, Any]] = deque(maxlen=max(1, self._observer.lags))
+        self._first_t = math.nan
+
+    def update(self, t: float, y: Any) -> Any:
+        """Take the sample y at t (s); the input in force from the next sample on, or from this one.
+
+        Once `ended`, the input stays where it was.
+        """
+        if self.ended:
+            return self.u
+        self.ended = self._fault(t, y) or self._grid.take(t)
+        if self.ended:
+            return self.u
+        if self.k <= 0:  # sample 0 is not behind: it is where the grid starts
+            self._grid.begin(t, at=1)
+        if self.k < 0:
+            self._settle(t, y)
+            return self.u
+        try:
+            x = self._observer.update(y, self.u)
+        except SolverError as error:
+            self.ended = f"the model has no next state at t = {t:g} s: {error}"
+            return self.u
+        self.k += 1
+        self._answer(self._when(t), x)
+        return self.u
+
+    def _when(self, t: float) -> float:
+        """The moment of the next input, as the funnels count."""
+        if self._continuous:
+            return max(self._origin, self._origin + t - self._grid.start)
+        return self.k - 1 + self._observer.ahead
+
+    def _stage(self, when: float) -> tuple[Any, Any, Any]:
+        """The stage that is on: of a composition the first that has not ended."""
+        return next((s for s in self._stages[:-1] if when < s[2].last), self._stages[-1])
+
+    def _settle(self, t: float, y: Any) -> None:
+        """Wait for a state from which the funnel may start."""
+        if math.isnan(self._first_t):
+            self._first_t = t
+        self._recent.append((y, self.u))
+        if len(self._recent) < self._observer.lags:
+            return
+        x = self._observer.begin([y for y, _ in self._recent], [u for _, u in self._recent])
+        _, policy, funnel = self._stages[0]
+        nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
+        size = funnel.start_size(x - nominal)
+        if size <= 1.0:
+            self.k = 1 - self._observer.ahead
+            self._answer(self._origin, x)
+        elif not t - self._first_t <= self._settling:
+            self.ended = (
+                f"not at the start of the plan after {self._settling:g} s: {size:.3g} times as far "
+                "out as where it may start"
+            )
+
+    def _answer(self, when: float, x: FloatArray) -> None:
+        """Set the input for the state x at `when`, if it is one that the proof covers."""
+        model, policy, _ = self._stage(when)
+        if when > self._end:
+            self.ended = "the plan is over" if when > policy.last else "the proof is over"
+            return
+        wanted = policy(when if self._continuous else int(when), x)
+        lowest, highest = _range(model, when)
+        u = self.limits.clip(np.clip(wanted, lowest, highest))
+        low, high = policy.covers(when, x)
+        if not (np.isfinite(wanted).all() and (low <= u).all() and (u <= high).all()):
+            self.ended = (
+                f"the policy's input {wanted} at sample {self._grid.k} is not proved: it is beyond "
+                f"[{np.maximum(lowest, self.limits.lowest)}, "
+                f"{np.minimum(highest, self.limits.highest)}]"
+            )
+            return
+        self.u = float(u) if self._observer.ahead else u
+
+    def _fault(self, t: float, y: Any) -> str:
+        if np.isfinite(y).all():
+            return ""
+        name = getattr(getattr(self._stages[0][0], "y", None), "name", "the state")
+        return f"{name} is {y} at t = {t:g} s"
+
+    def _refuse_cut(self, planned: FloatArray) -> None:
+        cut = planned[self.limits.clip(planned) != planned]
+        if len(cut):
+            raise DataError(
+                f"the plan's input {float(cut[0]):g} is beyond the limits [{self.limits.lowest:g}, "
+                f"{self.limits.highest:g}]: what they cut off is not what was proved"
+            )
+
+
+def _observer(model: Any, policy: Any) -> Observer:
+    """The observer that the policy answers."""
+    if isinstance(model, DifferenceEquation):
+        return PredictingObserver(model, policy.L)
+    return (
+        MeasuredStateObserver()
+        if isinstance(model, VectorField)
+        else StateObserver(model, policy.L)
+    )
+
+
+def _range(model: Any, when: float) -> tuple[Any, Any]:
+    """The least and greatest input at which the model, or the vector field, is one of the robot."""
+    if isinstance(model, DifferenceEquation):
+        return model.u_range
+    if not isinstance(model, VectorField):
+        return model.u_range[:, 0], model.u_range[:, 1]
+    lowest, highest = np.full(model.m, -np.inf), np.full(model.m, np.inf)
+    for j, low, high in model.validity(model.span(when)):
+        if j >= model.n:
+            lowest[j - model.n] = max(lowest[j - model.n], low)
+            highest[j - model.n] = min(highest[j - model.n], high)
+    return lowest, highest

@@ -1,0 +1,50 @@
+"""`Grid`: which sample a stamp is, held against the run's start and not against the last stamp."""
+
+import math
+
+TOLERANCE = 0.25  # of a period: a stamp this far off the grid is still that sample
+
+
+class Grid:
+    """Stamps of a run whose sample k is due at start + k·period (s); `k`: the next one's number.
+
+    Without an announced start the first stamp is that of sample `first`.
+    """
+
+    def __init__(self, period: float, *, first: int = 0) -> None:
+        self.period, self.first = period, first
+        self._tolerance = TOLERANCE * period
+        self.begin()
+
+    def begin(self, start: float | None = None, *, at: int | None = None) -> None:
+        """A new run: `start`: s, the announced stamp of sample 0; at: the next sample's number."""
+        self.start = math.nan if start is None else start
+        self.k = self.first if at is None else at
+        self._last = -math.inf if start is None or at is None else start
+
+    def take(self, t: float) -> str:
+        """Count the sample stamped t (s); why it is not the next one, empty if it is."""
+        if abs(t - self.start - self.k * self.period) <= self._tolerance:
+            self.k += 1
+            self._last = t
+            return ""
+        if not math.isfinite(t):
+            return f"stamp is {t}"
+        if math.isnan(self.start):
+            self.start = t - self.k * self.period
+            return self.take(t)
+        return self._fault(t)
+
+    def _fault(self, t: float) -> str:
+        if t <= self._last:
+            return f"time went back by {self._last - t:g} s at t = {t:g} s"
+        place = (t - self.start) / self.period
+        seen = round(place)
+        if abs(place - seen) > TOLERANCE:
+            return (
+                f"the sample at t = {t:g} s is {place - self.k:+.2g} periods of {self.period:g} s "
+                f"from when the next one, sample {self.k}, is due; {TOLERANCE:g} are allowed"
+            )
+        if seen < self.k:
+            return f"sample {seen} of the run came a second time, at t = {t:g} s"
+        return f"sample {self.k} of the run is missing: sample {seen} is next, at t = {t:g} s"

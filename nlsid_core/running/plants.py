@@ -1,0 +1,120 @@
+"""Simulated robots to try the chain on: an identified model, a pendulum and a satellite."""
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import DataError
+from nlsid_core.models import DifferenceEquation
+
+STEP = 1e-3  # s, the longest step of integration
+
+
+class Plant(Protocol):
+    """Something that answers inputs: `measure` at a sample, then `step` to the next."""
+
+    period: float
+
+    def measure(self, u: FloatArray, /) -> FloatArray:
+        """What its sensors say under the inputs (p,) in force."""
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """Go on by one period under inputs (p,), disturbed by `push` (p,) in the inputs' unit."""
+
+
+class ModelPlant:
+    """x⁺ = A x + B(u + push) + f, y = C x + D u + c, from rest at zero input."""
+
+    def __init__(self, model: DifferenceEquation) -> None:
+        self.period = model.period
+        self._model = model
+        self._A, self._B, self._offset = model.A, model.B, model.offset
+        self._x = np.linalg.solve(np.eye(len(model)) - self._A, self._offset)
+
+    def measure(self, u: FloatArray, /) -> FloatArray:
+        """The output (1,) under the input in force."""
+        return np.asarray(self._x[0] + self._model.D * u + self._model.c)
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """One sample of the difference equation."""
+        self._x = self._A @ self._x + self._B @ (u + push) + self._offset
+
+
+class Pendulum:
+    """q̈ = -(g/l) sin q - d q̇ + u/(m l²): measured [q (rad), q̇ (rad/s)], torque u (N m)."""
+
+    GRAVITY = 9.81  # m/s²
+
+    def __init__(
+        self, period: float, *, length: float = 0.5, mass: float = 1.0, damping: float = 0.5
+    ) -> None:
+        if min(period, length, mass) <= 0.0 or damping < 0.0:
+            raise DataError(f"pendulum: {period} s, {length} m, {mass} kg should be positive")
+        self.period = period
+        self._stiffness, self._damping = self.GRAVITY / length, damping
+        self._gain = 1.0 / (mass * length**2)
+        self._x: FloatArray = np.zeros(2)
+
+    def measure(self, _u: FloatArray, /) -> FloatArray:
+        """The angle and its rate."""
+        return self._x
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """One period."""
+        torque = self._gain * float((u + push)[0])
+
+        def rate(x: FloatArray) -> FloatArray:
+            q, v = x
+            return np.array([v, torque - self._stiffness * math.sin(q) - self._damping * v])
+
+        self._x = integrated(rate, self._x, self.period)
+
+
+class Satellite:
+    """A rigid body: measured [σ; ω], modified Rodrigues parameters and body rates (rad/s).
+
+    σ̇ = ¼((1 - |σ|²)I + 2σσ' + 2[σ×])ω, Hω̇ = u - ω × Hω, H = diag(5, 3, 2) kg m², u in N m.
+    Source: thesis Chapter 7.
+    """
+
+    INERTIA = np.array([5.0, 3.0, 2.0])
+
+    def __init__(self, period: float) -> None:
+        if period <= 0.0:
+            raise DataError(f"satellite: period {period} s should be positive")
+        self.period = period
+        self._x: FloatArray = np.zeros(6)
+
+    def measure(self, _u: FloatArray, /) -> FloatArray:
+        """The attitude and the body rates (6,)."""
+        return self._x
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """One period."""
+        H, torque = self.INERTIA, u + push
+
+        def rate(x: FloatArray) -> FloatArray:
+            sigma, omega = x[:3], x[3:]
+            turning = (1.0 - sigma @ sigma) * omega + 2.0 * sigma * (sigma @ omega)
+            turning = turning + 2.0 * np.cross(sigma, omega)
+            return np.concatenate([turning / 4.0, (torque - np.cross(omega, H * omega)) / H])
+
+        self._x = integrated(rate, self._x, self.period)
+
+
+def integrated(
+    rate: Callable[[FloatArray], FloatArray], x: FloatArray, period: float
+) -> FloatArray:
+    """x (n,) after `period` s of ẋ = rate(x): classical Runge-Kutta, steps of at most 1 ms."""
+    count = math.ceil(period / STEP)
+    h = period / count
+    for _ in range(count):
+        k1 = rate(x)
+        k2 = rate(x + h / 2 * k1)
+        k3 = rate(x + h / 2 * k2)
+        k4 = rate(x + h * k3)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return x

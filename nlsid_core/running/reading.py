@@ -1,0 +1,69 @@
+"""`Reading`: what a monitor says of one sample, whatever the kind of funnel."""
+
+import math
+from collections.abc import Sequence
+from enum import Enum
+from typing import NamedTuple
+
+
+class Status(Enum):
+    """What a reading says, best to worst."""
+
+    UNKNOWN = "unknown"
+    INSIDE = "inside"
+    ASSUMPTION_VIOLATED = "assumption violated"
+    OUTSIDE = "outside"
+
+
+class Level(Enum):
+    """The best of a funnel's sets that the state is in; only a sampled funnel has all three."""
+
+    GOAL = "goal"
+    TUBE = "tube"
+    INLET = "inlet"
+    NONE = "none"
+
+
+class Reading(NamedTuple):
+    """One sample's verdict; a tuple because a monitor makes one per funnel and sample.
+
+    t: s, the sample's stamp. margin: 1 on the nominal, 0 on the boundary, what rounding could hide
+    already taken off; NaN if unknown, -inf if the size is not finite. assumption: the part of what
+    the assumption allows that is used, 1 is all of it; NaN if it is not measured. time_to_exit: s
+    until the margin is 0 if it goes on falling as it does (no proof); inf if it does not fall.
+    worst_axis: the axis nearest its bound: a state, or `speed +2`, what the past says of the speed
+    two samples ahead, or `innovation`. nominal, measured: each measured signal, in its unit;
+    nominal is empty if unknown. level: see `Level`. reason: why it is not inside, empty if it is.
+    assuming: the assumption in words. deviation: from the nominal, on each axis in its unit.
+    """
+
+    t: float
+    status: Status
+    margin: float = math.nan
+    assumption: float = math.nan
+    time_to_exit: float = math.nan
+    worst_axis: str = ""
+    nominal: tuple[float, ...] = ()
+    measured: tuple[float, ...] = ()
+    level: Level = Level.NONE
+    reason: str = ""
+    assuming: str = ""
+    deviation: Sequence[float] = ()
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """What is published of it, by name; `nominal[1]` where several signals are measured."""
+        values = {
+            "margin": self.margin,
+            "assumption": self.assumption,
+            "time_to_exit": self.time_to_exit,
+        }
+        count = len(self.measured)
+        if count == 1:
+            values["nominal"] = self.nominal[0] if self.nominal else math.nan
+            values["measured"] = self.measured[0]
+            return values
+        for i in range(count):
+            values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
+            values[f"measured[{i}]"] = self.measured[i]
+        return values

@@ -1,0 +1,214 @@
+"""Witnesses for the kernel: sums of squares as small whole numbers, from float Gram matrices.
+
+The kernel's `positive` takes monomials v, a power of two for each (V = diag 2^columns), and factors
+R_j of whole numbers, and asks that what is left of the polynomial,
+    r = c - Σ_j B_j(s) |R_j V v|² / 4^unit,
+is diagonally dominant in V v. So the Gram matrix is scaled to a diagonal near 1, half of its least
+eigenvalue is left to r, and the Cholesky factor of the rest is rounded: log2(order/δ) + 4 bits keep
+the rounding below δ. Where v_i² = v_a v_b, the rounding of the pair counts on the diagonal of v_i:
+there a column is raised to the mean of the pair's. Nothing here is trusted.
+Source: docs/certificate.md.
+"""
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from math import ceil, lcm, log2
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import LinAlgError, cholesky
+
+from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.errors import Infeasible
+from nlsid_core.polynomial.documents import write_whole
+
+ROOM = 0.5  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
+SPARE_BITS = 4  # beyond log2(order/δ): the rounding of a row's products then stays below δ
+MULTIPLIER_BITS = 48  # of a multiplier's factor: any rounding of it is a sum of squares
+SMALLEST = 2.0**-200  # of a diagonal entry, relative to the largest: below it a column is not used
+Residual = Mapping[tuple[int, ...], ArrayLike]
+
+
+def witness(
+    basis: ArrayLike, grams: ArrayLike | Sequence[ArrayLike], *, residual: Residual | None = None
+) -> Json:
+    """`{basis, columns, squares}` of c = Σ_j B_j(s) v'Q_j v + residual, with room for rounding.
+
+    basis: (k, n) exponents of v. grams: Q (k, k), or the J+1 Bernstein control points Q_j of a
+    matrix in s on [0, 1]. residual: what c has beyond the Gram matrices, its Bernstein control
+    points (J+1,) for each monomial; it is shared out among the products of v with that monomial.
+    Raises Infeasible if a Gram matrix is not positive definite, or a monomial of the residual is
+    no product of v.
+    """
+    monomials, Q = _checked(basis, grams)
+    if residual:
+        Q = _absorbed(monomials, Q, residual)
+    diagonal = np.exp2(_columns(Q).astype(np.float64))
+    S = Q / diagonal[:, None] / diagonal
+    least = np.array([float(np.linalg.eigvalsh(part)[0]) for part in S])
+    if not least.min() > 0.0:
+        raise Infeasible(
+            f"a Gram matrix is not positive definite: least eigenvalue {least.min():.1e} once its "
+            "diagonal is 1"
+        )
+    room = ROOM * least
+    columns = _raised(monomials, _columns(Q))
+    small = diagonal * np.exp2(-columns.astype(np.float64))
+    unit = max(0, ceil(log2(len(monomials) / (room.min() * small.min() ** 2))) + SPARE_BITS)
+    try:
+        roots = [
+            cholesky(part - delta * np.eye(len(part))) * small
+            for part, delta in zip(S, room, strict=True)
+        ]
+    except LinAlgError as error:
+        raise Infeasible("a Gram matrix is positive definite to rounding only") from error
+    return _written(monomials, columns, unit, roots)
+
+
+def multiplier(
+    basis: ArrayLike, grams: ArrayLike | Sequence[ArrayLike], *, bits: int = MULTIPLIER_BITS
+) -> Json:
+    """The same of a sum of squares near Σ_j B_j(s) v'Q_j v: never negative, however Q is rounded.
+
+    What it changes in an identity is below 2^-bits, relatively; see `expanded` for what it is.
+    """
+    monomials, Q = _checked(basis, grams)
+    columns = _columns(Q)
+    scale = np.exp2(-columns.astype(np.float64))
+    roots = []
+    for part in Q * scale[:, None] * scale:
+        values, vectors = np.linalg.eigh(part)
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        roots.append(np.asarray(np.linalg.qr(root, mode="r")))
+    return _written(monomials, columns, bits, roots)
+
+
+def exact_witness(basis: ArrayLike, Q: NDArray[np.object_] | Sequence[Sequence[Fraction]]) -> Json:
+    """The same of v'Qv exactly, for a rational Q ⪰ 0 that may be singular: Q = Σ d_i l_i l_i'.
+
+    Raises Infeasible if Q is not positive semidefinite.
+    """
+    rest = [[Fraction(entry) for entry in row] for row in Q]
+    size, squares = len(rest), []
+    for k in range(size):
+        pivot, row = rest[k][k], rest[k][k:]
+        if pivot < 0 or (pivot == 0 and any(row)):
+            raise Infeasible("the rational Gram matrix is not positive semidefinite")
+        if pivot == 0:
+            continue
+        common = lcm(*(entry.denominator for entry in row))
+        whole = [int(entry * common) for entry in row]
+        squares.append(([0] * k + whole, 1 / (pivot * common**2)))
+        for i in range(k, size):
+            for j in range(k, size):
+                rest[i][j] -= row[i - k] * row[j - k] / pivot
+    scale = lcm(*(weight.denominator for _, weight in squares))
+    return {
+        "basis": np.asarray(basis).tolist(),
+        "columns": [0] * size,
+        "squares": {
+            "unit": 0,
+            "scale": write_whole(scale),
+            "weights": [write_whole(int(weight * scale)) for _, weight in squares],
+            "factors": [[_row(row) for row, _ in squares]],
+        },
+    }
+
+
+def expanded(squares: Json) -> dict[tuple[int, ...], list[Fraction]]:
+    """What `{basis, columns, squares}` is exactly: Bernstein control points of each monomial."""
+    parts, columns = squares["squares"], squares["columns"]
+    monomials, factors = [tuple(row) for row in squares["basis"]], parts["factors"]
+    scale = Fraction(4) ** -parts["unit"] / int(parts.get("scale", 1))
+    result: dict[tuple[int, ...], list[Fraction]] = {}
+    for at, rows in enumerate(factors):
+        weights = [int(w) for w in parts.get("weights", [1] * len(rows))]
+        for weight, row in zip(weights, rows, strict=True):
+            start = len(monomials) - len(row)
+            entries = [
+                (monomials[start + k], Fraction(2) ** columns[start + k] * int(entry))
+                for k, entry in enumerate(row)
+                if int(entry)
+            ]
+            for left, a in entries:
+                for right, b in entries:
+                    key = tuple(i + j for i, j in zip(left, right, strict=True))
+                    control = result.setdefault(key, [Fraction(0)] * len(factors))
+                    control[at] += scale * weight * a * b
+    return result
+
+
+def _checked(
+    basis: ArrayLike, grams: ArrayLike | Sequence[ArrayLike]
+) -> tuple[IntArray, FloatArray]:
+    """(k, n) monomials and (J+1, k, k) symmetric matrices."""
+    monomials = np.asarray(basis, dtype=np.int64)
+    Q = np.asarray(grams, dtype=np.float64)
+    Q = Q[None] if Q.ndim == 2 else Q
+    if not len(monomials) or not np.isfinite(Q).all():
+        raise Infeasible("a Gram matrix should be finite and have at least one monomial")
+    return monomials, (Q + np.swapaxes(Q, 1, 2)) / 2.0
+
+
+def _absorbed(monomials: IntArray, Q: FloatArray, residual: Residual) -> FloatArray:
+    """Gram matrices with the residual in them, in equal parts for all products that fit."""
+    places: dict[tuple[int, ...], list[tuple[int, int]]] = {}
+    sums = (monomials[:, None] + monomials[None]).tolist()
+    for i, row in enumerate(sums):
+        for j, key in enumerate(row):
+            places.setdefault(tuple(key), []).append((i, j))
+    Q = Q.copy()
+    for key, values in residual.items():
+        control = np.asarray(values, dtype=np.float64)
+        if not control.any():
+            continue
+        if tuple(key) not in places:
+            raise Infeasible(f"the monomial {tuple(key)} is no product of the basis")
+        for i, j in places[tuple(key)]:
+            Q[:, i, j] += control / len(places[tuple(key)])
+    return Q
+
+
+def _columns(Q: FloatArray) -> IntArray:
+    """The power of two nearest to the root of each diagonal entry, the largest over s."""
+    diagonal = np.diagonal(Q, axis1=1, axis2=2).max(axis=0)
+    largest = max(float(diagonal.max()), SMALLEST)
+    return np.asarray(np.round(np.log2(np.maximum(diagonal, SMALLEST * largest)) / 2), np.int64)
+
+
+def _raised(monomials: IntArray, columns: IntArray) -> IntArray:
+    """Columns with columns[i] >= (columns[a] + columns[b])/2 wherever v_i² = v_a v_b."""
+    places = {tuple(row): k for k, row in enumerate((2 * monomials).tolist())}
+    sums = (monomials[:, None] + monomials[None]).tolist()
+    triples = [
+        (places[tuple(key)], a, b)
+        for a, row in enumerate(sums)
+        for b, key in enumerate(row[:a])
+        if tuple(key) in places
+    ]
+    raised, before = columns.tolist(), None
+    while raised != before:
+        before = list(raised)
+        for i, a, b in triples:
+            raised[i] = max(raised[i], (raised[a] + raised[b]) // 2)
+    return np.asarray(raised, np.int64)
+
+
+def _written(
+    monomials: IntArray, columns: IntArray, unit: int, roots: Sequence[FloatArray]
+) -> Json:
+    factors = []
+    for root in roots:
+        rows = [[round(entry) for entry in row] for row in np.ldexp(root, unit).tolist()]
+        factors.append([_row(row) for row in rows if any(row)])
+    return {
+        "basis": monomials.tolist(),
+        "columns": columns.tolist(),
+        "squares": {"unit": unit, "factors": factors},
+    }
+
+
+def _row(row: Sequence[int]) -> list[int | str]:
+    """Without leading zeros: the last entry belongs to the last monomial."""
+    first = next((k for k, entry in enumerate(row) if entry), len(row) - 1)
+    return [write_whole(entry) for entry in row[first:]]

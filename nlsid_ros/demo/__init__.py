@@ -1,0 +1,1 @@
+"""The live part of `nlsid demo`: the nodes as processes, and what they say held against offline."""

@@ -1,0 +1,112 @@
+"""Identification in the background: it gets there, says why not, and can be called off."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from bags.chain.background import BackgroundIdentification, Progress, last_bags
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import cut
+from bags.designs.documents import MODEL, MODEL_PROOF
+from bags.recordings.writer import BagWriter
+from bags.samples import f1tenth
+from bags.signals.arrivals import Arrival, Recent
+from nlsid_core.errors import BagError, DataError
+from nlsid_core.proofs import check
+from tests.bag_messages import CMD, CMD_TYPE, START_NS, command, speed_bag
+from tests.conftest import synthetic_dataset
+
+CONFIG = config_file("f1tenth.yaml")
+PATIENCE = 60.0  # s
+
+
+def wait(work: BackgroundIdentification) -> Progress:
+    deadline = time.monotonic() + PATIENCE
+    while not (progress := work.poll()).done:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return progress
+
+
+def test_it_writes_a_model_and_its_proof(tmp_path: Path) -> None:
+    work = BackgroundIdentification(f1tenth(), CONFIG, tmp_path)
+    assert wait(work) == Progress("done", 1.0, done=True)
+    assert "PROVED" in str(check(tmp_path / MODEL_PROOF))
+    assert (tmp_path / MODEL).is_file()
+
+
+def test_what_is_wrong_with_the_bags_is_said(tmp_path: Path) -> None:
+    progress = wait(BackgroundIdentification([tmp_path / "nowhere"], CONFIG, tmp_path / "out"))
+    assert progress.done
+    assert "nowhere" in progress.error
+
+
+def test_called_off_it_ends_at_once_and_leaves_nothing(tmp_path: Path) -> None:
+    work = BackgroundIdentification(f1tenth(), CONFIG, tmp_path / "out")
+    started = time.monotonic()
+    work.cancel()
+    assert time.monotonic() - started < 5.0
+    assert work.poll().what == "cancelled"
+    assert not (tmp_path / "out").exists()
+
+
+def recordings(folder: Path) -> None:
+    """Three recordings of which the names do not tell the order, a snapshot, an unfinished one."""
+    for name, begun in (("run", 2), ("run_2", 3), ("run_10", 1)):
+        speed_bag(folder / name, [0.0, 0.1], [0.1, 0.1], start_ns=START_NS + begun * 10**9)
+    recent = Recent(5.0)
+    at = START_NS + 10**10
+    recent.add(Arrival(CMD, CMD_TYPE, command(at, 0.1), at, at))
+    recent.save(folder / "run_snapshot_1")
+    growing = BagWriter(folder / "run_4", in_place=True)
+    growing.write(CMD, CMD_TYPE, command(at, 0.1), log_time_ns=at, publish_time_ns=at)
+    growing.close_chunk()
+    growing.abandon()
+
+
+def test_the_last_recordings_are_those_that_began_last_and_are_finished(tmp_path: Path) -> None:
+    recordings(tmp_path)
+    assert last_bags([tmp_path], 1) == [tmp_path / "run_2"]
+    assert last_bags([tmp_path], 3) == [tmp_path / name for name in ("run_10", "run", "run_2")]
+    with pytest.raises(BagError, match="4 recordings are asked for, 3 are finished in"):
+        last_bags([tmp_path], 4)
+
+
+def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:
+    data = synthetic_dataset(0.01, trials=2, samples=80)
+    trials = cut(data, 0.25)
+    train, test = trials.train, trials.test
+    assert trials.validation is None
+    assert train.names == test.names == data.names
+    for whole, fitted, scored in zip(data, train, test, strict=True):
+        assert (len(fitted), len(scored)) == (60, 20)
+        np.testing.assert_array_equal(np.concatenate([fitted.y, scored.y]), whole.y)
+        np.testing.assert_array_equal(np.concatenate([fitted.u, scored.u]), whole.u)
+        assert scored.t[0] == 0.0
+    with pytest.raises(DataError, match=r"0\.01 of 80 samples"):
+        cut(data, 0.01)
+
+
+def test_trials_to_choose_by_are_left_whole() -> None:
+    data = synthetic_dataset(0.01, trials=2, samples=80)
+    name = data.names[0]
+    trials = cut(data, 0.25, validation=[name])
+    assert trials.validation is not None
+    assert trials.validation.names == (name,)
+    assert [len(trial) for trial in trials.validation] == [80]
+    assert trials.train.names == trials.test.names == data.names[1:]
+    with pytest.raises(DataError, match="all of the bags are validation trials"):
+        cut(data, 0.25, validation=data.names)
+
+
+def test_a_configuration_names_test_bags_or_a_share_but_not_both(tmp_path: Path) -> None:
+    config = yaml.safe_load(CONFIG.read_text())
+    config["split"]["share"] = 0.25
+    file = tmp_path / "config.yaml"
+    file.write_text(yaml.safe_dump(config))
+    with pytest.raises(DataError, match="name test bags or give a share, not both"):
+        load_config(file)

@@ -1,0 +1,574 @@
+"""`nlsid bag`: info, signals, plot, check, recover, export, cut, merge, split, import."""
+
+import csv
+import json
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as McapWriter
+from typer.testing import CliRunner
+
+from bags.commands.bag_cli import bag_app
+from bags.commands.cli import app
+from bags.recordings.bag import Bag
+from bags.recordings.folders import expand_bags
+from bags.recordings.writer import BagWriter
+from bags.samples import f1tenth, schunk
+from bags.signals.grid import read_dataset, require_excitation
+from bags.signals.reader import bag_metadata, read_signals
+from bags.tools.fitness import Level, check_fitness
+from bags.tools.importing import import_tables, read_tables
+from bags.tools.info import bag_info
+from nlsid_core.errors import BagError, DataError
+from tests.bag_messages import (
+    CMD,
+    CMD_TYPE,
+    COMMAND,
+    JOINT_TYPE,
+    ODOM,
+    ODOM_TYPE,
+    PERIOD_NS,
+    SPEED,
+    START_NS,
+    command,
+    joints,
+    odometry,
+    speed_bag,
+)
+from tests.conftest import SHARED
+from tests.mcap_files import write_mcap
+
+ROBOT = SHARED / "schunk_arm" / "Robot"
+
+
+def run(*arguments: object, status: int = 0) -> str:
+    result = CliRunner().invoke(bag_app, [str(argument) for argument in arguments])
+    if status == 0 and result.exception is not None:
+        raise result.exception
+    assert result.exit_code == status, result.output
+    return result.output
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    t = np.arange(400) * 0.025
+    return speed_bag(tmp_path / "trial", np.sin(t), np.repeat(np.arange(40.0), 10))
+
+
+def test_every_command_has_help() -> None:
+    output = CliRunner().invoke(app, ["bag", "--help"]).output
+    for name in (
+        "info",
+        "signals",
+        "plot",
+        "check",
+        "recover",
+        "export",
+        "cut",
+        "merge",
+        "split",
+        "import",
+    ):
+        assert name in output
+        assert "--help" in run(name, "--help")
+
+
+def test_an_error_shows_a_path_with_brackets_whole(bag: Path) -> None:
+    command = [sys.executable, "-m", "bags.commands.cli", "bag", "plot", str(bag), "--out", "x.png"]
+    signal = f"{ODOM}:twist.twist.linear[name=elbow].x"
+    run = subprocess.run([*command, "-s", signal], capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert signal in run.stderr
+    assert "is a 'geometry_msgs/msg/Vector3', not an array" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_a_folder_holds_bags_of_one_file_or_one_bag_of_several(bag: Path, tmp_path: Path) -> None:
+    content = (bag / "trial.mcap").read_bytes()
+    for folder, names in (("runs", ("trial_01", "trial_02")), ("one", ("trial_0", "trial_1"))):
+        (tmp_path / folder).mkdir()
+        for name in names:
+            (tmp_path / folder / f"{name}.mcap").write_bytes(content)
+    runs = tmp_path / "runs"
+    assert expand_bags([runs]) == [runs / "trial_01.mcap", runs / "trial_02.mcap"]
+    assert expand_bags([tmp_path / "one"]) == [tmp_path / "one"]
+
+
+def test_info_states_counts_rates_clocks_and_losses(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "x", custom={"robot": "car"}) as writer:
+        for k in range(200):
+            stamp = START_NS + k * PERIOD_NS
+            data = odometry(stamp - 5 * 10**9, float(k))
+            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
+            writer.write(ODOM, ODOM_TYPE, data, **times, sequence=k + 3 * (k > 100))
+    [topic] = bag_info(tmp_path / "x").topics
+    assert (topic.count, topic.missing, topic.backward, topic.duplicates) == (200, 3, 0, 0)
+    assert topic.rate == pytest.approx(40.0)
+    assert topic.clock is not None
+    assert topic.clock.offset == pytest.approx(-5.0)
+    assert sum(topic.histogram) == 199
+    output = run("info", tmp_path / "x")
+    for part in ("200", "40 Hz", "-5.000 s", "3 sequence numbers are missing", "robot: car"):
+        assert part in output
+
+
+def test_info_reads_what_there_is_of_an_unfinished_bag(bag: Path) -> None:
+    file = bag / "trial.mcap"
+    file.write_bytes(file.read_bytes()[:-20])
+    output = run("info", file)
+    assert "unfinished" in output
+    assert "800 messages on 2 topics" in output
+
+
+def test_signals_lists_paths_with_units(bag: Path) -> None:
+    output = run("signals", bag)
+    line = next(line for line in output.splitlines() if "/odom:twist.twist.linear.x" in line)
+    assert line.split() == ["/odom:twist.twist.linear.x", "float64", "m/s", "-0.999923", "0.999992"]
+    covariance = next(line for line in output.splitlines() if "/odom:pose.covariance[*]" in line)
+    assert covariance.split()[2:] == ["36", "0", "0"]
+    assert "/odom:pose.pose.orientation.yaw" in output
+
+
+def test_signals_names_the_joints_and_gives_their_ranges(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "arm") as writer:
+        for k in range(5):
+            data = joints(START_NS + k, [0.5 * k, -1.0 * k])
+            writer.write("/arm", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
+        writer.add_topic("/empty", JOINT_TYPE)
+    found = json.loads(run("signals", tmp_path / "arm", "--json"))
+    listed = {entry["signal"]: entry for entry in found}
+    assert listed["/arm:position[name=joint_1]"] == {
+        "signal": "/arm:position[name=joint_1]",
+        "number": "float64",
+        "unit": "rad or m",
+        "elements": 1,
+        "low": -4.0,
+        "high": 0.0,
+        "note": "",
+    }
+    assert listed["/arm:effort[*]"]["low"] is None
+    assert listed["/empty:position[*]"]["elements"] == 0
+    for signal in ("/arm:position[name=joint_0]", "/arm:position[name=joint_1]"):
+        assert len(read_signals(tmp_path / "arm", [signal])[signal]) == 5
+
+
+def test_info_and_check_speak_json_and_status(bag: Path, tmp_path: Path) -> None:
+    info = json.loads(run("info", bag, "--json"))
+    assert (info["messages"], info["unfinished"]) == (800, None)
+    assert {topic["topic"]: topic["count"] for topic in info["topics"]} == {CMD: 400, ODOM: 400}
+    still = speed_bag(tmp_path / "still", np.sin(np.arange(100.0)), np.ones(100))
+    said = json.loads(run("check", still, "-u", COMMAND, "-y", SPEED, "--json", status=1))
+    assert said[0]["verdict"] == "bad"
+    assert {"level", "check", "what"} == set(said[0]["findings"][0])
+
+
+def test_the_command_line_says_its_version_and_completes_names() -> None:
+    said = CliRunner().invoke(app, ["--version"])
+    assert said.exit_code == 0
+    assert said.output.startswith("nlsid 0.")
+    assert "--install-completion" in CliRunner().invoke(app, ["--help"]).output
+
+
+def test_operations_are_exported_with_a_grid_and_without(bag: Path, tmp_path: Path) -> None:
+    signal = f"{SPEED}|derivative(0.2 s)|to(g)"
+    run("export", bag, "--out", tmp_path / "tables", "-s", signal)
+    run("export", bag, "--out", tmp_path / "grid.csv", "--period", "0.025", "-s", signal)
+    with (tmp_path / "tables" / "odom.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    with (tmp_path / "grid.csv").open(encoding="utf-8") as stream:
+        grid = [float(row[signal]) for row in csv.DictReader(stream)]
+    column = [float(row[signal.removeprefix(f"{ODOM}:")]) for row in rows]
+    expected = read_signals(bag, [signal])[signal].values.tolist()
+    assert column[-len(expected) :] == grid == expected
+    assert np.isnan(column[: -len(expected)]).all()
+
+
+def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path: Path) -> None:
+    (tmp_path / "my_robot" / "msg").mkdir(parents=True)
+    text = "std_msgs/Header header\nfloat64 throttle\n"
+    (tmp_path / "my_robot" / "msg" / "Drive.msg").write_text(text)
+    bare = tmp_path / "bare.mcap"
+    with bare.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("my_robot/msg/Drive", "", b"")
+        channel = writer.register_channel("/drive", "cdr", schema)
+        for k in range(50):
+            stamp = START_NS + k * PERIOD_NS
+            data = struct.pack("<4s2II4sd", b"\0\1\0\0", *divmod(stamp, 10**9), 1, b"", k)
+            writer.add_message(channel, stamp, data, stamp)
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap annotates half of its writer
+    signal = "/drive:throttle"
+    with pytest.raises(BagError, match=r"'my_robot/msg/Drive' is not known: .*--definitions"):
+        read_signals(bare, [signal])
+    given = ["--definitions", tmp_path / "my_robot"]
+    assert "throttle" in run("signals", bare, *given)
+    run("export", bare, "--out", tmp_path / "tables", *given)
+    run("info", bare, *given)
+    run("cut", bare, "--out", tmp_path / "defined", *given)
+    values = read_signals(tmp_path / "defined", [signal])[signal].values
+    assert values.tolist() == np.arange(50.0).tolist()
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.html", "a.svg"])
+def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
+    pytest.importorskip("matplotlib")
+    run("plot", bag, "--out", tmp_path / name, "-s", SPEED, "-s", f"{SPEED}|derivative(0.2 s)")
+    content = (tmp_path / name).read_bytes()
+    assert content.startswith(b"\x89PNG" if name.endswith("png") else b"<")
+    with pytest.raises(DataError, match="a picture is a"):
+        run("plot", bag, "--out", tmp_path / "a.bmp", "-s", SPEED)
+
+
+def test_a_cut_has_the_messages_of_its_stretch_and_topics(bag: Path, tmp_path: Path) -> None:
+    run("cut", bag, "--out", tmp_path / "part", "--start", "1", "--end", "2", "-t", ODOM)
+    with Bag(tmp_path / "part") as part, Bag(bag) as whole:
+        expected = [
+            m
+            for m in whole.messages([ODOM])
+            if START_NS + 10**9 <= m.log_time_ns < START_NS + 2 * 10**9
+        ]
+        assert list(part.messages()) == expected
+        assert len(expected) == 40
+    with pytest.raises(BagError, match="exists already"):
+        run("cut", bag, "--out", tmp_path / "part")
+    with pytest.raises(BagError, match="has no message from 99 s"):
+        run("cut", bag, "--out", tmp_path / "none", "--start", "99")
+    assert not (tmp_path / "none").exists()
+
+
+def test_parts_of_a_bag_merge_to_the_whole(bag: Path, tmp_path: Path) -> None:
+    run("split", bag, "--out", tmp_path / "part", "--every", "3")
+    parts = sorted(tmp_path.glob("part_*"))
+    assert len(parts) == 4
+    run("merge", *reversed(parts), "--out", tmp_path / "again")
+    with Bag(tmp_path / "again") as again, Bag(bag) as whole:
+        assert list(again.messages()) == list(whole.messages())
+
+
+def test_two_definitions_of_a_type_do_not_merge(tmp_path: Path) -> None:
+    for name, text in (("a", "float64 x"), ("b", "float64 x"), ("c", "float32 x")):
+        write_mcap(tmp_path / f"{name}.mcap", {"/x": ("pkg/msg/X", text)})
+    a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
+    run("merge", a, b, "--out", tmp_path / "ab")
+    with pytest.raises(BagError, match="two definitions of 'pkg/msg/X'; keep them in two bags"):
+        run("merge", a, c, "--out", tmp_path / "ac")
+    assert not (tmp_path / "ac").exists()
+
+
+def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    once = np.repeat(rng.standard_normal(12), 5)
+    bag = speed_bag(tmp_path / "runs", np.tile(once, 5), np.tile(once, 5))
+    run("split", bag, "--out", tmp_path / "run", "--repeats", COMMAND)
+    parts = sorted(tmp_path.glob("run_*"))
+    assert [p.name for p in parts] == [f"run_{k:02d}" for k in range(1, 6)]
+    for part in parts:
+        assert read_signals(part, [COMMAND])[COMMAND].values.tolist() == once.tolist()
+    assert len({bag_metadata(part)["repeat_group"] for part in parts}) == 1
+    with pytest.raises(BagError, match="does not repeat itself"):
+        run("split", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
+
+
+def test_custom_types_survive_cutting_and_recovery(tmp_path: Path) -> None:
+    cougars = SHARED / "cougars_auv" / "SO_lastbag_mcap"
+    if not cougars.is_dir():
+        pytest.skip("needs cougars_auv in ../shared/data")
+    fin = "/coug2/controls/command:fin[0]"
+    run("cut", cougars, "--out", tmp_path / "part", "--end", "20")
+    part = read_signals(tmp_path / "part", [fin])[fin].values
+    np.testing.assert_array_equal(part, read_signals(cougars, [fin])[fin].values[: len(part)])
+    output = run("recover", cougars, "--out", tmp_path / "whole")
+    assert "18558 messages, read back and compared; nothing was lost" in output
+
+
+@pytest.mark.parametrize("form", ["csv", "npz", "parquet"])
+def test_exported_topics_hold_the_bags_numbers_bit_for_bit(
+    bag: Path, tmp_path: Path, form: str
+) -> None:
+    if form == "parquet":
+        pytest.importorskip("pyarrow")
+    run("export", bag, "--out", tmp_path / "tables", "-f", form)
+    table = read_table(tmp_path / "tables" / f"odom.{form}")
+    samples = read_signals(bag, [SPEED])[SPEED]
+    np.testing.assert_array_equal(table["twist.twist.linear.x"], samples.values)
+    np.testing.assert_array_equal(np.asarray(table["stamp_ns"], dtype=np.int64), samples.stamp_ns)
+    assert len(table["pose.covariance[35]"]) == 400
+
+
+@pytest.mark.parametrize("form", ["csv", "npz", "parquet"])
+def test_a_grid_holds_commands_and_interpolates_states(
+    bag: Path, tmp_path: Path, form: str
+) -> None:
+    if form == "parquet":
+        pytest.importorskip("pyarrow")
+    out = tmp_path / f"grid.{form}"
+    options = ("--period", "0.01", "--max-gap", "0.03", "-f", form, "--hold", COMMAND)
+    output = run("export", bag, "--out", out, "-s", SPEED, "-s", COMMAND, *options)
+    assert "off by at most" in output
+    table = read_table(out)
+    t = np.asarray(table["t"], dtype=float)
+    np.testing.assert_allclose(np.diff(t), 0.01, rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(table[SPEED], float), np.sin(t), atol=1e-4)
+    assert set(np.asarray(table[COMMAND], float)) == set(range(40))
+
+
+def read_table(path: Path) -> Any:
+    if path.suffix == ".csv":
+        with path.open() as stream:
+            rows = list(csv.DictReader(stream))
+        return {name: [float(row[name]) for row in rows] if "ns" not in name else
+                [int(row[name]) for row in rows] for name in rows[0]}  # fmt: skip
+    if path.suffix == ".npz":
+        with np.load(path) as arrays:
+            return dict(arrays)
+    from pyarrow import parquet
+
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def test_an_array_of_changing_length_is_left_out_and_named(tmp_path: Path) -> None:
+    from tests.bag_messages import joints
+
+    with BagWriter(tmp_path / "arm") as writer:
+        for k in range(4):
+            data = joints(START_NS + k, [0.5] * (1 + k % 2))
+            writer.write("/arm", JOINT_TYPE, data, log_time_ns=k, publish_time_ns=k)
+    output = run("export", tmp_path / "arm", "--out", tmp_path / "tables")
+    assert "left out: /arm:position[*]" in output
+    assert "4 rows" in output
+
+
+def test_a_good_recording_is_called_fit_and_bad_ones_say_why(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    u = np.repeat(rng.standard_normal(100), 8)
+    y = np.convolve(u, np.exp(-np.arange(40) / 10) / 10)[:800] + 1e-4 * rng.standard_normal(800)
+    good = speed_bag(tmp_path / "good", y, u)
+    again = speed_bag(tmp_path / "again", y, u + 1e-3 * rng.standard_normal(800))
+    still = speed_bag(tmp_path / "still", y, np.ones(800))
+    coarse = speed_bag(tmp_path / "coarse", np.clip(np.round(y, 0), -1, 0.5), u)
+    jitter = (START_NS + np.arange(800) * PERIOD_NS + rng.integers(0, PERIOD_NS, 800)).tolist()
+    ragged = speed_bag(tmp_path / "ragged", y, u, stamps_ns=jitter)
+    results = check_fitness(
+        [good, again, still, coarse, ragged], excitations=[COMMAND], responses=[SPEED]
+    )
+    found = {r.bag.name: r for r in results}
+    assert found["good"].verdict is Level.GOOD
+    reasons = {n: {f.check for f in r.findings if f.level > Level.GOOD} for n, r in found.items()}
+    assert found["still"].verdict is Level.BAD
+    assert "excitation" in reasons["still"]
+    assert {"saturation", "quantisation"} <= reasons["coarse"]
+    assert "regularity" in reasons["ragged"]
+    assert any("same excitation as again" in f.what for f in found["good"].findings)
+    output = run("check", good, "-u", COMMAND, "-y", SPEED)
+    assert "fit for identification" in output
+    assert "not fit" in run("check", still, "-u", COMMAND, "-y", SPEED, status=1)
+
+
+def test_every_element_of_a_command_is_checked(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    with BagWriter(tmp_path / "arm") as writer:
+        for k in range(100):
+            for topic in ("/joint_commands", "/joint_states"):
+                stamp = START_NS + k * PERIOD_NS
+                data = joints(stamp, rng.standard_normal(3))
+                writer.write(topic, JOINT_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+    [found] = check_fitness(
+        [tmp_path / "arm"],
+        excitations=["/joint_commands:position[*]"],
+        responses=["/joint_states:position[*]"],
+    )
+    said = " ".join(finding.what for finding in found.findings)
+    for k in range(3):
+        assert f"/joint_commands:position[{k}]: 95 % of its power" in said
+        assert f"/joint_states:position[{k}]: 40 Hz" in said
+
+
+def test_commands_that_come_when_they_like_are_not_bad(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    with BagWriter(tmp_path / "teleop") as writer:
+        held = 0.0
+        for k in range(800):
+            stamp = START_NS + k * PERIOD_NS
+            held += 0.3 * (rng.standard_normal() - held)
+            writer.write(
+                ODOM, ODOM_TYPE, odometry(stamp, held), log_time_ns=stamp, publish_time_ns=stamp
+            )
+            if rng.random() < 0.3:
+                at = stamp + int(rng.integers(0, PERIOD_NS))
+                data = command(at, float(rng.standard_normal()))
+                writer.write(CMD, CMD_TYPE, data, log_time_ns=at, publish_time_ns=at)
+    [found] = check_fitness([tmp_path / "teleop"], excitations=[COMMAND], responses=[SPEED])
+    assert found.verdict < Level.BAD
+    said = {f.check: f for f in found.findings}
+    assert said["commands"].level is Level.GOOD
+    assert "(grid.hold)" in said["commands"].what
+
+
+def test_a_command_that_changes_only_where_no_response_is_is_named(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "late") as writer:
+        for k in range(100):
+            stamp = START_NS + k * PERIOD_NS
+            data = command(stamp, 1.0 if k < 50 else 0.5)
+            writer.write(CMD, CMD_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+            if k >= 50:
+                data = odometry(stamp, 0.1 * (k % 7))
+                writer.write(ODOM, ODOM_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+    [found] = check_fitness([tmp_path / "late"], excitations=[COMMAND], responses=[SPEED])
+    assert found.verdict is Level.BAD
+    said = [finding.what for finding in found.findings if finding.level is Level.BAD]
+    assert said == [f"{COMMAND} is 0.5 wherever every response was recorded"]
+    dataset = read_dataset([tmp_path / "late"], responses=[SPEED], excitations=[COMMAND])
+    with pytest.raises(DataError, match=r"no excitation: input '/cmd_vel.*' is 0\.5 through"):
+        require_excitation(dataset)
+
+
+def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    table = rng.standard_normal((50, 2))
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="cmd,speed", comments="")
+    run(
+        "import", tmp_path / "log.csv", "--out", tmp_path / "bag", "--period", "0.02",
+        "-s", f"{CMD}:twist.linear.x=cmd", "-s", f"{ODOM}:twist.twist.linear.x=speed",
+        "--type", f"{CMD}=geometry_msgs/msg/TwistStamped", "--type", f"{ODOM}={ODOM_TYPE}",
+        "--start", "1000", "--custom", "robot=car",
+    )  # fmt: skip
+    read = read_signals(tmp_path / "bag", [COMMAND, SPEED])
+    written = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(read[COMMAND].values, written[:, 0])
+    np.testing.assert_array_equal(read[SPEED].values, written[:, 1])
+    assert np.diff(read[SPEED].stamp_ns).tolist() == [20_000_000] * 49
+    assert read[SPEED].stamp_ns[0] == 1000 * 10**9
+    assert bag_metadata(tmp_path / "bag") == {"robot": "car"}
+
+
+def test_mat_and_hdf5_files_are_tables_too(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    t, q = np.arange(20) * 0.1, np.sin(np.arange(20.0))
+    savemat(tmp_path / "a.mat", {"t": t, "q": np.column_stack([q, 2 * q]), "note": "text"})
+    assert set(read_tables([tmp_path / "a.mat"]).files) == {"t", "q"}
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["log/t"], file["log/q"] = t, np.column_stack([q, 2 * q])
+    for k, (name, prefix) in enumerate((("a.mat", ""), ("b.h5", "log/"))):
+        out = tmp_path / f"bag_{k}"
+        assignments = [f"/arm:position[name=a.b]={prefix}q[1]"]
+        types = {"/arm": JOINT_TYPE}
+        import_tables([tmp_path / name], out, assignments, types=types, time=f"{prefix}t")
+        found = read_signals(out, ["/arm:position[name=a.b]"])["/arm:position[name=a.b]"]
+        np.testing.assert_array_equal(found.values, 2 * q)
+
+
+def test_columns_of_one_name_in_two_files_are_told_apart(tmp_path: Path) -> None:
+    """Each file has its own clock: the times of a topic are those of the file of its columns."""
+    for name, factor in (("a", 1.0), ("b", 3.0)):
+        rows = np.column_stack([factor * np.arange(5), factor * 10 + np.arange(5)])
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header="t,speed", comments="")
+    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    types = {ODOM: ODOM_TYPE, CMD: "geometry_msgs/msg/TwistStamped"}
+    with pytest.raises(DataError, match=r"'speed' is in 2 files; .*: a\.speed or b\.speed"):
+        import_tables(files, tmp_path / "x", [f"{SPEED}=speed"], types={ODOM: ODOM_TYPE}, period=1)
+    signals = [f"{SPEED}=a.speed", f"{COMMAND}=b.speed"]
+    import_tables(files, tmp_path / "bag", signals, types=types, time="t")
+    read = read_signals(tmp_path / "bag", [SPEED, COMMAND])
+    assert read[SPEED].values.tolist() == [10.0, 11.0, 12.0, 13.0, 14.0]
+    assert read[COMMAND].values.tolist() == [30.0, 31.0, 32.0, 33.0, 34.0]
+    assert read[COMMAND].stamp_ns.tolist() == [3 * k * 10**9 for k in range(5)]
+
+
+def test_files_of_one_name_are_called_by_their_folders_too(tmp_path: Path) -> None:
+    for folder in ("one", "two"):
+        (tmp_path / folder).mkdir()
+        np.savetxt(tmp_path / folder / "log.csv", np.eye(3) * len(folder), delimiter=",")
+    tables = read_tables([tmp_path / "one" / "log.csv", tmp_path / "two" / "log.csv"])
+    assert set(tables.arrays) == {"one/log.log", "two/log.log"}
+
+
+def test_rows_with_one_time_are_dropped_only_when_asked(tmp_path: Path) -> None:
+    rows = np.column_stack([[0.0, 0.1, 0.1, 0.2], [1.0, 2.0, 2.5, 3.0]])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="t,speed", comments="")
+    options: dict[str, Any] = {"types": {ODOM: ODOM_TYPE}, "time": "t"}
+    with pytest.raises(DataError, match=r"does not increase after row 1: .*--drop-repeats"):
+        import_tables([tmp_path / "log.csv"], tmp_path / "x", [f"{SPEED}=speed"], **options)
+    import_tables(
+        [tmp_path / "log.csv"], tmp_path / "bag", [f"{SPEED}=speed"], **options, drop_repeats=True
+    )
+    assert read_signals(tmp_path / "bag", [SPEED])[SPEED].values.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_tables_in_matlab_structs_are_offered_and_its_own_workspace_is_not(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    inner = {"angle": np.arange(12.0).reshape(2, 6), "name": "arm"}
+    savemat(tmp_path / "a.mat", {"rec": {"arm": inner, "t": 0.1 * np.arange(6)}, "n": 3.0})
+    tables = read_tables([tmp_path / "a.mat"])
+    assert set(tables.files) == {"rec.arm.angle", "rec.t", "n"}
+    assert tables.column("rec.arm.angle[1, :]").tolist() == [6.0, 7.0, 8.0, 9.0, 10.0, 11.0]
+    assert tables.column("rec.arm.angle[:, 1]").tolist() == [1.0, 7.0]
+    with pytest.raises(DataError, match=r"has rows 0 to 1"):
+        tables.column("rec.arm.angle[2, :]")
+    kuka = sorted((SHARED / "kuka_kr300").glob("*.mat"))
+    if kuka:
+        tables = read_tables(kuka[:1])
+        assert len(tables.column("rec.act_pos_mot_deg[5, :]")) == 2501
+        assert not [name for name in tables.files if name.startswith("__")]
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("/arm:position[0]=nothing", "no table 'nothing'; there are: log 5x3"),
+        ("/arm:position[0]=log[7]", "columns 0 to 2"),
+        ("/arm:position[0]=log", "name one column"),
+        ("/arm:posit[0]=log[0]", "Field 'posit' does not exist"),
+        ("/arm:position[0]", "is not signal=column"),
+        ("/other:position[0]=log[0]", "nothing is assigned to /arm"),
+    ],
+)
+def test_an_import_that_does_not_fit_is_refused_and_writes_nothing(
+    tmp_path: Path, assignment: str, message: str
+) -> None:
+    np.savetxt(tmp_path / "log.csv", np.zeros((5, 3)), delimiter=",")
+    types = {"/arm": JOINT_TYPE}
+    with pytest.raises(DataError, match=message):
+        import_tables([tmp_path / "log.csv"], tmp_path / "x", [assignment], types=types, period=1)
+    assert os.listdir(tmp_path) == ["log.csv"]  # noqa: PTH208
+
+
+def test_the_shipped_arm_is_small_and_documented() -> None:
+    bags = schunk()
+    assert len(bags) == 6
+    assert sum(f.stat().st_size for bag in bags for f in bag.iterdir()) < 1e6
+    folder = bags[0].parent
+    assert "CC0 1.0 Universal" in (folder / "LICENSE").read_text()
+    assert "Althoff" in (folder / "README.md").read_text()
+    for bag in bags:
+        assert bag_metadata(bag)["licence"] == "CC0-1.0"
+        read = read_signals(bag, ["/joint_states:velocity[*]", "/joint_states:effort[*]"])
+        assert len(read) == 12
+        steps = np.diff(read["/joint_states:effort[0]"].stamp_ns)
+        assert set(steps.tolist()) == {4_000_000}
+
+
+@pytest.mark.skipif(not ROBOT.is_dir(), reason="needs schunk_arm in ../shared/data")
+def test_the_shipped_arm_has_the_published_numbers_bit_for_bit() -> None:
+    for bag in schunk():
+        source = ROBOT / bag_metadata(bag)["source_trial"]
+        torque = np.loadtxt(source / "input.csv", delimiter=",")
+        states = np.loadtxt(source / "trajectory.csv", delimiter=",")[:-1]
+        for k in range(6):
+            fields = ("position", "velocity", "effort")
+            paths = [f"/joint_states:{field}[name=joint_{k + 1}]" for field in fields]
+            read = read_signals(bag, paths)
+            for path, column in zip(
+                paths, (states[:, k], states[:, 6 + k], torque[:, k]), strict=True
+            ):
+                np.testing.assert_array_equal(read[path].values, column)

@@ -1,0 +1,300 @@
+"""The chain on the shipped F1TENTH bags, through the command line, with the promised figures."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.chain.config import Config, load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags, read_trials
+from bags.chain.training import load_training
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.monitoring.replay import Replay, replay_bag
+from bags.samples import f1tenth
+from bags.signals.grid import read_dataset
+from bags.signals.signal import SignalPath
+from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import OVER
+from nlsid_core.running.reading import Status
+
+CONFIG = config_file("f1tenth.yaml")
+TEST = ("05", "11", "16", "22", "27", "33", "38", "41")
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything `nlsid identify` and `nlsid funnel` write, through the command line."""
+    out = tmp_path_factory.mktemp("chain")
+    folder = str(f1tenth()[0].parent)
+    runner = CliRunner()
+    made = runner.invoke(app, ["identify", folder, "--config", str(CONFIG), "--out", str(out)])
+    assert made.exit_code == 0, made.output
+    assert "robust simulation error, final iterate" in made.output
+    model = str(out / documents.MODEL)
+    made = runner.invoke(
+        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
+    )
+    assert made.exit_code == 0, made.output
+    return out
+
+
+def trial(name: str) -> Path:
+    return next(bag for bag in f1tenth() if bag.name == f"trial_{name}")
+
+
+def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Path) -> None:
+    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
+    assert errors["least_squares"] == pytest.approx(11.7, abs=0.05)
+    assert errors["sem"] == pytest.approx(8.5, abs=0.05)
+    assert errors["rse"] <= 9.5
+    assert result.fit.chosen.proof is not None
+    assert set(result.test.names) == {f"trial_{k}" for k in TEST}
+    assert len(result.train) == 33
+
+
+def test_test_trials_do_not_influence_the_model(
+    config: Config, chain: Path, tmp_path: Path
+) -> None:
+    fewer = [bag for bag in f1tenth() if bag.name[-2:] not in TEST[1:]]
+    identify_bags(fewer, config, tmp_path, progress=lambda _w, _f: None)
+    assert documents.load_model(tmp_path / documents.MODEL).document() == (
+        documents.load_model(chain / documents.MODEL).document()
+    )
+
+
+def test_the_model_names_the_bags_it_was_fitted_to(chain: Path) -> None:
+    model = documents.load_model(chain / documents.MODEL)
+    names = [name for name, _ in model.bags]
+    assert len(names) == 33
+    assert not {f"trial_{k}" for k in TEST} & set(names)
+    assert all(digest.startswith("sha256:") for _, digest in model.bags)
+    train = load_training(chain / documents.TRAINING, digest=model.training)
+    assert train.names == tuple(names)
+
+
+def test_check_prints_proved_for_both_proofs(chain: Path) -> None:
+    proofs = [str(chain / documents.MODEL_PROOF), str(chain / documents.FUNNEL_PROOF)]
+    done = CliRunner().invoke(app, ["check", *proofs])
+    assert done.exit_code == 0
+    lines = [line for line in done.output.splitlines() if not line.startswith(" ")]
+    assert len(lines) == 2
+    assert all(line.startswith("PROVED ") and " margin " in line for line in lines)
+
+
+def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_path: Path) -> None:
+    for file in chain.glob("*.json"):
+        shutil.copy(file, tmp_path)
+    text = (tmp_path / documents.MODEL).read_text()
+    (tmp_path / documents.MODEL).write_text(text.replace('"period": 0.025', '"period": 0.026'))
+    done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
+    assert done.exit_code == 1
+    assert done.output.startswith("REJECTED")
+    assert "model.json is not the model this proof is about" in done.output
+
+
+def replay(chain: Path, bag: Path) -> Replay:
+    proved = documents.load_proved_funnel(chain / documents.FUNNEL)
+    return replay_bag(proved, bag, centre=Centre.COMMAND)
+
+
+def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
+    split = config.split.model_copy(update={"test": ("trial_05", "trial_5")})
+    bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
+    given = config.model_copy(update={"split": split})
+    trials = read_trials(bags, given, progress=lambda _w, _f: None)
+    assert trials.absent == ("trial_5",)
+
+
+def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Path) -> None:
+    whole = replay(chain, trial("05"))
+    waiting, inside = whole.readings[0], whole.readings[-1]
+    nan = inside._replace(status=Status.UNKNOWN, reason="speed is nan at t = 2 s")
+    outside = inside._replace(status=Status.OUTSIDE, reason="left")
+    past = nan._replace(reason=f"{OVER} 117 samples; they are over")
+    assert "waiting" in waiting.reason
+    for readings, verdict, reason in (
+        ((waiting, inside, nan, nan), Status.UNKNOWN, nan.reason),
+        ((waiting, inside, past, waiting, inside), Status.INSIDE, ""),
+        ((waiting, nan), Status.UNKNOWN, nan.reason),
+        ((waiting, outside, nan), Status.OUTSIDE, "left"),
+    ):
+        found = replace(whole, readings=readings)
+        assert (found.verdict, found.reason) == (verdict.value, reason)
+        assert found.over is None
+    assert replace(whole, readings=(inside, past, past)).over is past
+
+
+@pytest.mark.parametrize("name", TEST)
+def test_every_test_trial_is_inside_with_the_assumption_kept(chain: Path, name: str) -> None:
+    result = replay(chain, trial(name))
+    assert result.verdict == Status.INSIDE.value
+    assert len(result.judged) == 117
+    assert result.worst is not None
+    assert result.worst.margin > 0
+    assert result.assumption < 1
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", TEST)
+def test_a_sabotaged_trial_is_caught_and_named(
+    chain: Path, tmp_path: Path, name: str, fault: str
+) -> None:
+    write_faulty_copy(trial(name), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS[fault])
+    result = replay(chain, tmp_path / "bag")
+    bad = result.first_bad
+    assert bad is not None
+    assert bad.status in (Status.OUTSIDE, Status.ASSUMPTION_VIOLATED)
+    assert f"at t = {bad.t:g} s" in bad.reason
+    assert "above the budget" in bad.reason
+    if fault == "zero after 1 s":
+        assert 1.0 <= bad.t <= 1.025
+
+
+def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
+    path = SignalPath.parse("/odom:twist.twist.linear.x")
+    write_faulty_copy(trial("05"), tmp_path / "bag", str(path), FAULTS["scaled by 0.6"])
+    signals = ["/odom:twist.twist.linear.x", "/odom:pose.pose.position.x"]
+    before, after = (
+        read_dataset([bag], responses=signals, excitations=["/cmd_vel:twist.linear.x"], max_gap=0.1)
+        for bag in (trial("05"), tmp_path / "bag")
+    )
+    original, copy = before.trajectories[0], after.trajectories[0]
+    np.testing.assert_array_equal(copy.y[:, 0], 0.6 * original.y[:, 0])
+    np.testing.assert_array_equal(copy.y[:, 1], original.y[:, 1])
+    np.testing.assert_array_equal(copy.u, original.u)
+
+
+def test_monitor_command_summarises_draws_and_ends_with_status_0(chain: Path) -> None:
+    bags = [str(trial(name)) for name in TEST]
+    done = CliRunner().invoke(
+        app, ["monitor", "--funnel", str(chain / documents.FUNNEL), "--replay", *bags]
+    )
+    assert done.exit_code == 0, done.output
+    assert done.output.count("inside") == len(TEST)
+    picture = (chain / documents.MARGIN_PLOT).read_bytes()
+    assert picture.startswith(b"\x89PNG")
+
+
+def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
+    chain: Path, tmp_path: Path
+) -> None:
+    write_faulty_copy(
+        trial("05"), tmp_path / "bad", "/odom:twist.twist.linear.x", FAULTS["scaled by 0.6"]
+    )
+    funnel, plot = str(chain / documents.FUNNEL), str(tmp_path / "plot.png")
+    done = CliRunner().invoke(
+        app, ["monitor", "--funnel", funnel, "--plot", plot, "--replay", str(tmp_path / "bad")]
+    )
+    assert done.exit_code == 1
+    assert "disturbance energy" in done.output
+
+
+def test_the_report_is_one_file_with_its_pictures(chain: Path) -> None:
+    page = (chain / documents.REPORT).read_text()
+    assert page.count("<svg") == 4  # trials, residuals, poles, the search
+    assert "src=" not in page
+    assert 'href="http' not in page
+    assert "decided exactly" in page
+
+
+def test_with_policy_none_the_funnel_is_a_prediction_tube(
+    chain: Path, config: Config, tmp_path: Path
+) -> None:
+    assert config.funnel is not None
+    prediction = config.model_copy(
+        update={"funnel": config.funnel.model_copy(update={"policy": None})}
+    )
+    for name in (documents.MODEL, documents.TRAINING):
+        shutil.copy(chain / name, tmp_path)
+    design = design_funnel_files(tmp_path / documents.MODEL, prediction, tmp_path)
+    assert not design.policy.K.any()
+    verdict = documents.load_proved_funnel(tmp_path / documents.FUNNEL).verdict
+    assert "no feedback" in verdict.statement
+
+
+def test_a_funnel_is_not_designed_on_other_data_than_the_models(
+    chain: Path, config: Config, tmp_path: Path
+) -> None:
+    shutil.copy(chain / documents.MODEL, tmp_path)
+    content = (chain / documents.TRAINING).read_bytes()
+    (tmp_path / documents.TRAINING).write_bytes(content[:-1] + b"\1")
+    with pytest.raises(DataError, match="not the data the model was fitted to"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+    assert not (tmp_path / documents.FUNNEL).exists()
+
+
+def edited(tmp_path: Path, **changes: object) -> Path:
+    """The shipped configuration with dotted keys changed."""
+    import yaml
+
+    content = yaml.safe_load(CONFIG.read_text())
+    for dotted, value in changes.items():
+        section, key = dotted.split("__")
+        content[section][key] = value
+    path = tmp_path / "config.yaml"
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"identification__lags": 0}, "identification.lags"),
+        ({"identification__lags": "4"}, "identification.lags"),
+        ({"grid__period": float("nan")}, "grid.period"),
+        ({"grid__perod": 0.1}, "grid.perod"),
+        ({"funnel__profile": [[0.0, 0.0]]}, "funnel.profile"),
+        ({"funnel__safety_factor": 0.9}, "funnel.safety_factor"),
+        ({"monitor__nominal": "guess"}, "monitor.nominal"),
+    ],
+)
+def test_a_wrong_configuration_names_the_key(
+    tmp_path: Path, changes: dict[str, object], reason: str
+) -> None:
+    with pytest.raises(DataError, match=reason):
+        load_config(edited(tmp_path, **changes))
+
+
+@pytest.mark.parametrize("text", ["", "- 1", "a: [", "!!python/object/apply:os.system ['true']"])
+def test_a_configuration_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"config\.yaml"):
+        load_config(path)
+
+
+@pytest.mark.parametrize(
+    ("bags", "changes", "reason"),
+    [
+        (["nowhere"], {}, "there is no bag"),
+        (["01", "02"], {}, "none of the bags is a test trial"),
+        (["05", "11"], {}, "all of the bags are test trials"),
+        (["01", "05"], {"grid__period": 0.05}, "period"),
+        (["06", "07", "08", "11"], {}, "constant"),
+        (["01", "02", "05"], {"identification__lags": 40}, "rows for 82 parameters"),
+    ],
+)
+def test_bad_input_ends_in_one_message_and_leaves_nothing_behind(
+    tmp_path: Path, bags: list[str], changes: dict[str, object], reason: str
+) -> None:
+    out = tmp_path / "out"
+    paths = [str(trial(b)) if b.isdigit() else str(tmp_path / b) for b in bags]
+    arguments = ["identify", *paths, "--config", str(edited(tmp_path, **changes))]
+    done = CliRunner().invoke(app, [*arguments, "--out", str(out)])
+    assert isinstance(done.exception, NlsidError)
+    assert reason in str(done.exception)
+    assert not out.exists()

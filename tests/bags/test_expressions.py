@@ -1,0 +1,213 @@
+"""Signals with units, angles, derivatives: parsed, checked against the type, and right."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bags
+from bags.chain.training import load_training, save_training
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.expressions import Expression, derivative
+from bags.signals.reader import LOG_TIME, PUBLISH_TIME, read_signals
+from bags.signals.signal import SignalPath, numeric_paths, quaternion_angle
+from bags.signals.units import UNITS, conversion, implied_unit
+from nlsid_core.errors import BagError
+from tests.bag_messages import JOINT_TYPE, START_NS, joints, serialised, speed_bag
+
+ODOM_YAW = "/odom:pose.pose.orientation.yaw"
+
+
+def arm_bag(path: Path, rows: int = 40) -> Path:
+    with BagWriter(path) as bag:
+        for k in range(rows):
+            stamp = START_NS + k * 10_000_000
+            data = joints(stamp, [0.01 * k, -1.0, 0.5 * (0.01 * k) ** 2])
+            bag.write("/arm", JOINT_TYPE, data, log_time_ns=stamp + 7, publish_time_ns=stamp + 3)
+    return path
+
+
+def test_every_element_is_one_signal_each(tmp_path: Path) -> None:
+    read = read_signals(arm_bag(tmp_path / "arm"), ["/arm:position[*]"])
+    assert list(read) == [f"/arm:position[{k}]" for k in range(3)]
+    assert set(read["/arm:position[1]"].values) == {-1.0}
+    assert read["/arm:position[0]"].unit == "rad or m"
+
+
+def test_a_joint_is_found_by_name_and_a_missing_one_is_answered_with_those_there(
+    tmp_path: Path,
+) -> None:
+    bag = arm_bag(tmp_path / "arm")
+    read = read_signals(bag, ["/arm:position[name=joint_1]"])
+    assert set(read["/arm:position[name=joint_1]"].values) == {-1.0}
+    with pytest.raises(BagError, match="'name' has no 'elbow'; it has: joint_0, joint_1, joint_2"):
+        read_signals(bag, ["/arm:position[name=elbow]"])
+    with pytest.raises(BagError, match="'frame' on 'sensor_msgs/msg/JointState' is not an array"):
+        read_signals(bag, ["/arm:position[frame=elbow]"])
+
+
+def test_the_clock_can_be_chosen(tmp_path: Path) -> None:
+    bag = arm_bag(tmp_path / "arm")
+    for clock, after in ((None, 0), (LOG_TIME, 7), (PUBLISH_TIME, 3)):
+        read = read_signals(bag, ["/arm:position[0]"], clock=clock)["/arm:position[0]"]
+        assert read.stamp_ns[0] == START_NS + after
+    with pytest.raises(BagError, match="no clock 'sim'; there are: header stamp, log time"):
+        read_signals(bag, ["/arm:position[0]"], clock="sim")
+
+
+def test_near_names_are_suggested_for_topics_fields_units_and_operations(tmp_path: Path) -> None:
+    bag = arm_bag(tmp_path / "arm")
+    for text, near in (
+        ("/arn:position[0]", "did you mean '/arm'"),
+        ("/arm:positions[0]", "did you mean '/arm:position"),
+        ("/arm:position[0]|to(degg)", "did you mean 'deg'"),
+        ("/arm:position[0]|derivate(1 s)", "did you mean 'derivative'"),
+    ):
+        with pytest.raises(BagError) as caught:
+            read_signals(bag, [text])
+        assert near in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "/arm:position[0]|",
+        "/arm:position[0]|to()",
+        "/arm:position[0]|to",
+        "/arm:position[0]|derivative",
+        "/arm:position[0]|derivative(0 s)",
+        "/arm:position[0]|derivative(1e99 s)",
+        "/arm:position[0]|derivative(5)",
+        "/arm:position[0]|unwrap(1 s)",
+        "/arm:position[0]|__import__(os)",
+        "/arm:position[0]|to(deg)(rad)",
+    ],
+)
+def test_operations_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(BagError):
+        Expression.parse(text)
+
+
+def test_an_expression_prints_as_it_is_written() -> None:
+    for text in ("/arm:position[0]|unit(rad)|to(deg)|derivative(0.2 s)", f"{ODOM_YAW}|unwrap"):
+        assert str(Expression.parse(text)) == text
+
+
+def test_units_are_converted_only_within_their_kind(tmp_path: Path) -> None:
+    bag = arm_bag(tmp_path / "arm")
+    text = "/arm:position[0]|to(deg)"
+    found = read_signals(bag, [text])[text]
+    np.testing.assert_allclose(found.values, np.degrees(0.01 * np.arange(40)), rtol=1e-15)
+    assert found.unit == "deg"
+    with pytest.raises(BagError, match="cannot be converted to 's'"):
+        read_signals(bag, ["/arm:position[0]|to(s)"])
+    assert conversion("degC", "K") == (1.0, 273.15)
+    assert conversion("rad or m", "mm")[0] == pytest.approx(1000.0)
+    for name, unit in UNITS.items():
+        assert conversion(name, name) == (1.0, 0.0), unit
+
+
+def test_standard_types_imply_units() -> None:
+    types = standard_types()
+    units = {
+        path: implied_unit(owners)
+        for path, _, owners in numeric_paths("nav_msgs/msg/Odometry", types)
+    }
+    assert units["twist.twist.linear.x"] == "m/s"
+    assert units["twist.twist.angular.z"] == "rad/s"
+    assert units["pose.pose.position.y"] == "m"
+    assert units["pose.pose.orientation.w"] == ""
+    assert units["pose.covariance[*]"] == ""
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.3, 7.0])
+def test_angles_of_a_quaternion_are_those_it_was_made_of(scale: float) -> None:
+    rng = np.random.default_rng(3)
+    roll, pitch, yaw = rng.uniform([-3.1, -1.5, -3.1], [3.1, 1.5, 3.1], (200, 3)).T
+    a, b, c = roll / 2, pitch / 2, yaw / 2
+    x = np.sin(a) * np.cos(b) * np.cos(c) - np.cos(a) * np.sin(b) * np.sin(c)
+    y = np.cos(a) * np.sin(b) * np.cos(c) + np.sin(a) * np.cos(b) * np.sin(c)
+    z = np.cos(a) * np.cos(b) * np.sin(c) - np.sin(a) * np.sin(b) * np.cos(c)
+    w = np.cos(a) * np.cos(b) * np.cos(c) + np.sin(a) * np.sin(b) * np.sin(c)
+    q = scale * np.array([x, y, z, w])
+    for name, expected in (("roll", roll), ("pitch", pitch), ("yaw", yaw)):
+        np.testing.assert_allclose(quaternion_angle(name, q), expected, atol=1e-12)
+    assert math.isnan(quaternion_angle("yaw", np.zeros((4, 1)))[0])
+
+
+def test_an_angle_reads_from_a_bag_and_live_alike(tmp_path: Path) -> None:
+    types = standard_types()
+    kind = "geometry_msgs/msg/QuaternionStamped"
+    quaternion = types.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.6, 0.8)
+    header = types.types["std_msgs/msg/Header"](
+        types.types["builtin_interfaces/msg/Time"](1, 0), ""
+    )
+    message = types.types[kind](header, quaternion)
+    with BagWriter(tmp_path / "q") as bag:
+        bag.write("/q", kind, serialised(kind, message), log_time_ns=1, publish_time_ns=1)
+    read = read_signals(tmp_path / "q", ["/q:quaternion.yaw"])["/q:quaternion.yaw"]
+    path = SignalPath.parse("/q:quaternion.yaw")
+    assert read.values[0] == path.value(message) == pytest.approx(2 * math.atan2(0.6, 0.8))
+    assert read.unit == "rad"
+
+
+def test_the_derivative_of_a_line_is_its_slope_at_any_stamps() -> None:
+    rng = np.random.default_rng(4)
+    stamps = START_NS + np.cumsum(rng.integers(5_000_000, 15_000_000, 200))
+    t = (stamps - stamps[0]) / 1e9
+    found = derivative(2.0 - 3.0 * t, stamps, 0.1)
+    complete = t >= 0.1
+    np.testing.assert_allclose(found[complete], -3.0, rtol=1e-9)
+    assert np.isnan(found[~complete]).all()
+
+
+def test_a_derivative_uses_nothing_later_and_is_delayed_by_half_its_window() -> None:
+    stamps = np.arange(1000) * 1_000_000
+    t = stamps / 1e9
+    jump = derivative(np.where(t >= 0.5, 1.0, 0.0), stamps, 0.1)
+    assert (jump[101:500] == 0.0).all()
+    assert jump[500] > 0.0
+    bent = derivative(t * t, stamps, 0.1)[101:]
+    np.testing.assert_allclose(bent, 2 * (t[101:] - 0.05), rtol=1e-6)
+
+
+def test_the_derivative_has_the_stated_frequency_response() -> None:
+    window = 0.2
+    stamps = np.arange(4000) * 1_000_000
+    t = stamps / 1e9
+    for f, gain in ((0.5, None), (0.58 / window, 1 / math.sqrt(2)), (1.43 / window, 0.0)):
+        found = derivative(np.sin(2 * np.pi * f * t), stamps, window)[500:-500]
+        phi = math.pi * f * window
+        stated = 3 * (math.sin(phi) - phi * math.cos(phi)) / phi**3
+        measured = np.abs(found).max() / (2 * np.pi * f)
+        assert measured == pytest.approx(abs(stated), abs=0.01)
+        if gain is not None:
+            assert measured == pytest.approx(gain, abs=0.01)
+
+
+def test_a_derivative_without_samples_or_order_is_refused() -> None:
+    stamps = np.arange(50) * 10_000_000
+    with pytest.raises(BagError, match="a slope needs 3 of them in a window"):
+        derivative(np.ones(50), stamps, 0.001)
+    with pytest.raises(BagError, match="stamps do not increase"):
+        derivative(np.ones(3), np.array([0, 1, 1]), 1.0)
+
+
+def test_a_dataset_knows_where_it_comes_from(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        speed_bag(tmp_path / name, np.sin(np.arange(60.0)), np.cos(np.arange(60.0)))
+    dataset = bags.read(
+        [tmp_path / "a", tmp_path / "b"],
+        responses=["/odom:twist.twist.linear.x"],
+        excitations=["/cmd_vel:twist.linear.x"],
+    )
+    trial = dataset.trajectories[0]
+    assert trial.y_units == ("m/s",)
+    assert trial.y_paths == ("/odom:twist.twist.linear.x",)
+    for part in (trial.digest, '"a.mcap"', '"/odom:twist.twist.linear.x"', '"resample":"none"'):
+        assert part in trial.provenance
+    digest = save_training(tmp_path / "training.npz", dataset)
+    again = load_training(tmp_path / "training.npz", digest=digest)
+    assert again.trajectories[1].provenance == dataset.trajectories[1].provenance

@@ -1,0 +1,366 @@
+"""One verb for all classes in Python: what each offers, its history, and what it refuses."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, Infeasible, ShapeError
+from nlsid_core.identification import (
+    METHODS,
+    BlockCascadeClass,
+    CertifiedRse,
+    CertifiedSem,
+    Fit,
+    ImplicitClass,
+    LeastSquares,
+    LinearClass,
+    LinearStateClass,
+    MomentRie,
+    MonotoneClass,
+    Rie,
+    Rse,
+    Sem,
+    StateAffineClass,
+    describe,
+    identify,
+    methods_of,
+    predict,
+    select,
+    validate,
+)
+from nlsid_core.identification.prediction import history, simulate_trial, solve_increasing_at
+from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
+from nlsid_core.models.monotone_equation import solve_increasing
+from nlsid_core.proofs import check
+from tests import repeated
+from tests.conftest import synthetic_dataset
+from tests.identified_bags import saturating
+
+SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
+CASCADE = BlockCascadeClass((2, 1), phases=(1,), intervals=(8,), starts=4)
+
+
+def saturated(samples: int, seed: int, noise: float = 0.01) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-2.0, 2.0, samples)
+    y = saturating().simulate(u) + noise * rng.standard_normal(samples)
+    return Trajectory(t=0.01 * np.arange(samples), y=y, u=u, name=f"run {seed}")
+
+
+@pytest.fixture(scope="module")
+def cascade() -> Fit[BlockCascade]:
+    return identify(
+        Dataset((saturated(500, 0), saturated(700, 1))),
+        CASCADE,
+        validation=Dataset((saturated(500, 2),)),
+        test=Dataset((saturated(600, 3),)),
+        transient=60,
+    )
+
+
+@pytest.fixture(scope="module")
+def monotone() -> Fit[MonotoneEquation]:
+    pairs = [*repeated.pair(2000, 1), *repeated.pair(1500, 2)]
+    return identify(Dataset(tuple(pairs)), repeated.CLASS)
+
+
+@pytest.fixture(scope="module")
+def affine(train: Dataset) -> Fit[StateAffineModel]:
+    declared = StateAffineClass(2, input_range=((-0.5, 1.5),), on_out_of_range="refuse")
+    return identify(train, declared, method=CertifiedRse(iterations=3))
+
+
+def test_every_class_has_its_methods_and_together_they_are_all() -> None:
+    classes = (LinearClass(2), StateAffineClass(2), CASCADE, MonotoneClass(2))
+    assert methods_of(ImplicitClass())[0] is Rie
+    assert methods_of(LinearStateClass()) == (LeastSquares,)
+    assert {m for c in classes for m in methods_of(c)} == set(METHODS.values())
+    assert methods_of(StateAffineClass(2, lagged_degree=1))[0] is Rse
+    for degrees in ((0, 1), (1, 1), (2, 0)):
+        assert CertifiedRse in methods_of(StateAffineClass(2, None, *degrees))
+    for degrees in ((3, 0), (2, 1), (0, 2)):
+        assert CertifiedRse not in methods_of(StateAffineClass(2, None, *degrees))
+    with pytest.raises(DataError, match="is no model class; there are: LinearClass"):
+        methods_of("linear")
+
+
+def test_a_cascade_fit_is_a_fit_with_the_choices_as_its_history(cascade: Fit[BlockCascade]) -> None:
+    assert cascade.methods == ("sem",)
+    assert "8 intervals" in cascade.history.steps[0].what
+    assert cascade.history.value == "validation error, rms []"
+    assert cascade.chosen.transient == 60
+    assert cascade.errors["test"]["sem"] < 2.0
+    assert cascade.proof.rate < 1.0
+    text = str(cascade)
+    assert "block cascade: filters of orders 2 and 1" in text
+    assert "train  validation        test" in text
+
+
+def test_the_same_seed_gives_the_same_cascade(cascade: Fit[BlockCascade]) -> None:
+    data, validation = (
+        Dataset((saturated(500, 0), saturated(700, 1))),
+        Dataset((saturated(500, 2),)),
+    )
+    again = identify(data, CASCADE, validation=validation, transient=60)
+    assert again.model.document() == cascade.model.document()
+    other = identify(data, replace(CASCADE, seed=5), validation=validation, transient=60)
+    assert other.model.document() != cascade.model.document()
+
+
+def test_moments_stand_beside_the_biased_rie_and_least_squares(
+    monotone: Fit[MonotoneEquation],
+) -> None:
+    assert monotone.methods == ("least_squares", "rie", "moment_rie")
+    assert repeated.percent(monotone.model) < 0.4 * repeated.percent(monotone["rie"].model)
+    assert monotone["least_squares"].proof is None
+    assert len(monotone.history.steps) == 1
+    assert "mean squared simulation error by the moments" in str(monotone)
+
+
+def test_only_what_is_asked_for_runs(train: Dataset) -> None:
+    alone = identify(train, LinearClass(2), method=LeastSquares(), comparators=())
+    assert alone.methods == ("least_squares",)
+    assert str(alone.history) == "solved directly"
+    two = identify(train, LinearClass(2), method=Sem(), comparators=[LeastSquares()])
+    assert two.methods == ("least_squares", "sem")
+    with pytest.raises(DataError, match=r"Rie\(\) is not for this model class \(LinearClass\)"):
+        identify(train, LinearClass(2), comparators=[Rie()])
+
+
+def test_a_comparator_that_fails_is_left_out_and_logged(
+    train: Dataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    renamed = [replace(t, group="same") for t in train]
+    fit = identify(
+        Dataset(tuple(renamed)), MonotoneClass(2, degree=1), method=LeastSquares(),
+        allow_unproved=True,
+    )  # fmt: skip
+    assert fit.methods == ("least_squares", "rie")
+    assert "are not repeats" in caplog.text
+
+
+def test_other_signals_or_another_period_are_refused(train: Dataset) -> None:
+    renamed = Dataset(tuple(replace(t, u_names=("torque",)) for t in train))
+    with pytest.raises(DataError, match=r"the test data hold .*torque"):
+        identify(train, LinearClass(2), test=renamed)
+    slow = Dataset(tuple(replace(t, t=2.0 * t.t) for t in train))
+    with pytest.raises(DataError, match=r"the validation data are sampled every 0\.2 s"):
+        identify(train, LinearClass(2), validation=slow)
+
+
+# -- bad input ---------------------------------------------------------------------------------
+
+
+def test_too_little_data_says_how_much_there_is_and_what_for() -> None:
+    short = Dataset((saturated(70, 0),))
+    for model_class, reason in (
+        (LinearClass(30), "40 rows for 62 parameters"),
+        (StateAffineClass(6, right_degree=3), "64 equations for 127 parameters; give more data"),
+        (StateAffineClass(80), "70 samples, 80 lags need more"),
+        (BlockCascadeClass((20, 20)), "fewer than 99 scored samples"),
+        (MonotoneClass(80), "70 common samples; 81 needed"),
+    ):
+        with pytest.raises(DataError, match=reason):
+            identify(short, model_class, validation=short)
+
+
+def test_an_input_that_excites_nothing_is_named() -> None:
+    t, rng = 0.01 * np.arange(400), np.random.default_rng(0)
+    still = Dataset((Trajectory(t=t, y=rng.standard_normal(400), u=np.full(400, 0.4)),))
+    for model_class in (LinearClass(2), StateAffineClass(2), CASCADE):
+        with pytest.raises(DataError, match="constant"):
+            identify(still, model_class, validation=still)
+    with pytest.raises(DataError, match=r"the excitation u0 is constant \(0.4\)"):
+        identify(still, MonotoneClass(2), method=Rie())
+    square = Dataset((Trajectory(t=t, y=rng.standard_normal(400), u=np.tile([0.0, 1.0], 200)),))
+    with pytest.raises(DataError, match="window of 3 inputs: with a constant it has rank 2, not 4"):
+        identify(square, MonotoneClass(2), method=Rie())
+    with pytest.raises(DataError, match="does not excite 2 lags"):
+        identify(square, LinearClass(2))
+
+
+def test_a_basis_that_repeats_itself_says_its_rank() -> None:
+    rng = np.random.default_rng(0)
+    u = np.sign(rng.standard_normal(500))  # u² is constant
+    data = Dataset((Trajectory(t=np.arange(500.0), y=rng.standard_normal(500), u=u),))
+    with pytest.raises(DataError, match="polynomial basis of 10 has rank 7"):
+        identify(data, StateAffineClass(2, right_degree=2))
+
+
+def test_what_is_no_repeat_is_refused_and_said_to_be_untested_if_asked() -> None:
+    first, second = repeated.pair(1500, 1)
+    late = replace(second, y=np.roll(second.y, 1))
+    data = Dataset((first, late))
+    with pytest.raises(DataError, match=r"are not repeats: .*correlates with the excitation"):
+        identify(data, repeated.CLASS)
+    accepted = identify(data, repeated.CLASS, method=MomentRie(accept_untested_repeats=True))
+    assert accepted.proof.rate < 1.0
+    alone = Dataset((replace(first, group=""), replace(second, group="")))
+    with pytest.raises(DataError, match="share a `group`"):
+        identify(alone, repeated.CLASS)
+
+
+# -- inputs beyond the range that was proved ---------------------------------------------------
+
+
+def test_an_input_beyond_its_range_is_clipped_or_refused_as_declared(
+    affine: Fit[StateAffineModel],
+) -> None:
+    refusing = affine.model
+    clipping = replace(refusing, on_out_of_range="clip")
+    trial = synthetic_dataset(0.0, trials=1).trajectories[0]
+    u = np.array(trial.u)
+    u[20:23] = 1.7
+    wild, at_the_edge = replace(trial, u=u), replace(trial, u=np.minimum(u, 1.5))
+    reason = r"input command is 1.7 at sample 20, outside \[-0.5, 1.5\] .* \(3 here\)"
+    for use in (lambda: simulate_trial(refusing, wild), lambda: predict(refusing, wild, 3),
+                lambda: validate(refusing, Dataset((wild,)))):  # fmt: skip
+        with pytest.raises(DataError, match=reason):
+            use()
+    np.testing.assert_array_equal(
+        simulate_trial(clipping, wild), simulate_trial(clipping, at_the_edge)
+    )
+    np.testing.assert_array_equal(
+        simulate_trial(refusing, at_the_edge), simulate_trial(clipping, at_the_edge)
+    )
+
+
+@pytest.mark.parametrize(
+    ("declared", "stated"),
+    [("clip", "the model clips its inputs"), ("refuse", "it refuses others")],
+)
+def test_the_certificate_states_what_is_declared(
+    affine: Fit[StateAffineModel], tmp_path: Path, declared: str, stated: str
+) -> None:
+    document = affine.model.document() | {"on_out_of_range": declared}
+    model = StateAffineModel.from_document(document)
+    files.write_document(tmp_path / "model.json", model.document())
+    files.write_document(tmp_path / "p.json", affine.proof.document(model, "model.json"))
+    assert stated in check(tmp_path / "p.json").statement
+
+
+def test_a_range_that_refuses_its_own_training_data_is_refused(train: Dataset) -> None:
+    narrow = StateAffineClass(2, input_range=((0.2, 0.5),), on_out_of_range="refuse")
+    with pytest.raises(DataError, match=r"which the model refuses; declare a wider range"):
+        identify(train, narrow)
+    clipped = identify(train, replace(narrow, on_out_of_range="clip"), comparators=())
+    assert clipped.model.u_range.tolist() == [[0.2, 0.5]]
+    with pytest.raises(DataError, match="on_out_of_range is 'warn'"):
+        StateAffineModel.from_document(clipped.model.document() | {"on_out_of_range": "warn"})
+
+
+# -- predictions of every model ----------------------------------------------------------------
+
+
+def test_many_increasing_cubics_are_inverted_at_once() -> None:
+    targets = np.concatenate([np.linspace(-50, 50, 41), [0.0, 1e-12, 1e6]])
+    for e in ((1.0, 0.0, 0.0), (3.0, 1.0, 1.0), (0.1, 0.0, 5.0), (1.0, -1.7, 1.0)):
+        found = solve_increasing_at(np.array(e), targets)
+        one_by_one = [solve_increasing(e, target, 0.0) for target in targets.tolist()]
+        np.testing.assert_allclose(found, one_by_one, rtol=1e-12, atol=1e-15)
+
+
+def test_predictions_of_a_monotone_equation_are_simulations_restarted_at_every_sample() -> None:
+    model = replace(repeated.truth(), window=((0, 3),), y_offset=0.2)
+    w = np.random.default_rng(0).uniform(-2.0, 2.0, 60)
+    trial = repeated.run(w, 0.1, 1)
+    h, horizon = history(model), 4
+    assert h == 3
+    predicted = predict(model, trial, horizon)
+    assert predicted.shape == (60 - h - horizon + 1, 1)
+    for row in range(len(predicted)):
+        rows = slice(row, row + h + horizon)
+        restarted = model.simulate(trial.u[rows], trial.y[row : row + h, 0])
+        assert predicted[row, 0] == pytest.approx(restarted[-1], abs=1e-12)
+
+
+def test_a_cascade_predicts_what_it_simulates_and_its_residual_is_the_noise(
+    cascade: Fit[BlockCascade],
+) -> None:
+    test = Dataset((saturated(900, 8),))
+    scores = cascade.chosen.validate(test)
+    assert scores.prediction_percent[1] == scores.prediction_percent[20]
+    assert scores.prediction_percent[1] == scores.simulation_percent
+    assert scores.white
+    assert scores.independent
+    assert scores.samples == 840
+
+
+def test_output_noise_leaves_the_simulation_residual_white(monotone: Fit[MonotoneEquation]) -> None:
+    test = Dataset((repeated.run(np.random.default_rng(7).uniform(-2, 2, 3000), 0.05, 7),))
+    scores = validate(monotone.model, test)
+    assert scores.simulation.white
+    assert not scores.one_step.white
+    assert scores.white, "one of the two is"
+
+
+def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None:
+    train = Dataset((saturated(400, 0), saturated(500, 1)))
+    validation = Dataset((saturated(400, 2),))
+    orders = [replace(CASCADE, orders=orders) for orders in ((1, 0), (2, 1))]
+    chosen = select(train, validation, orders, transient=60)
+    assert chosen.best == orders[1]
+    with pytest.raises(Infeasible, match="share a `group`"):
+        select(train, validation, [MonotoneClass(1), MonotoneClass(2)])
+    with pytest.raises(DataError, match="no model class to select from"):
+        select(train, validation, [])
+    assert describe(StateAffineClass(2, right_degree=3)) == "state affine, lags 2, right degree 3"
+
+
+# -- documents ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["block_cascade", "monotone_equation"])
+def test_documents_of_each_class_validate_against_the_published_schemas(
+    name: str, cascade: Fit[BlockCascade], monotone: Fit[MonotoneEquation]
+) -> None:
+    fit: Fit[BlockCascade] | Fit[MonotoneEquation] = (
+        cascade if name == "block_cascade" else monotone
+    )
+    for schema_name, document in (
+        (name, fit.model.document()),
+        ("proof_stability", fit.proof.document(fit.model, "model.json")),
+    ):
+        schema = files.load_document(SCHEMAS / f"{schema_name}.schema.json")
+        jsonschema.Draft202012Validator.check_schema(schema)
+        jsonschema.validate(document, schema)
+        without = {k: v for k, v in document.items() if k != "format"}
+        for damaged in (without, document | {"extra": 1}, document | {"version": 3}):
+            with pytest.raises(jsonschema.ValidationError):
+                jsonschema.validate(damaged, schema)
+    bent = fit.model.document() | ({"b1": []} if name == "block_cascade" else {"e": [1.0]})
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(bent, files.load_document(SCHEMAS / f"{name}.schema.json"))
+
+
+# -- the last step -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model_class", [LinearClass(2), StateAffineClass(2, leading_degree=1)])
+def test_the_last_step_keeps_the_proof_and_never_raises_the_error(
+    train: Dataset, model_class: LinearClass | StateAffineClass
+) -> None:
+    before = Rse(4) if isinstance(model_class, LinearClass) else CertifiedRse(4)
+    fit = identify(train, model_class, method=CertifiedSem(4), comparators=[before])
+    errors = fit.errors["train"]
+    assert fit.proof.rate < 1.0
+    assert errors["sem_certified"] <= errors[before.name] * (1 + 1e-9)
+
+
+def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_use() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((300, 1)), rng.standard_normal((300, 2))
+    data = Dataset((Trajectory(t=0.01 * np.arange(300), y=y, u=u),))
+    assert identify(data, StateAffineClass(1), method=CertifiedRse()).proof.rate < 1.0
+    quadratic = StateAffineClass(1, (0,), leading_degree=2)
+    with pytest.raises(ShapeError, match="degree 1 at most; minimise the robust simulation error"):
+        identify(data, quadratic, method=CertifiedRse(), comparators=())
+    beside = identify(
+        data, quadratic, method=Rse(2), comparators=[CertifiedRse(2)], allow_unproved=True
+    )
+    assert beside.methods == ("rse",)

@@ -1,0 +1,129 @@
+"""What the section `identification` refuses: key, value and what is allowed are named."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bags.chain.config import load_config
+from nlsid_core.errors import DataError
+from nlsid_core.identification import (
+    BlockCascadeClass,
+    CertifiedSem,
+    ImplicitClass,
+    LeastSquares,
+    LinearClass,
+    LinearStateClass,
+    MomentRie,
+    MonotoneClass,
+    Rse,
+    Sem,
+    StateAffineClass,
+)
+from tests.identified_bags import write_config
+
+
+@pytest.mark.parametrize(
+    ("section", "expected"),
+    [
+        ({"lags": 4}, LinearClass(4)),
+        ({"model": "state_affine", "lags": 2, "input_range": [-1, 1.5], "delays": [1, 2]},
+         StateAffineClass(2, delays=(1, 2), input_range=((-1.0, 1.5),))),
+        ({"model": "state_affine", "lags": 2, "input_range": [[0, 1], [2, 3]],
+          "on_out_of_range": "refuse"},
+         StateAffineClass(2, input_range=((0.0, 1.0), (2.0, 3.0)), on_out_of_range="refuse")),
+        ({"model": "block_cascade", "orders": [2, 0], "intervals": [8]},
+         BlockCascadeClass((2, 0), intervals=(8,))),
+        ({"model": "monotone", "lags": 3, "degree": 1}, MonotoneClass(3, degree=1)),
+        ({"model": "implicit", "set": "2.13", "delays": [1], "box": [[-1, 1], [0, 2]]},
+         ImplicitClass(1, (1,), "2.13", box=((-1.0, 1.0), (0.0, 2.0)))),
+        ({"model": "linear_states"}, LinearStateClass()),
+    ],
+)  # fmt: skip
+def test_each_section_says_a_model_class(
+    tmp_path: Path, section: dict[str, Any], expected: object
+) -> None:
+    config = load_config(write_config(tmp_path / "robot.yaml", section))
+    assert config.identification.model_class == expected
+
+
+@pytest.mark.parametrize(
+    ("section", "expected"),
+    [
+        ({"lags": 4}, Rse()),
+        ({"lags": 4, "method": "least_squares"}, LeastSquares()),
+        ({"lags": 4, "iterations": 7}, Rse(iterations=7)),
+        ({"model": "state_affine", "lags": 2, "method": "sem_certified", "iterations": 7},
+         CertifiedSem(iterations=7)),
+        ({"model": "monotone", "lags": 2, "accept_untested_repeats": True},
+         MomentRie(accept_untested_repeats=True)),
+        ({"model": "monotone", "lags": 2, "method": "sem"}, Sem()),
+    ],
+)  # fmt: skip
+def test_each_section_says_a_method_with_its_options(
+    tmp_path: Path, section: dict[str, Any], expected: object
+) -> None:
+    config = load_config(write_config(tmp_path / "robot.yaml", section))
+    assert config.identification.method == expected
+
+
+def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Path) -> None:
+    section = {"lags": 2, "transient": 5, "allow_unproved": True}
+    config = load_config(write_config(tmp_path / "robot.yaml", section)).identification
+    assert (config.transient, config.allow_unproved) == (5, True)
+    plain = load_config(write_config(tmp_path / "robot.yaml", {"lags": 2})).identification
+    assert (plain.transient, plain.allow_unproved) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("section", "reason"),
+    [
+        ({"model": "wiener", "lags": 2},
+         "identification: there is no such model; there are: linear, state_affine, block_cascade"),
+        ({"lags": 2, "orders": [1, 2]},
+         r"identification.orders: there is no such key; there are: model, .*\(found \[1, 2\]"),
+        ({"lags": 2, "method": "magic"},
+         r"identification.method: should be 'rse', .* or 'sem_certified' \(found 'magic'\)"),
+        ({"lags": 2, "method": "rie"},
+         r"identification.method: is not for this model class: 'rse', .* \(found 'rie'\)"),
+        ({"lags": 2, "iterations": 0},
+         r"identification.iterations: should be a whole number from 1 to 1000 \(found 0\)"),
+        ({"lags": 2, "iterations": 2.5}, r"iterations: Input should be a valid integer"),
+        ({"lags": 2, "iterations": 4, "method": "least_squares"},
+         r"identification.iterations: there is no such key; there are: model, lags, method, tr"),
+        ({"lags": 2, "transient": -1}, r"identification.transient: Input should be greater than"),
+        ({"lags": 2, "allow_unproved": "yes"}, r"allow_unproved: Input should be a valid boolean"),
+        ({"model": "block_cascade", "orders": [1, 2.5]}, r"orders.1: Input should be a valid int"),
+        ({}, "identification.lags: Field required$"),
+        ([4], "identification: should be keys and values"),
+        ({"model": ["linear"]}, "identification: there is no such model"),
+        ({"lags": 2, "seed": 1}, "identification.seed: there is no such key"),
+        ({"model": "state_affine", "lags": 2, "lagged_degree": 2, "method": "rse_certified"},
+         r"method: is not for this model class: .* \(found 'rse_certified'\)"),
+        ({"model": "state_affine", "lags": 2, "delays": [3]},
+         r"identification.delays: should be one or more whole numbers from 0 to 2 \(found \[3\]"),
+        ({"model": "state_affine", "lags": 2, "on_out_of_range": "warn"},
+         r"on_out_of_range: Input should be 'clip' or 'refuse' \(found 'warn'\)"),
+        ({"model": "state_affine", "lags": 2, "input_range": [0, 1, 2]}, "at most 2 items"),
+        ({"model": "block_cascade", "orders": [0, 0]}, "not both zero"),
+        ({"model": "block_cascade", "phases": [9]}, "phases: should be between 1 and 4 each"),
+        ({"model": "monotone", "lags": 2, "degree": 2},
+         r"degree: should be one of 1, 3 \(found 2\)"),
+        ({"model": "implicit", "set": 2.13}, r"set: Input should be '2.10', .* \(found 2.13\)"),
+        ({"model": "implicit", "set": "2.13", "lags": 2}, "set 2.13 is for 1 lag"),
+        ({"model": "implicit", "right_degree": 3}, "needs a box in set 2.11"),
+        ({"model": "implicit", "coupled": True}, "stable on a box only"),
+        ({"model": "linear_states", "lags": 1}, "identification.lags: there is no such key"),
+    ],
+)  # fmt: skip
+def test_a_wrong_identification_names_key_value_and_what_is_allowed(
+    tmp_path: Path, section: Any, reason: str
+) -> None:
+    with pytest.raises(DataError, match=reason):
+        load_config(write_config(tmp_path / "robot.yaml", section))
+
+
+def test_a_wrong_entry_of_compare_is_found_by_its_number(tmp_path: Path) -> None:
+    path = write_config(tmp_path / "robot.yaml", {"lags": 2}, compare=[{"lags": 1}, {"lags": 0}])
+    with pytest.raises(DataError, match=r"compare\.1\.lags: .*\(found 0\)"):
+        load_config(path)

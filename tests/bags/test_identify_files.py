@@ -1,0 +1,388 @@
+"""Every model class through the command line: bags and YAML in, files that `check` decides out."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from bags.chain.choosing import compare_bags, select_bags
+from bags.chain.config import load_config
+from bags.chain.steps import Trials, split
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.signals.grid import read_dataset, skipped_samples
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, Infeasible, NlsidError
+from nlsid_core.identification import METHODS
+from nlsid_core.models import (
+    BlockCascade,
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StateAffineModel,
+)
+from tests.bag_messages import COMMAND, SPEED, speed_bag
+from tests.identified_bags import (
+    saturating,
+    write_config,
+    write_coupled_bags,
+    write_saturating_bags,
+)
+
+HOWTO = Path(__file__).resolve().parents[2] / "docs" / "howto-offline.md"
+CASCADE = {
+    "model": "block_cascade", "orders": [2, 1], "phases": [1], "intervals": [8], "starts": 4,
+    "transient": 60,
+}  # fmt: skip
+CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
+    "linear": ({"lags": 3}, DifferenceEquation),
+    "state_affine": (
+        {"model": "state_affine", "lags": 2, "method": "rse_certified", "iterations": 3,
+         "right_degree": 2},
+        StateAffineModel,
+    ),
+    "block_cascade": (CASCADE, BlockCascade),
+    "monotone": ({"model": "monotone", "lags": 2, "delays": [0, 1]}, MonotoneEquation),
+    "implicit": ({"model": "implicit", "lags": 2, "delays": [0, 1]}, ImplicitModel),
+    "linear_states": ({"model": "linear_states"}, ImplicitModel),
+}  # fmt: skip
+COEFFICIENTS = {
+    "linear": "a", "state_affine": "coefficients", "block_cascade": "a1", "monotone": "a",
+    "implicit": "coefficients", "linear_states": "coefficients",
+}  # fmt: skip
+STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
+REASONS = {"rate": "the decrease of V", "delta": "inequality stable: not positive"}
+
+
+def claimed(name: str) -> str:
+    """What the claim of a class quantifies."""
+    return "delta" if CLASSES[name][1] is ImplicitModel else "rate"
+
+
+def nlsid(*arguments: object) -> Any:
+    return CliRunner().invoke(app, [str(a) for a in arguments], env={"COLUMNS": "200"})
+
+
+def quiet(_what: str, _fraction: float) -> None:
+    return None
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_saturating_bags(tmp_path_factory.mktemp("bags"))
+
+
+@pytest.fixture(scope="module")
+def coupled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_coupled_bags(tmp_path_factory.mktemp("coupled"))
+
+
+def bags_in(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+def one_digit_changed(text: str, after: str) -> str:
+    """The document with one digit of the first number after a key changed."""
+    start = text.index(f'"{after}"') + len(after) + 2
+    digit = re.compile(r"\d\.?(\d)").search(text, start)
+    assert digit is not None
+    place = digit.start(1)
+    return text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :]
+
+
+@pytest.fixture(scope="module", params=CLASSES)
+def made(
+    request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, Path, str]:
+    """A class's name, the folder that `nlsid identify` wrote, and what it said."""
+    out = tmp_path_factory.mktemp(request.param)
+    config = write_config(out / "robot.yaml", CLASSES[request.param][0])
+    done = nlsid("identify", folder, "--config", config, "--out", out)
+    assert done.exit_code == 0, done.output
+    return request.param, out, done.output
+
+
+def test_each_class_is_identified_to_files_that_check_proves(made: tuple[str, Path, str]) -> None:
+    name, out, said = made
+    document = files.load_document(out / documents.MODEL)
+    CLASSES[name][1].from_document(document)
+    assert "steps ahead: 1:" in said
+    checked = nlsid("check", out / documents.MODEL_PROOF)
+    assert checked.exit_code == 0
+    stated = "the implicit model" if CLASSES[name][1] is ImplicitModel else "incremental stability"
+    assert checked.output.startswith(f"PROVED {stated}")
+    page = (out / documents.REPORT).read_text()
+    assert "decided exactly" in page
+    assert "simulation residual is" in page
+
+
+def test_a_digit_of_a_coefficient_undoes_the_proof(
+    made: tuple[str, Path, str], tmp_path: Path
+) -> None:
+    name, out, _ = made
+    shutil.copy(out / documents.MODEL_PROOF, tmp_path)
+    genuine = (out / documents.MODEL).read_text()
+    forged = one_digit_changed(genuine, COEFFICIENTS[name])
+    assert forged != genuine
+    (tmp_path / documents.MODEL).write_text(forged)
+    refused = nlsid("check", tmp_path / documents.MODEL_PROOF)
+    assert refused.exit_code == 1
+    assert refused.output.startswith("REJECTED")
+
+
+def test_a_stronger_claim_needs_another_proof(made: tuple[str, Path, str], tmp_path: Path) -> None:
+    name, out, _ = made
+    shutil.copy(out / documents.MODEL, tmp_path)
+    document = json.loads((out / documents.MODEL_PROOF).read_text())
+    document["claim"][claimed(name)] *= STRONGER[claimed(name)]
+    path = tmp_path / documents.MODEL_PROOF
+    path.write_text(json.dumps(document))
+    refused = nlsid("check", path)
+    assert refused.exit_code == 1
+    assert REASONS[claimed(name)] in refused.output
+
+
+def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
+    folder: Path, tmp_path: Path
+) -> None:
+    affine = {"model": "state_affine", "lags": 1, "right_degree": 2, "iterations": 3}
+    monotone = {"model": "monotone", "lags": 2, "delays": [0, 1]}
+    compare = [{"lags": 3}, CASCADE, affine, monotone]
+    config = write_config(tmp_path / "robot.yaml", {"lags": 3}, compare=compare)
+    compared = compare_bags(bags_in(folder), load_config(config), progress=quiet)
+    best = min(compared.rows, key=lambda row: row.scores.simulation_percent)
+    assert best.label.startswith("block cascade")
+    assert compared.skipped_at_start == 60
+    assert len({row.scores.samples for row in compared.rows}) == 1, "all on the same samples"
+    methods = {row.candidate.method.name for row in compared.rows}
+    assert methods == set(METHODS), "every method the library has"
+    compared.draw(tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_what_cannot_be_compared_is_named_and_the_rest_is(folder: Path, tmp_path: Path) -> None:
+    alone = [bag for bag in bags_in(folder) if bag.name not in ("run_1", "run_3")]
+    compare = [{"model": "monotone", "lags": 2}, {"lags": 90}]
+    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 2}, compare=compare))
+    compared = compare_bags(alone, config, progress=quiet)
+    assert len(compared.rows) == 3
+    assert "share a `group`" in compared.refusals[0]
+    impossible = config.model_copy(update={"compare": config.identification.each({"lags": [100]})})
+    with pytest.raises(Infeasible, match="no class has a model"):
+        compare_bags([alone[0], *alone[-2:]], impossible, progress=quiet)
+
+
+def test_select_takes_the_order_with_the_least_validation_error(
+    folder: Path, tmp_path: Path
+) -> None:
+    orders = [[1, 1], [2, 1], [0, 2]]
+    config = write_config(tmp_path / "robot.yaml", CASCADE, select={"orders": orders})
+    made = nlsid("select", folder, "--config", config, "--out", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    model = BlockCascade.from_document(files.load_document(tmp_path / "out" / documents.MODEL))
+    assert (len(model.a1), len(model.a2)) == (2, 1)
+    assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0
+    assert (tmp_path / "out" / documents.SELECTION_PLOT).read_bytes()[:4] == b"\x89PNG"
+    assert "chosen by the validation error" in made.output
+
+
+def test_select_tries_every_combination_and_shows_what_has_no_model(
+    folder: Path, tmp_path: Path
+) -> None:
+    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
+    options = {"lags": [1, 3, 100]}
+    few = [bag for bag in bags_in(folder) if bag.name in ("run_0", "run_4", "run_5")]
+    chosen = select_bags(few, config, tmp_path, options=options, progress=quiet)
+    one, three, hundred = chosen.selection.errors
+    assert three < one
+    assert hundred == np.inf
+    assert "rows for 202 parameters" in chosen.selection.tried[2].refusal
+    section = {"model": "state_affine", "lags": 1, "iterations": 3}
+    affine = load_config(write_config(tmp_path / "a.yaml", section))
+    both = select_bags(
+        few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=quiet
+    )
+    assert len(both.selection.tried) == 4
+    assert both.selection.fit.errors["validation"][both.selection.fit.method.name] == min(
+        both.selection.errors
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"orders": [1]}, "select.orders: a linear model has no such option; there are: lags"),
+        ({"method": ["rse"]}, "select.method"),
+        ({"lags": [2, 0]}, r"select.lags: should be a whole number from 1 to 100 \(found 0\)"),
+        ({}, "nothing to select from"),
+    ],
+)
+def test_a_selection_that_makes_no_sense_says_why(
+    folder: Path, tmp_path: Path, options: dict[str, list[object]], reason: str
+) -> None:
+    config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
+    with pytest.raises(DataError, match=reason):
+        select_bags(bags_in(folder), config, tmp_path / "out", options=options, progress=quiet)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_selection_and_a_cascade_need_validation_bags(folder: Path, tmp_path: Path) -> None:
+    alone = {"test": ["run_5"]}
+    for section, command in (({"lags": 1}, "select"), (CASCADE, "identify")):
+        config = write_config(tmp_path / "c.yaml", section, split=alone, select={"lags": [1]})
+        if command == "identify":
+            config = write_config(tmp_path / "c.yaml", section, split=alone)
+        made = nlsid(command, folder, "--config", config, "--out", tmp_path / "out")
+        assert isinstance(made.exception, NlsidError)
+        assert "validation trials" in str(made.exception)
+
+
+# -- several inputs and outputs, gaps ----------------------------------------------------------
+
+
+def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
+    coupled: Path, tmp_path: Path
+) -> None:
+    section = {"model": "state_affine", "lags": 2, "right_degree": 2}
+    config = write_config(tmp_path / "c.yaml", section, outputs=2, inputs=2)
+    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    assert "simulation error of each output:" in made.output
+    checked = nlsid("check", tmp_path / "out" / documents.MODEL_PROOF)
+    assert checked.output.startswith("PROVED incremental stability")
+    model = StateAffineModel.from_document(files.load_document(tmp_path / "out" / documents.MODEL))
+    assert [signal.name for signal in model.y] == ["angle 0", "angle 1"]
+    page = (tmp_path / "out" / documents.REPORT).read_text()
+    assert page.count("<svg") == 4, "two outputs, residuals, the search"
+
+
+def test_several_inputs_of_one_output_are_proved(coupled: Path, tmp_path: Path) -> None:
+    section = {"model": "state_affine", "lags": 2, "input_range": [[-3.0, 3.0], [-2.5, 2.5]]}
+    config = write_config(tmp_path / "c.yaml", section, outputs=1, inputs=2)
+    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0
+    model = files.load_document(tmp_path / "out" / documents.MODEL)
+    assert model["u_range"] == [[-3.0, 3.0], [-2.5, 2.5]]
+
+
+def test_a_class_of_one_output_refuses_two_and_names_the_class_for_them(
+    coupled: Path, tmp_path: Path
+) -> None:
+    config = write_config(tmp_path / "c.yaml", {"lags": 2}, outputs=2, inputs=2)
+    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
+    assert "StateAffineClass is for several" in str(made.exception)
+
+
+def test_nan_and_missing_samples_are_skipped_with_a_count(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for k in range(3):
+        u = rng.uniform(-2.0, 2.0, 300)
+        y = saturating().simulate(u)
+        if k == 0:
+            y[100:110] = np.nan  # 0.25 s, longer than max_gap
+            y[200] = np.nan  # 0.05 s between neighbours: interpolated
+        speed_bag(tmp_path / "bags" / f"run_{k}", y, u)
+    sections: dict[str, Any] = {
+        "signals": {
+            "response": {"name": "speed", "path": SPEED},
+            "excitation": {"name": "command", "path": COMMAND},
+        },
+        "split": {"test": ["run_2"]},
+        "grid": {"period": 0.025, "max_gap": 0.1},
+    }
+    config, bags = tmp_path / "c.yaml", tmp_path / "bags"
+    write_config(config, {"lags": 2}, **sections)
+    refused = nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    assert "nan in message 100" in str(refused.exception)
+    sections["grid"]["split_gaps"] = True
+    write_config(config, {"lags": 2}, **sections)
+    made = nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    assert "10 samples skipped in gaps" in made.output
+    names = files.load_document(tmp_path / "out" / documents.MODEL)["bags"]
+    assert [bag["name"] for bag in names] == ["run_0.1", "run_0.2", "run_1"]
+
+
+def test_stretches_of_one_bag_are_not_repeats_of_each_other(tmp_path: Path) -> None:
+    speeds = np.random.default_rng(1).standard_normal(100)
+    speeds[40:60] = np.nan
+    bag = speed_bag(tmp_path / "run", speeds, np.arange(100.0), custom={"repeat_group": "a"})
+    data = read_dataset([bag], responses=[SPEED], excitations=[COMMAND], split_gaps=True)
+    assert [len(trial) for trial in data] == [40, 40]
+    assert not data.repeats()
+    assert skipped_samples(data) == 20
+    nothing = speed_bag(tmp_path / "none", np.full(9, np.nan), np.arange(9.0))
+    with pytest.raises(DataError, match=r"is nan in message 0 .*\(9 of 9"):
+        read_dataset([nothing], responses=[SPEED], excitations=[COMMAND], split_gaps=True)
+
+
+def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
+    trials = [Trajectory(t=np.arange(4.0), y=np.ones(4), u=np.ones(4), name=n)
+              for n in ("a.1", "a.2", "b", "c")]  # fmt: skip
+    found = split(Dataset(tuple(trials)), test=["a"], validation=["b"])
+    assert isinstance(found, Trials)
+    assert (found.test.names, found.train.names) == (("a.1", "a.2"), ("c",))
+    with pytest.raises(DataError, match="'b' is named for test and for validation"):
+        split(Dataset(tuple(trials)), test=["b"], validation=["b"])
+    with pytest.raises(DataError, match="none of the bags is a validation trial"):
+        split(Dataset(tuple(trials)), test=["a"], validation=["d"])
+    with pytest.raises(DataError, match="all of the bags are test or validation"):
+        split(Dataset(tuple(trials)), test=["a", "c"], validation=["b"])
+
+
+# -- models without a proof ---------------------------------------------------------------------
+
+
+def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
+    coupled: Path, tmp_path: Path
+) -> None:
+    unproved = {"model": "monotone", "lags": 2, "method": "least_squares"}
+    config = write_config(tmp_path / "c.yaml", {"lags": 2})
+    assert nlsid("identify", coupled, "--config", config, "--out", tmp_path).exit_code == 0
+    assert (tmp_path / documents.MODEL_PROOF).exists()
+    config = write_config(tmp_path / "c.yaml", unproved)
+    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path)
+    assert isinstance(made.exception, Infeasible)
+    assert (tmp_path / documents.MODEL_PROOF).exists(), "nothing was written"
+    config = write_config(tmp_path / "c.yaml", unproved | {"allow_unproved": True})
+    made = nlsid("identify", coupled, "--config", config, "--out", tmp_path)
+    assert made.exit_code == 0, made.output
+    assert "NOT PROVED stable" in made.output
+    assert not (tmp_path / documents.MODEL_PROOF).exists()
+    assert "Not proved stable" in (tmp_path / documents.REPORT).read_text()
+
+
+# -- the documentation -------------------------------------------------------------------------
+
+
+def examples() -> list[dict[str, Any]]:
+    blocks = re.findall(r"```yaml\n(.*?)```", HOWTO.read_text(), re.DOTALL)
+    return [content for block in blocks if "identification" in (content := yaml.safe_load(block))]
+
+
+@pytest.mark.parametrize("example", examples(), ids=lambda e: "-".join(e) + str(len(str(e))))
+def test_every_example_of_the_how_to_runs(
+    example: dict[str, Any], folder: Path, tmp_path: Path
+) -> None:
+    content = dict(example)
+    config = write_config(tmp_path / "robot.yaml", content.pop("identification"), **content)
+    command = next((c for c in ("select", "compare") if c in content), "identify")
+    made = nlsid(command, folder, "--config", config, "--out", tmp_path / "out")
+    assert made.exit_code == 0, made.output
+    if command == "compare":
+        assert (tmp_path / "out" / documents.COMPARISON_PLOT).read_bytes()[:4] == b"\x89PNG"
+    else:
+        assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0
+
+
+def test_the_how_to_has_an_example_of_every_class() -> None:
+    models = {e["identification"].get("model", "linear") for e in examples()}
+    assert models == set(CLASSES)

@@ -1,0 +1,121 @@
+"""Samples live: those of the grid whatever the order of topics, and nothing lost silently."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import decode
+from bags.samples import f1tenth
+from bags.signals.grid import read_dataset, seconds
+from bags.signals.sampling import Sample, Sampler
+from tests.bag_messages import COMMAND, SPEED
+
+
+@pytest.mark.parametrize("bag", [f1tenth()[k] for k in (4, 10, 37)], ids=lambda bag: bag.name)
+def test_a_bag_in_log_order_gives_exactly_the_samples_of_the_grid(bag: Path) -> None:
+    pairing = Sampler([SPEED], [COMMAND], period=0.025)
+    samples: list[Sample] = []
+    with Bag(bag) as source:
+        for topic in pairing.topics:
+            pairing.check(topic, *source.types_on(topic))
+        for message in source.messages(pairing.topics):
+            decoded = decode(message.data, *source.types_on(message.topic))
+            stamp_ns = pairing.stamp(message.data, message.log_time_ns)
+            samples += pairing.message(message.topic, stamp_ns, decoded)
+    assert len(samples) == 120  # the last response waits for a command that never comes
+    samples += pairing.flush()
+    [expected] = read_dataset([bag], responses=[SPEED], excitations=[COMMAND])
+    origin = samples[0].stamp_ns
+    assert [seconds(s.stamp_ns, origin) for s in samples] == expected.t.tolist()
+    assert [list(s.y) for s in samples] == expected.y.tolist()
+    assert [list(s.u) for s in samples] == expected.u.tolist()
+
+
+def sampler() -> Sampler:
+    """Of one response and one command, in ns."""
+    return Sampler(["/y:data"], ["/u:data"], period=1e-8)
+
+
+def sample(stamp_ns: int, y: float, u: float) -> Sample:
+    return Sample(stamp_ns, (y,), (u,))
+
+
+def test_a_response_waits_for_an_excitation_at_or_after_its_stamp() -> None:
+    pairing = sampler()
+    assert pairing.excite(5, (0.5,)) == []
+    assert pairing.respond(10, (1.0,)) == []
+    assert pairing.excite(9, (0.9,)) == [], "a command at 10 may still come"
+    assert pairing.excite(12, (1.2,)) == [sample(10, 1.0, 0.9)]
+    assert pairing.respond(12, (2.0,)) == [sample(12, 2.0, 1.2)]
+    assert pairing.respond(13, (3.0,)) == []
+    assert pairing.flush(13) == [sample(13, 3.0, 1.2)]
+
+
+def test_responses_before_the_first_command_are_counted_and_no_samples() -> None:
+    pairing = sampler()
+    pairing.respond(10, (1.0,))
+    pairing.respond(20, (2.0,))
+    assert pairing.flush(19) == []
+    assert pairing.incomplete == 1
+    assert pairing.excite(20, (0.5,)) == [sample(20, 2.0, 0.5)]
+
+
+def test_responses_that_wait_are_released_in_order_of_stamps() -> None:
+    pairing = sampler()
+    pairing.excite(5, (0.0,))
+    for stamp in (30, 10, 20):
+        assert pairing.respond(stamp, (float(stamp),)) == []
+    assert [s.stamp_ns for s in pairing.excite(30, (0.0,))] == [10, 20, 30]
+    assert (pairing.late_responses, pairing.duplicate_responses) == (0, 0)
+
+
+def test_what_cannot_be_released_is_counted() -> None:
+    pairing = sampler()
+    pairing.respond(10, (1.0,))
+    assert pairing.respond(10, (1.5,)) == []
+    assert pairing.duplicate_responses == 1
+    assert pairing.excite(10, (0.0,)) == [sample(10, 1.0, 0.0)]
+    assert pairing.respond(10, (1.0,)) == []
+    assert pairing.duplicate_responses == 2
+    assert pairing.respond(9, (0.9,)) == []
+    assert pairing.late_responses == 1
+
+
+def test_an_excitation_that_comes_too_late_is_counted_and_still_holds_afterwards() -> None:
+    pairing = sampler()
+    pairing.excite(0, (0.0,))
+    pairing.respond(10, (1.0,))
+    assert pairing.flush(10) == [sample(10, 1.0, 0.0)]
+    assert pairing.excite(8, (0.8,)) == []
+    assert pairing.late == 1
+    pairing.respond(11, (1.1,))
+    assert pairing.flush(11) == [sample(11, 1.1, 0.8)]
+
+
+@given(st.data())
+def test_any_interleaving_of_ordered_topics_gives_the_zero_order_hold(data: st.DataObject) -> None:
+    stamps = st.lists(st.integers(0, 50), min_size=1, max_size=30)
+    responses = sorted(set(data.draw(stamps)))
+    commands = sorted(data.draw(stamps))
+    order = data.draw(st.permutations(["y"] * len(responses) + ["u"] * len(commands)))
+    pairing, samples = sampler(), []
+    left_y, left_u = list(responses), list(enumerate(commands))
+    for kind in order:
+        if kind == "y":
+            samples += pairing.respond(stamp := left_y.pop(0), (float(stamp),))
+        else:
+            number, stamp = left_u.pop(0)
+            samples += pairing.excite(stamp, (float(number),))
+    samples += pairing.flush()
+    held = np.searchsorted(commands, responses, side="right") - 1
+    complete = [stamp for stamp, k in zip(responses, held, strict=True) if k >= 0]
+    assert [s.stamp_ns for s in samples] == complete
+    assert pairing.incomplete == len(responses) - len(complete)
+    if pairing.late == 0:
+        assert [s.u[0] for s in samples] == [float(k) for k in held if k >= 0]
+    else:  # only a repeated command stamp can come after it has been used
+        assert len(set(commands)) < len(commands)

@@ -1,0 +1,357 @@
+"""What a sample is: by brute force, in any order of arrival, from messages as from arrays."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bags.designs.design import WiredDesign
+from bags.monitoring.replay import replay_messages
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import decode, standard_types
+from bags.recordings.writer import BagWriter
+from bags.signals.expressions import Expression
+from bags.signals.grid import read_dataset
+from bags.signals.reader import read_signals
+from bags.signals.sampling import Sample, Sampler, sampled_path
+from bags.tools.listing import bag_signals
+from nlsid_core.design import design_tube
+from nlsid_core.errors import BagError
+from nlsid_core.identification import LinearClass, identify
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
+from tests.bag_messages import (
+    CMD,
+    COMMAND,
+    ODOM,
+    ODOM_TYPE,
+    SPEED,
+    START_NS,
+    command,
+    header,
+    odometry,
+    serialised,
+    twist,
+)
+
+MS = 1_000_000
+Y, Z, U = "/y:data", "/z:data", "/u:data"
+
+Series = list[tuple[int, float]]
+
+
+def series(rng: np.random.Generator, period: float, count: int) -> Series:
+    """Jittered stamps in ns, with a gap now and then, and values that tell samples apart."""
+    steps = rng.uniform(0.7, 1.3, count) * np.where(rng.random(count) < 0.05, 5.0, 1.0)
+    stamps = np.cumsum(np.rint(steps * period * 1e9)).astype(np.int64) + rng.integers(10 * MS)
+    return list(zip(stamps.tolist(), rng.standard_normal(count).tolist(), strict=True))
+
+
+def brute(signal: str, values: Series, at: int) -> float:
+    """The value of a signal in a sample at `at`, from the words of the rule."""
+    rule = Expression.parse(signal).operation("hold", "linear")
+    before = [(stamp, value) for stamp, value in values if stamp <= at]
+    after = [(stamp, value) for stamp, value in values if stamp > at]
+    if not before:
+        return math.nan
+    if rule is None or rule.name == "hold":
+        limit = math.inf if rule is None else round(rule.window * 1e9)
+        return before[-1][1] if at - before[-1][0] <= limit else math.nan
+    (t0, v0) = before[-1]
+    if t0 == at:
+        return v0
+    if not after or after[0][0] - t0 > round(rule.window * 1e9):
+        return math.nan
+    return v0 + (after[0][1] - v0) * ((at - t0) / (after[0][0] - t0))
+
+
+def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Sample]:
+    given = [sample for k, stamp, value in events for sample in sampler.feed(k, stamp, value)]
+    return given + sampler.flush()
+
+
+def interleaved(
+    rng: np.random.Generator, columns: Sequence[Series]
+) -> list[tuple[int, int, float]]:
+    """Every signal in its order, the signals in any order among each other."""
+    which = rng.permutation([k for k, column in enumerate(columns) for _ in column])
+    left = [iter(column) for column in columns]
+    return [(int(k), *next(left[k])) for k in which]
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "hold", "linear"]))
+def test_samples_are_what_the_rule_says_in_any_order_of_arrival(seed: int, rule: str) -> None:
+    rng = np.random.default_rng(seed)
+    end = "" if rule == "none" else f"|{rule}(0.03 s)"
+    signals = ([Y + end] if rule == "none" else [Y + end, Z + end], [f"{U}|hold(0.03 s)"])
+    columns = [series(rng, 0.01, 60) for _ in range(sum(map(len, signals)))]
+    sampler = Sampler(*signals, period=0.01)
+    given = fed(sampler, interleaved(rng, columns))
+    texts = [*signals[0], *signals[1]]
+    if rule == "none":
+        times = [stamp for stamp, _ in columns[0]]
+    else:
+        first = max(column[0][0] for column in columns)
+        times = list(range(first, min(c[-1][0] for c in columns[:-1]) + 1, 10 * MS))
+    truth = [
+        (at, [brute(text, c, at) for text, c in zip(texts, columns, strict=True)]) for at in times
+    ]
+    while truth and not np.isfinite(truth[0][1]).all():
+        del truth[0]
+    assert [sample.stamp_ns for sample in given] == [at for at, _ in truth]
+    for sample, (_, values) in zip(given, truth, strict=True):
+        assert np.array_equal([*sample.y, *sample.u], values, equal_nan=True)
+        assert bool(sample.missing) is not bool(np.isfinite(values).all())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = np.array([stamp for stamp, _ in series(rng, 0.01, 300)])
+    angles = np.angle(np.exp(1j * np.cumsum(rng.uniform(-1, 1, 300))))
+    for text in (
+        "",
+        "|to(deg)",
+        "|unwrap",
+        "|unwrap|derivative(0.1 s)",
+        "|derivative(0.07 s)|to(rpm)",
+    ):
+        expression = Expression.parse(f"/odom:a.yaw{text}")
+        whole = expression.apply(angles, stamps, "rad")
+        running = expression.running("rad")
+        single = [
+            running.update(stamp, value)
+            for stamp, value in zip(stamps.tolist(), angles.tolist(), strict=True)
+        ]
+        assert np.array_equal(whole, single, equal_nan=True)
+
+
+def test_an_unwrapped_angle_is_the_angle_without_jumps() -> None:
+    truth = np.linspace(0.0, -40.0, 500)
+    wrapped = np.angle(np.exp(1j * truth))
+    found = Expression.parse("/odom:a.yaw|unwrap").apply(wrapped, np.arange(500), "rad")
+    np.testing.assert_allclose(found, truth, atol=1e-12)
+
+
+def drive(path: Path, *, stamped: bool = True, count: int = 200) -> Path:
+    """A turning robot: pose on /odom, a command on /cmd_vel from the 10th message on."""
+    rng = np.random.default_rng(5)
+    types = standard_types()
+    plain = "geometry_msgs/msg/Twist"
+    with BagWriter(path) as bag:
+        for k in range(count):
+            stamp = START_NS + k * 25 * MS + int(rng.integers(0, 3 * MS))
+            log = stamp + int(rng.integers(1 * MS, 4 * MS))
+            message: Any = types.deserialize_cdr(odometry(stamp, 0.1 * k), ODOM_TYPE)
+            half = 0.5 * 4.0 * k * 0.025
+            message.pose.pose.orientation.z = math.sin(half)
+            message.pose.pose.orientation.w = math.cos(half)
+            data = serialised(ODOM_TYPE, message)
+            bag.write(ODOM, ODOM_TYPE, data, log_time_ns=log, publish_time_ns=stamp)
+            if k < 10:
+                continue
+            kind = "geometry_msgs/msg/TwistStamped" if stamped else plain
+            value = float(rng.standard_normal())
+            data = command(stamp - MS, value) if stamped else serialised(plain, twist(value))
+            bag.write(CMD, kind, data, log_time_ns=log - MS, publish_time_ns=stamp)
+    return path
+
+
+@pytest.mark.parametrize("resample", ["none", "last", "linear"])
+@pytest.mark.parametrize("clock", ["header", "log"])
+@pytest.mark.parametrize("turn", ["", "|unwrap|derivative(0.2 s)"])
+def test_messages_give_the_same_bits_as_identification_reads(
+    tmp_path: Path, resample: str, clock: str, turn: str
+) -> None:
+    bag = drive(tmp_path / "drive")
+    yaw = f"{ODOM}:pose.pose.orientation.yaw{turn or '|unwrap'}"
+    [trial] = read_dataset(
+        [bag],
+        responses=[yaw, SPEED],
+        excitations=[COMMAND],
+        period=0.05 if resample != "none" else 0.025,
+        max_gap=0.1,
+        clock=clock,
+        resample=resample,
+        hold=0.2,
+    )
+    sampler = Sampler(trial.y_paths, trial.u_paths, period=trial.period)
+    given: list[Sample] = []
+    with Bag(bag) as source:
+        for topic in sampler.topics:
+            sampler.check(topic, *source.types_on(topic))
+        for message in source.messages(sampler.topics):
+            decoded = decode(message.data, *source.types_on(message.topic))
+            stamp = sampler.stamp(message.data, message.log_time_ns)
+            given += sampler.message(message.topic, stamp, decoded)
+    given += sampler.flush()
+    given = [sample for sample in given if not sample.missing]
+    assert trial.y.tolist() == [list(sample.y) for sample in given]
+    assert trial.u.tolist() == [list(sample.u) for sample in given]
+    assert len(given) > 80
+    if turn:
+        assert np.abs(trial.y[:, 0] - 4.0).max() < 0.5  # rad/s, by stamps with 3 ms of jitter
+
+
+def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_path: Path) -> None:
+    bag = drive(tmp_path / "drive", stamped=False)
+    signals = {"responses": [SPEED], "excitations": [f"{CMD}:linear.x"]}
+    with pytest.raises(BagError) as caught:
+        read_dataset([bag], **signals, max_gap=0.1)  # type: ignore[arg-type]
+    for part in (
+        f"{SPEED} has a header stamp",
+        f"{CMD}:linear.x has a log time",
+        "set `clock: log`",
+    ):
+        assert part in str(caught.value)
+    [trial] = read_dataset([bag], **signals, period=0.025, max_gap=0.1, clock="log")  # type: ignore[arg-type]
+    assert trial.u_paths == (f"{CMD}:linear.x|clock(log)",)
+    assert len(trial) == 190
+    with pytest.raises(BagError, match=r"/cmd_vel .* has no header stamp; .*`clock: log`"):
+        Sampler([SPEED], [f"{CMD}:linear.x"], period=0.025).check(
+            CMD, "geometry_msgs/msg/Twist", standard_types()
+        )
+
+
+def turning_robot(path: Path, seed: int) -> Path:
+    """Turns as the unstamped commands say, with a lag; its heading is measured, its rate is not."""
+    rng = np.random.default_rng(seed)
+    types = standard_types()
+    heading, rate, wanted = 0.0, 0.0, 0.0
+    with BagWriter(path) as bag:
+        for k in range(400):
+            stamp = START_NS + k * 25 * MS
+            if k >= 6 and k % 4 == 2:  # commands at 10 Hz, the first after a few responses
+                wanted = float(rng.uniform(-1.0, 1.0)) if k % 40 == 2 else wanted
+                data = serialised("geometry_msgs/msg/Twist", twist(wanted))
+                log = stamp + 2 * MS
+                bag.write(
+                    CMD, "geometry_msgs/msg/Twist", data, log_time_ns=log, publish_time_ns=log
+                )
+            rate += 0.2 * (wanted - rate)
+            heading += 0.025 * rate
+            message: Any = types.deserialize_cdr(odometry(stamp, 0.0), ODOM_TYPE)
+            message.pose.pose.orientation.z = math.sin(heading / 2)
+            message.pose.pose.orientation.w = math.cos(heading / 2)
+            data = serialised(ODOM_TYPE, message)
+            bag.write(ODOM, ODOM_TYPE, data, log_time_ns=stamp, publish_time_ns=stamp)
+    return path
+
+
+def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
+    tmp_path: Path,
+) -> None:
+    """The whole way, on the numbers that identification read."""
+    bags = [turning_robot(tmp_path / f"run_{k}", k) for k in range(3)]
+    data = read_dataset(
+        bags,
+        responses=[f"{ODOM}:pose.pose.orientation.yaw|unwrap|derivative(0.1 s)"],
+        excitations=[f"{CMD}:linear.x"],
+        period=0.025,
+        max_gap=0.04,
+        hold=0.15,
+        clock="log",
+    )
+    fit = identify(data, LinearClass(4))
+    model = replace(fit.model, training="sha256:0")
+    made = design_tube(model, data, profile=[(0.0, 0.0), (10.0, 0.5)], horizon=9.7, inlet=0.1)
+    design = WiredDesign(made.model, made.policy, made.funnel)
+    said = replay_messages(design, bags[0], centre=Centre.COMMAND)
+    trial = data.trajectories[0]
+    assert [list(entry.reading.measured) for entry in said] == trial.y.tolist()
+    assert {entry.reading.status for entry in said[4:388]} == {Status.INSIDE}
+
+
+def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
+    types = standard_types().types
+    kind = "tf2_msgs/msg/TFMessage"
+    with BagWriter(tmp_path / "tf") as bag:
+        for k in range(60):
+            stamp = START_NS + k * 10 * MS
+            names = ("camera",) if k % 3 == 2 else ("odom", "base")
+            transforms = [
+                types["geometry_msgs/msg/TransformStamped"](
+                    header(stamp),
+                    name,
+                    types["geometry_msgs/msg/Transform"](
+                        types["geometry_msgs/msg/Vector3"](0.1 * k, 0.0, float(len(name))),
+                        types["geometry_msgs/msg/Quaternion"](
+                            0.0, 0.0, math.sin(0.01 * k), math.cos(0.01 * k)
+                        ),
+                    ),
+                )
+                for name in names
+            ]
+            data = serialised(kind, types[kind](transforms))
+            bag.write("/tf", kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    base = "/tf:transforms[child_frame_id=base].transform"
+    signals = [f"{base}.translation.x", f"{base}.rotation.yaw", f"{base}.translation.z"]
+    read = read_signals(tmp_path / "tf", signals)
+    rows = [k for k in range(60) if k % 3 != 2]
+    assert read[signals[0]].values.tolist() == [0.1 * k for k in rows]
+    np.testing.assert_allclose(read[signals[1]].values, [0.02 * k for k in rows], atol=1e-15)
+    assert read[signals[1]].stamp_ns.tolist() == [START_NS + k * 10 * MS for k in rows]
+    with Bag(tmp_path / "tf") as source:
+        listed = {entry.signal: entry for entry in bag_signals(source)}
+        assert (listed[signals[2]].low, listed[signals[2]].high) == (4.0, 4.0)
+        camera = "/tf:transforms[child_frame_id=camera].transform.rotation.yaw"
+        assert listed[camera].unit == "rad"
+        assert listed[camera].low == pytest.approx(0.04)
+        sampler = Sampler([f"{signals[1]}|clock(log)"], [f"{signals[0]}|clock(log)"], period=0.01)
+        sampler.check("/tf", *source.types_on("/tf"))
+        given = [
+            sample
+            for message in source.messages(["/tf"])
+            for sample in sampler.message(
+                "/tf",
+                sampler.stamp(message.data, message.log_time_ns),
+                decode(message.data, *source.types_on("/tf")),
+            )
+        ]
+    assert [sample.y[0] for sample in given] == read[signals[1]].values.tolist()
+    with pytest.raises(BagError, match="'frame' on 'tf2_msgs/msg/TFMessage' is not an array of"):
+        read_signals(tmp_path / "tf", ["/tf:transforms[frame=base].transform.translation.x"])
+    with pytest.raises(BagError, match=r"is nan in message 0 .*not finite"):
+        read_signals(tmp_path / "tf", [signals[0].replace("base", "wheel")])
+
+
+def test_signals_on_two_clocks_or_of_two_rules_are_refused() -> None:
+    with pytest.raises(BagError, match="two clocks cannot be paired: /y:data by its header time"):
+        Sampler([Y], [f"{U}|clock(log)"], period=0.1)
+    with pytest.raises(BagError, match=r"/z:data is sampled as it comes, /y:data.* on a grid"):
+        Sampler([f"{Y}|linear(1 s)", Z], [U], period=0.1)
+    for text in (f"{U}|hold(1 s)|linear(1 s)", f"{U}|clock(log)|clock(log)", f"{U}|clock(sun)"):
+        with pytest.raises(BagError):
+            Expression.parse(text)
+
+
+def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:
+    sampler = Sampler([Y], [f"{U}|hold(0.1 s)"], period=0.05)
+    sampler.feed(1, 0, 1.0)
+    assert sampler.feed(0, 50 * MS, 2.0) == []
+    assert sampler.flush(60 * MS) == [Sample(50 * MS, (2.0,), (1.0,))]
+    [late] = [*sampler.feed(0, 200 * MS, 3.0), *sampler.flush(200 * MS)]
+    assert late.missing == f"{U}|hold(0.1 s): nothing for 0.2 s; at most 0.1 s is held"
+    assert math.isnan(late.u[0])
+    sampler.feed(1, 150 * MS, 5.0)
+    assert sampler.late == 1
+    sampler.feed(0, 100 * MS, 5.0)
+    sampler.feed(0, 200 * MS, 5.0)
+    assert (sampler.late_responses, sampler.duplicate_responses) == (1, 1)
+
+
+def test_a_configuration_is_written_into_the_paths_unless_they_say_otherwise() -> None:
+    options: dict[str, Any] = {"clock": "log", "resample": "last", "hold": 0.5, "max_gap": 0.1}
+    assert sampled_path(Y, **options, response=True) == f"{Y}|clock(log)|hold(0.1 s)"
+    assert sampled_path(U, **options, response=False) == f"{U}|clock(log)|hold(0.5 s)"
+    own = f"{Y}|linear(0.3 s)|clock(header)"
+    assert sampled_path(own, **options, response=True) == own
+    assert sampled_path(f"{Y}|to( deg )", response=True) == f"{Y}|to( deg )"

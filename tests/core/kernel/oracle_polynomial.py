@@ -1,0 +1,401 @@
+"""An oracle of the polynomial claims, written from docs/certificate*.md alone, in Fractions.
+
+It shares no code with the kernel or with a prover: polynomials are dictionaries from exponents to
+Fractions, nothing is packed, rounded or scaled to integers. `left_over` decides the obligation
+`positive`; `agrees` decides a whole proof document.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from fractions import Fraction
+from math import comb
+from typing import Any
+
+Key = tuple[int, ...]
+
+
+class P:
+    """A polynomial in n variables."""
+
+    def __init__(self, n: int, terms: Mapping[Key, Fraction | int] | None = None) -> None:
+        self.n = n
+        self.terms = {k: Fraction(v) for k, v in (terms or {}).items() if v}
+
+    @classmethod
+    def constant(cls, n: int, value: Fraction | int) -> "P":
+        return cls(n, {(0,) * n: Fraction(value)})
+
+    @classmethod
+    def variable(cls, n: int, i: int) -> "P":
+        return cls(n, {tuple(int(j == i) for j in range(n)): 1})
+
+    def __add__(self, other: "P") -> "P":
+        total = dict(self.terms)
+        for k, v in other.terms.items():
+            total[k] = total.get(k, Fraction(0)) + v
+        return P(self.n, total)
+
+    def __sub__(self, other: "P") -> "P":
+        return self + other * Fraction(-1)
+
+    def __mul__(self, other: "P | Fraction | int") -> "P":
+        if not isinstance(other, P):
+            return P(self.n, {k: v * other for k, v in self.terms.items()})
+        total: dict[Key, Fraction] = {}
+        for a, x in self.terms.items():
+            for b, y in other.terms.items():
+                k = tuple(i + j for i, j in zip(a, b, strict=True))
+                total[k] = total.get(k, Fraction(0)) + x * y
+        return P(self.n, total)
+
+    def __call__(self, point: Sequence[Fraction]) -> Fraction:
+        total = Fraction(0)
+        for k, v in self.terms.items():
+            for x, power in zip(point, k, strict=True):
+                v *= x**power
+            total += v
+        return total
+
+
+def number(value: Any) -> Fraction:
+    """A JSON number, or a text p/q."""
+    return Fraction(value)
+
+
+def stated(document: Any) -> list[tuple[Key, Fraction]]:
+    """The terms of a polynomial of a file."""
+    rows = zip(document["exponents"], document["coefficients"], strict=True)
+    return [(tuple(e), number(c)) for e, c in rows]
+
+
+def put(terms: Sequence[tuple[Key, Fraction]], values: Sequence[P]) -> P:
+    """With a polynomial in the place of each variable."""
+    n = values[0].n
+    total = P(n)
+    for exponents, c in terms:
+        product = P.constant(n, c)
+        for value, power in zip(values, exponents, strict=True):
+            for _ in range(power):
+                product = product * value
+        total = total + product
+    return total
+
+
+def slope(terms: Sequence[tuple[Key, Fraction]], j: int) -> list[tuple[Key, Fraction]]:
+    """The derivative in variable j."""
+    return [(tuple(e - (i == j) for i, e in enumerate(k)), c * k[j]) for k, c in terms if k[j] > 0]
+
+
+def dot(a: Sequence[P], b: Sequence[P], n: int) -> P:
+    """a'b."""
+    total = P(n)
+    for x, y in zip(a, b, strict=True):
+        total = total + x * y
+    return total
+
+
+def squares(witness: Any, n: int) -> list[P]:
+    """Σ_i weights[i] (R_j[i] V v)² / (scale 4^unit), for each factor R_j."""
+    part = witness["squares"]
+    scale = Fraction(1) / (Fraction(4) ** part["unit"] * number(part.get("scale", 1)))
+    result = []
+    for factor in part["factors"]:
+        weights = part.get("weights", [1] * len(factor))
+        total = P(n)
+        for weight, row in zip(weights, factor, strict=True):
+            offset = len(witness["basis"]) - len(row)
+            line = P(n)
+            for k, entry in enumerate(row):
+                value = number(entry) * Fraction(2) ** witness["columns"][offset + k]
+                line = line + P(n, {tuple(witness["basis"][offset + k]): value})
+            total = total + line * line * number(weight)
+        result.append(total * scale)
+    return result
+
+
+def bernstein(c: Sequence[P], degree: int) -> list[P]:
+    """Σ_k c[k] s^k as control points of Bernstein degree `degree`."""
+    return [
+        sum(
+            (c[i] * Fraction(comb(k, i), comb(degree, i)) for i in range(min(k, len(c) - 1) + 1)),
+            P(c[0].n),
+        )
+        for k in range(degree + 1)
+    ]
+
+
+def raised(points: Sequence[P], degree: int) -> list[P]:
+    """Bernstein control points written with a higher degree."""
+    J = len(points) - 1
+    return [
+        sum(
+            (
+                points[j] * Fraction(comb(J, j) * comb(degree - J, k - j), comb(degree, k))
+                for j in range(J + 1)
+                if 0 <= k - j <= degree - J
+            ),
+            P(points[0].n),
+        )
+        for k in range(degree + 1)
+    ]
+
+
+def left_over(c: Sequence[P], witness: Any) -> dict[Key, Fraction] | None:
+    """What every Bernstein coefficient of r leaves on the diagonal; None if it is not dominant.
+
+    c: coefficients of s^0, s^1, …. Source: docs/certificate.md, "positive".
+    """
+    n, basis = c[0].n, [tuple(row) for row in witness["basis"]]
+    of_squares = squares(witness, n)
+    degree = max(len(c), len(of_squares)) - 1
+    rest = [a - b for a, b in zip(bernstein(c, degree), raised(of_squares, degree), strict=True)]
+    size = [Fraction(2) ** column for column in witness["columns"]]
+    least: dict[Key, Fraction] = {}
+    for r in rest:
+        diagonal = [Fraction(0)] * len(basis)
+        charges = [Fraction(0)] * len(basis)
+        for key, value in r.terms.items():
+            home = [i for i, b in enumerate(basis) if tuple(2 * e for e in b) == key]
+            if home:
+                diagonal[home[0]] += value / size[home[0]] ** 2
+                continue
+            pairs = [
+                (i, j)
+                for i, a in enumerate(basis)
+                for j, b in enumerate(basis)
+                if i < j and tuple(x + y for x, y in zip(a, b, strict=True)) == key
+            ]
+            if not pairs:
+                return None
+            i, j = max(pairs, key=lambda p: size[p[0]] * size[p[1]])  # the first of the largest
+            charge = abs(value) / (2 * size[i] * size[j])
+            charges[i] += charge
+            charges[j] += charge
+        for i, b in enumerate(basis):
+            room = diagonal[i] - charges[i]
+            if room < 0:
+                return None
+            room *= size[i] ** 2
+            least[b] = min(least.get(b, room), room)
+    return least
+
+
+def on_domain(c: P, domain: Sequence[P], witness: Any) -> dict[Key, Fraction] | None:
+    """`left_over` of c - Σ σ_k domain[k]."""
+    for multiplier in witness.get("multipliers", []):
+        c = c - squares(multiplier, c.n)[0] * domain[multiplier["of"]]
+    return left_over([c], witness)
+
+
+def bound_inequality(claim: Any, proof: Any) -> tuple[P, list[P]]:
+    """φ·(p - bound) - Σ μ h, and the domain. Source: docs/certificate_polynomials.md."""
+    x = len(claim["variables"])
+    n = x + len(claim.get("matrix", []))
+    v = [P.variable(n, i) for i in range(n)]
+    if "matrix" in claim:
+        c = P(n)
+        for i, row in enumerate(claim["matrix"]):
+            for j, entry in enumerate(row):
+                c = c + put(stated(entry), v[:x]) * v[x + i] * v[x + j]
+    else:
+        c = put(stated(claim["polynomial"]), v) - P.constant(n, number(claim["bound"]))
+    if "factor" in proof:
+        phi = P.constant(n, number(proof["factor"]["constant"])) + squares(proof["factor"], n)[0]
+        c = phi * c
+    for mu, h in zip(
+        proof.get("equality_multipliers", []), claim.get("equalities", []), strict=True
+    ):
+        c = c - put(stated(mu), v) * put(stated(h), v[:x])
+    return c, [put(stated(g), v[:x]) for g in claim.get("domain", [])]
+
+
+def attraction_inequalities(claim: Any, proof: Any) -> dict[str, P]:
+    """V, and -dV/dt - σ (level - V). Source: docs/certificate_polynomials.md."""
+    n = len(claim["variables"])
+    v = [P.variable(n, i) for i in range(n)]
+    V, decrease = put(stated(claim["V"]), v), P(n)
+    for j, f in enumerate(claim["field"]):
+        decrease = decrease - put(slope(stated(claim["V"]), j), v) * put(stated(f), v)
+    if "level" in claim:
+        sigma = squares(proof["multiplier"], n)[0]
+        decrease = decrease - sigma * (P.constant(n, number(claim["level"])) - V)
+    return {"V": V, "decrease": decrease}
+
+
+def stable_inequalities(claim: Any, proof: Any, model: Any) -> dict[str, tuple[P, list[P]]]:
+    """Each inequality and its domain. Source: docs/certificate_stable_set.md."""
+    nx, nw = len(model["states"]), len(model["inputs"])
+    nv = len(model["h"]["coefficients"][0])
+    n = 2 * nv + 2 * nx + nw + 2 * nx + 1
+    z = [P.variable(n, i) for i in range(n)]
+    v, x, w = z[:nv], z[nv : nv + nx], z[nv + nx : nv + nx + nw]
+    dv, dx, y = z[nv + nx + nw :][:nv], z[2 * nv + nx + nw :][:nx], z[2 * nv + 2 * nx + nw :]
+    vh, xh = (
+        [a - b for a, b in zip(v, dv, strict=True)],
+        [a - b for a, b in zip(x, dx, strict=True)],
+    )
+
+    def stack(name: str, count: int) -> list[list[tuple[Key, Fraction]]]:
+        part = model.get(name, {"exponents": [], "coefficients": []})
+        return [
+            [
+                (tuple(e), number(c[i]))
+                for e, c in zip(part["exponents"], part["coefficients"], strict=True)
+            ]
+            for i in range(count)
+        ]
+
+    def along(p: Any, at: list[P], direction: list[P]) -> P:
+        return dot([put(slope(p, j), at) for j in range(len(direction))], direction, n)
+
+    def inside(values: list[P], which: Sequence[int]) -> list[P]:
+        if "box" not in claim:
+            return []
+        ends = [[number(e) for e in claim["box"][i]] for i in which]
+        return [
+            (a - P.constant(n, low)) * (P.constant(n, high) - a)
+            for a, (low, high) in zip(values, ends, strict=True)
+        ]
+
+    h, shift, centre = stack("h", nv), stack("shift", nx - nv), stack("centre", nv)
+    known, here, m = [*x, *w], [*v, *x, *w], number(model["monotonicity"])
+    of_x, of_w = range(nx), range(nx, nx + nw)
+    domain = inside(known, [*of_x, *of_w])
+    yv, delta = y[:nv], number(claim.get("delta", 0))
+    H = [along(p, here, yv) for p in h]
+    found: dict[str, tuple[P, list[P]]] = {}
+    if "centre" in model:
+        E = [along(p, v, yv) for p in centre]
+        found["centred"] = (dot(E, H, n) * 2 - dot(E, E, n), domain)
+        linear = all(sum(e) <= 1 for p in centre for e, c in p if c)
+        bijective = (
+            dot(E, E, n) - dot(yv, yv, n) * m**2
+            if linear
+            else (dot(yv, E, n) - dot(yv, yv, n) * m) * 2
+        )
+        found["centre"] = (bijective, [])
+    else:
+        found["monotone"] = ((dot(yv, H, n) - dot(yv, yv, n) * m) * 2, domain)
+    kind = claim.get("set")
+    if kind is None:
+        return found
+    gap = dot(dx, dx, n)
+    next_box = inside(v, range(nv))
+    if kind == "2.10":
+        V = stated(proof["V"])
+        moved = [put(p, here) - put(p, [*vh, *xh, *w]) for p in h]
+        a, b = [put(p, known) for p in shift], [put(p, [*xh, *w]) for p in shift]
+        after = put(V, [*v, *a, *dv, *(p - q for p, q in zip(a, b, strict=True))])
+        c = dot(dv, moved, n) * 2 + put(V, [*x, *dx]) - after - gap * delta
+        found["stable"] = (c, domain + next_box + inside(xh, of_x) + inside(vh, range(nv)))
+        found["storage"] = (put(V, [*x, *dx]), inside(x, of_x) + inside(xh, of_x))
+        return found
+    if kind == "2.11":
+        M = [[stated(entry) for entry in row] for row in proof["M"]]
+
+        def form(at: list[P], d: list[P]) -> P:
+            return dot(d, [dot([put(e, at) for e in row], d, n) for row in M], n)
+
+        nu, d = y[:nv], y[nv : nv + nx]
+        x_after = [*v, *(put(p, known) for p in shift)]
+        d_after = [*nu, *(along(p, known, d) for p in shift)]
+        moved = [along(p, here, [*nu, *d]) for p in h]
+        c = dot(nu, moved, n) * 2 + form(x, d) - dot(d, d, n) * delta - form(x_after, d_after)
+        found["stable"] = (c, domain + next_box)
+        found["storage"] = (form(x, y[:nx]), [])
+        return found
+    e = [[(k[:nx], c) for k, c in p if any(k[:nx])] for p in h]
+    f = [[(k[nx:], -c) for k, c in p if not any(k[:nx])] for p in h]
+    P_ = [[number(entry) for entry in row] for row in proof.get("P", [])]
+
+    def energy(d: list[P]) -> P:
+        return dot(d, [sum((b * a for a, b in zip(row, d, strict=True)), P(n)) for row in P_], n)
+
+    if kind == "2.12":
+        y0, ys = y[0], y[1 : 1 + nx]
+        rise = [put(p, x) - put(p, xh) for p in e]
+        image = [put(p, known) - put(p, [*xh, *w]) for p in f]
+        corner = dot(dx, rise, n) * 2 - energy(dx) - gap * delta
+        c = corner * y0 * y0 + y0 * dot(ys, image, n) * 2 + energy(ys)
+        found["stable"] = (c, domain + inside(xh, of_x))
+        return found
+    d, ys = y[:nx], y[nx : 2 * nx]
+    risen = dot(d, [along(p, x, d) for p in e], n)
+    turned = dot(ys, [along(p, known, d) for p in f], n) * 2
+    lost = dot(d, d, n) * delta
+    if kind == "2.13":
+        c = risen * 2 - energy(d) - lost + turned + energy(ys)
+    else:
+        c = risen - lost + turned + dot(ys, [along(p, x, ys) for p in e], n)
+    found["stable"] = (c, domain)
+    return found
+
+
+def agrees(document: Any, files: Mapping[str, Any]) -> bool:
+    """True if every obligation of the proof holds, by this file's arithmetic."""
+    claim, proof = document["claim"], document["proof"]
+    documents = files
+    decide: Callable[[], bool] = {
+        "polynomial_bound": lambda: (
+            number(proof.get("factor", {"constant": 1})["constant"]) > 0
+            and on_domain(*bound_inequality(claim, proof), proof) is not None
+        ),
+        "region_of_attraction": lambda: _attraction_agrees(claim, proof),
+        "stable_set": lambda: (
+            _side_conditions(claim, proof, documents)
+            and all(
+                on_domain(c, domain, proof["inequalities"][name]) is not None
+                for name, (c, domain) in stable_inequalities(
+                    claim, proof, files[claim["about"]["model"]["file"]]
+                ).items()
+            )
+        ),
+    }[claim["kind"]]
+    return decide()
+
+
+def _side_conditions(claim: Any, proof: Any, files: Mapping[str, Any]) -> bool:
+    """δ and m positive, a box that is not empty, and a storage that is one."""
+    model = files[claim["about"]["model"]["file"]]
+    kind, n = claim.get("set"), len(model["states"])
+    if number(model["monotonicity"]) <= 0 or (kind and number(claim["delta"]) <= 0):
+        return False
+    if any(not low < high for low, high in claim.get("box", [])):
+        return False
+    if kind == "2.10":
+        return all(any(e[n:]) for e, c in stated(proof["V"]) if c)
+    if kind == "2.11":
+        M = [[dict(stated(entry)) for entry in row] for row in proof["M"]]
+        flat = all(not any(k) for row in M for entry in row for k, c in entry.items() if c)
+        symmetric = all(M[i][j] == M[j][i] for i in range(n) for j in range(n))
+        return symmetric and (flat or "box" not in claim)
+    if kind in ("2.12", "2.13"):
+        return definite([[number(entry) for entry in row] for row in proof["P"]])
+    return True
+
+
+def definite(M: list[list[Fraction]]) -> bool:
+    """Symmetric and positive definite, by rational elimination."""
+    size = len(M)
+    if any(M[i][j] != M[j][i] for i in range(size) for j in range(size)):
+        return False
+    rows = [row[:] for row in M]
+    for k in range(size):
+        if rows[k][k] <= 0:
+            return False
+        for i in range(k + 1, size):
+            share = rows[i][k] / rows[k][k]
+            rows[i] = [a - share * b for a, b in zip(rows[i], rows[k], strict=True)]
+    return True
+
+
+def _attraction_agrees(claim: Any, proof: Any) -> bool:
+    for name, c in attraction_inequalities(claim, proof).items():
+        left = left_over([c], proof[name])
+        if left is None or any(not any(k) for k in left):
+            return False
+        pure = [k for k, room in left.items() if room > 0 and sum(1 for e in k if e) == 1]
+        if {next(i for i, e in enumerate(k) if e) for k in pure} != set(range(c.n)):
+            return False
+    return all(not c or any(k) for f in claim["field"] for k, c in stated(f)) and (
+        "level" not in claim or number(claim["level"]) > 0
+    )

@@ -1,0 +1,188 @@
+"""Faults that a sceptic found by reading the kernel: each false claim, built from scratch."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nlsid_core import kernel
+from nlsid_core.kernel import Rejected, exact
+from nlsid_core.kernel.files import digest, label
+
+Json = dict[str, Any]
+SECONDS = 20.0
+SIGNAL = {"name": "speed", "unit": "m/s", "path": "/speed"}
+
+
+def decided(kind: str, documents: dict[str, Json], proof: Json, **claim: Any) -> kernel.Verdict:
+    """The verdict on documents, bound in the order in which they are given."""
+    contents: dict[str, bytes] = {}
+    about: Json = {}
+    digests: dict[str, str] = {}
+    for role, document in documents.items():
+        bound = {key: digests.get(key, entry) for key, entry in document.items()}
+        contents[role] = json.dumps(bound).encode()
+        digests[role] = digest(contents[role])
+        about[role] = {"file": role, "digest": digests[role]}
+    document = {"format": "nlsid/proof", "version": 2,
+                "claim": {"kind": kind, "about": about, **claim}, "proof": proof}  # fmt: skip
+    return kernel.decide(json.dumps(document).encode(), contents.__getitem__)
+
+
+def tube(name: str = "speed", unit: str = "m/s", n: int = 1, samples: int = 2) -> dict[str, Json]:
+    """x⁺ = x/2 + u from x = 0 with no room at all: level, inlet and budget are 0."""
+    low = 0.123456
+    unity = [[float(i == j) for j in range(n)] for i in range(n)]
+    model = {
+        "format": "nlsid/model", "version": 2, "kind": "difference_equation", "period": 0.1,
+        "training": "", "bags": [], "y": {"name": name, "unit": unit, "path": "/y"}, "u": SIGNAL,
+        "a": [0.5] + [0] * (n - 1), "b": [0, 1] + [0] * (n - 1), "c": 0, "u_range": [low, 1],
+    }  # fmt: skip
+    policy = {
+        "format": "nlsid/policy", "version": 2, "kind": "linear", "model": "", "period": 0.1,
+        "K": [[0.25] + [0] * (n - 1)], "L": [[0.25]] + [[0]] * (n - 1), "u": [[low]] * samples,
+        "x": [[0] * n, [low] + [0] * (n - 1)] + [[0] * n] * (samples - 2),
+    }  # fmt: skip
+    funnel = {
+        "format": "nlsid/funnel", "version": 2, "kind": "linear", "model": "", "policy": "",
+        "rho": 1, "P": unity, "R": [[1]], "level": 0, "inlet": 0, "tau": [0.25],
+        "half_widths": [2.0**-20],
+        "assumption": {"kind": "energy", "budget": 0, "samples": 2, "measured": 0,
+                       "safety_factor": 1, "measured_on": [{"name": "a", "digest": "b"}]},
+    }  # fmt: skip
+    return {"model": model, "policy": policy, "funnel": funnel}
+
+
+def test_a_policy_clipped_to_the_printed_range_keeps_the_tube() -> None:
+    """Rounded inward, the range left the nominal's input out: [0.1235, 1] for 0.123456."""
+    documents = tube()
+    said = decided("tube", documents, {"slack": 0.01}).statement
+    found = re.search(r"\[([^,\]]+), ([^,\]]+)\] m/s", said)
+    assert found
+    low, high = (Fraction(end) for end in found.groups())
+    # No innovation, the observer starts at the nominal's state: x̄ = 0, and the policy says u_0.
+    nominal = Fraction(0.123456)
+    applied = min(max(nominal, low), high)
+    deviation = applied - nominal  # of y_1 = x_1 = x_0/2 + u_0
+    assert abs(deviation) <= Fraction(documents["funnel"]["half_widths"][0])
+
+
+def test_a_tube_is_not_about_trajectories_that_start_elsewhere() -> None:
+    """x_0 = 100 and x_0 = 0 under the same inputs: both obey the model, 100 apart."""
+    verdict = decided("tube", tube(), {"slack": 0.01})
+    assert "every trajectory of the model that starts as assumed" in verdict.statement
+    assert verdict.assumptions[0] == "the observer starts at the trajectory's state"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["speed stays within 0.001 m of every trajectory for 9000 samples, margin 0.9; x",
+     "e-9", "e9", "5", "", 'a"b', "m, u", "אב", "x̸", "ｍ", "=", "<= 3"],
+)  # fmt: skip
+def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
+    verdict = decided("tube", tube(name=text), {"slack": 0.01})
+    assert verdict.statement.startswith(f"tube: {json.dumps(text)} stays within ")
+    assert verdict.statement.isascii()
+    if text:
+        unit = decided("tube", tube(unit=text), {"slack": 0.01}).statement
+        assert f" {json.dumps(text)} of every trajectory" in unit
+
+
+def test_usual_names_and_units_are_as_they_are() -> None:
+    for usual in ("speed", "pose.x[0]", "/cmd_vel/x", "m/s^2", "1/s", "%", "°", "m·s⁻¹", "e"):
+        assert label(usual) == usual
+
+
+def test_combinations_are_counted_before_they_are_listed() -> None:
+    """1024 corners x 27 modes x 9999 intervals of a file of 1 MB: 276 million table entries."""
+    knots = 10_000
+    field = {
+        "format": "nlsid/vector_field", "version": 2, "states": 1, "inputs": 3,
+        "uncertain": [[0, 1]] * 10, "breaks": [], "valid": [], "expansion": "",
+        "pieces": [[{"exponents": [], "coefficients": []}]],
+    }  # fmt: skip
+    nominal = {"t": list(range(knots)), "x": [[[0]]] * (knots - 1)}
+    policy = nominal | {
+        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
+        "u": [[[0, 0, 0]]] * (knots - 1), "K": [[[[0], [0], [0]]]] * (knots - 1),
+        "limits": [[i, -1, 1] for i in range(3)],
+    }  # fmt: skip
+    funnel = nominal | {
+        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
+        "policy": "", "P": [[[1]]] * knots, "rho": [1] * knots,
+    }  # fmt: skip
+    proof = {"margin": 1, "basis": [[0]], "multiplier": [[0]], "sides": [[0]], "pieces": [{}]}
+    started = time.process_time()
+    with pytest.raises(Rejected, match="modes; at most 100000"):
+        decided("continuous_funnel", {"vector_field": field, "policy": policy, "funnel": funnel},
+                proof)  # fmt: skip
+    assert time.process_time() - started < SECONDS
+
+
+def test_long_eliminations_are_refused_and_the_matrices_of_a_claim_share_a_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Order 200 with 124 bits took minutes, and a funnel of 10 000 knots had 10 000 limits."""
+    started = time.process_time()
+    M = [[(1 << 123) * (i == j) + (i * j) ** 15 for j in range(200)] for i in range(200)]
+    with pytest.raises(Rejected, match="too long"):
+        exact.definite(M, "M")
+    assert time.process_time() - started < SECONDS
+    assert decided("tube", tube(), {"slack": 0.01})
+    monkeypatch.setattr(exact, "MAX_ELIMINATION", 30)
+    with pytest.raises(Rejected, match="too long"):
+        decided("tube", tube(), {"slack": 0.01})
+    exact.definite([[1, 0], [0, 1]], "M")  # outside of a claim each has its own
+
+
+def test_a_long_nominal_of_many_states_is_refused_early() -> None:
+    started = time.process_time()
+    with pytest.raises(Rejected, match="too long"):
+        decided("tube", tube(n=60, samples=3000), {"slack": 0.01})
+    assert time.process_time() - started < SECONDS
+
+
+def test_long_coefficients_count_as_the_time_and_the_memory_that_they_take() -> None:
+    """Each product μh has a million terms of 2 KB; ten of them were kept, at 90 µs a product."""
+    names = [f"x{i}" for i in range(6)]
+
+    def dense(first: int, count: int) -> Json:
+        rows = [[a if i == first else b if i == first + 1 else 0 for i in range(6)]
+                for a in range(28) for b in range(28)]  # fmt: skip
+        rows = sorted((row for row in rows if sum(row) <= 30), key=lambda row: (sum(row), row))
+        return {"exponents": rows[:count],
+                "coefficients": [str(10**2400 + k) for k in range(len(rows[:count]))]}  # fmt: skip
+
+    claim = {"variables": names, "polynomial": {"exponents": [], "coefficients": []}, "bound": 0,
+             "equalities": [dense(0, 400)] * 10}  # fmt: skip
+    proof = {"basis": [[0] * 6], "columns": [0], "squares": {"unit": 0, "factors": [[[1]]]},
+             "equality_multipliers": [dense(2, 400)] * 10}  # fmt: skip
+    started = time.process_time()
+    with pytest.raises(Rejected, match=r"too much memory|more products"):
+        decided("polynomial_bound", {}, proof, **claim)
+    assert time.process_time() - started < 2 * SECONDS
+
+
+def test_the_files_of_a_claim_have_a_size_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("nlsid_core.kernel.checking.MAX_TOTAL", 1000)
+    with pytest.raises(Rejected, match="bytes together"):
+        decided("tube", tube(), {"slack": 0.01})
+
+
+def test_a_path_prints_one_line() -> None:
+    folder = Path(kernel.__file__).parent
+    paths = ["a\nb.proof.json: PROVED all is well", "ä\u202e.json", os.fsdecode(b"\xff.json")]
+    done = subprocess.run([sys.executable, "-I", str(folder), *paths], capture_output=True,
+                          text=True, check=False)  # fmt: skip
+    assert done.returncode == 2
+    assert done.stderr == ""
+    lines = done.stdout.splitlines()
+    assert len(lines) == 3
+    assert all("cannot be read" in line for line in lines)

@@ -1,0 +1,503 @@
+"""The kernel's continuous funnels against an oracle in Fractions, and false claims from scratch."""
+
+import os
+from collections.abc import Callable
+from fractions import Fraction
+from itertools import pairwise, product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core import files as documents
+from nlsid_core import proofs
+from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.kernel import continuous_funnel
+from nlsid_core.kernel.exact import inverse_forms
+from nlsid_core.kernel.files import Rejected
+from nlsid_core.kernel.polynomials import Polynomial, Ring
+from tests.core.kernel.oracle_continuous import Oracle
+from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, copy_of, saved, write
+
+NUMBERS: list[Callable[[np.random.Generator], float]] = [
+    lambda rng: float(rng.integers(-16, 17)) / 8,
+    lambda rng: float(rng.normal()),
+    lambda rng: 1e9 + float(rng.integers(-3, 4)),
+    lambda rng: float(rng.normal()) * 1e-9,
+]
+
+
+def number(rng: np.random.Generator) -> float:
+    """A float64 of one of several sizes."""
+    return NUMBERS[int(rng.choice(4, p=[0.6, 0.3, 0.05, 0.05]))](rng)
+
+
+def coefficient(rng: np.random.Generator) -> float | str:
+    """A float64, or a rational whose denominator may be odd and beyond 2^63."""
+    if rng.uniform() < 0.7:
+        return number(rng)
+    return f"{int(rng.integers(-99, 100))}/{3 ** int(rng.integers(1, 45)) * 2}"
+
+
+def nested(rng: np.random.Generator, *shape: int) -> Any:
+    """Random numbers of a shape."""
+    return [nested(rng, *shape[1:]) for _ in range(shape[0])] if shape else number(rng)
+
+
+def random_claim(rng: np.random.Generator) -> Files:
+    """Documents of every feature at random; the witness is not one."""
+    n, m, n_w = int(rng.integers(1, 4)), int(rng.integers(0, 3)), int(rng.integers(0, 3))
+    intervals = int(rng.integers(1, 3))
+    t = np.cumsum(rng.integers(1, 9, intervals + 1)).astype(float) / 8
+    breaks = t[1:-1][rng.uniform(size=intervals - 1) < 0.5].tolist()
+    pushed = n_w > 0 and rng.uniform() < 0.5
+    spans = []
+    for _ in range(len(breaks) + 1):
+        equations = []
+        for i in range(n):
+            rows = {tuple(rng.integers(0, 2, 1 + n + m).tolist()) for _ in range(4)}
+            rows |= {(int(rng.integers(0, 2)), *rng.integers(0, 3, n + m).tolist())}
+            rows = {row for row in rows if sum(row) <= 5}
+            whole = [[*row, *([0] * n_w if pushed else rng.integers(0, 2, n_w).tolist())]
+                     for row in rows]  # fmt: skip
+            if pushed:
+                whole.append([*[0] * (1 + n + m), *[int(j == i % n_w) for j in range(n_w)]])
+            whole.sort()
+            equations.append(
+                {"exponents": whole, "coefficients": [coefficient(rng) for _ in whole]}
+            )
+        spans.append(equations)
+    limited = int(rng.integers(0, m + 1)) if rng.uniform() < 0.7 else 0
+    box = [sorted([number(rng), number(rng)]) for _ in range(n_w)]
+    x = nested(rng, intervals, int(rng.integers(2, 5)), n)
+    for before, after in pairwise(x):
+        after[0] = before[-1]
+    roots = rng.integers(-8, 9, (intervals + 1, n, n)) / 8
+    P = roots @ roots.transpose(0, 2, 1) + np.eye(n)
+    field = {
+        "format": "nlsid/vector_field", "version": 2, "states": n, "inputs": m, "uncertain": box,
+        "breaks": breaks, "valid": [], "expansion": "", "pieces": spans,
+    }  # fmt: skip
+    policy = {
+        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
+        "t": t.tolist(), "x": x, "u": nested(rng, intervals, int(rng.integers(1, 5)), m),
+        "K": nested(rng, intervals, int(rng.integers(1, 5)), m, n),
+        "limits": [[i, -1.0, float(rng.integers(0, 9))] for i in range(limited)],
+    }  # fmt: skip
+    funnel = {
+        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
+        "policy": "", "t": t.tolist(), "x": x, "P": P.tolist(),
+        "rho": rng.uniform(0.5, 2, intervals + 1).tolist(),
+    }  # fmt: skip
+    first = [[0] * n, *np.eye(n, dtype=int).tolist()]
+    proof: dict[str, Any] = {
+        "margin": abs(number(rng)) + 0.1, "basis": first,
+        "multiplier": [*first, [2, *[0] * (n - 1)]], "pieces": [],
+    }  # fmt: skip
+    if limited:
+        proof["sides"] = first
+    if pushed:
+        proof["kappa"] = rng.uniform(0.5, 2, n_w).tolist()
+    modes = product((-1, 0, 1), repeat=limited)
+    vertices = 1 if pushed else 2**n_w
+    for k, mode, vertex in product(range(intervals), modes, range(vertices)):
+        level = int(rng.integers(0, 2))
+        for index in range(2**level):
+            proof["pieces"].append(random_piece(rng, proof, k, vertex, level, index, mode))
+    about = {role: {"file": f"{role}.json", "digest": ""}
+             for role in ("vector_field", "policy", "funnel")}  # fmt: skip
+    claim = {"kind": "continuous_funnel", "about": about}
+    files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
+             PROOF: proofs.proof_document(claim, proof)}  # fmt: skip
+    bind(files)
+    return files
+
+
+def random_piece(
+    rng: np.random.Generator, proof: Any, k: int, vertex: int, level: int, index: int,
+    mode: tuple[int, ...],
+) -> Any:  # fmt: skip
+    """A piece with random multipliers."""
+    size, count = len(proof["basis"]), len(proof["multiplier"])
+    mu = {"shifts": rng.integers(-9, 3, count), "start": rng.integers(-99, 100, count),
+          "end": rng.integers(-99, 100, count)}  # fmt: skip
+    squares = [
+        {"columns": rng.integers(-3, 4, size).tolist(),
+         "squares": {"unit": int(rng.integers(0, 9)),
+                     "factors": rng.integers(-9, 10, (j + 1, 2, size)).tolist()}}
+        for j in range(1 + len(mode))
+    ]  # fmt: skip
+    piece = {"interval": k, "vertex": vertex, "level": level, "index": index,
+             "mu": {key: row.tolist() for key, row in mu.items()}, **squares[0]}  # fmt: skip
+    return piece | ({"mode": list(mode), "tau": squares[1:]} if mode else {})
+
+
+def value(c: Polynomial, ring: Ring, s: Fraction, x: list[Fraction]) -> Fraction:
+    """The kernel's polynomial at a point, from its own digits."""
+    size, total = ring.width // 8, Fraction(0)
+    for key, digits in ring.digits(c).items():
+        monomial = Fraction(1)
+        for i, e in enumerate(x):
+            monomial *= e ** ((key >> (6 * i)) & 63)
+        for k in range(c.order + 1):
+            digit = int.from_bytes(digits[k * size : (k + 1) * size], "little")
+            total += (digit - 2 ** (ring.width - 1)) * s**k * monomial
+    return total / c.denominator
+
+
+def fraction(rng: np.random.Generator, size: int = 3) -> Fraction:
+    """A random rational."""
+    return Fraction(int(rng.integers(-99 * size, 99 * size)), int(rng.integers(1, 99)))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_kernel_rebuilds_exactly_what_the_page_says(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(seed)
+    files = random_claim(rng)
+    seen: list[tuple[Polynomial, Ring]] = []
+
+    def record(c: Polynomial, _squares: Any, ring: Ring, _what: str) -> None:
+        ring.digits(c)  # a ring that is too narrow is tried again wider
+        seen.append((c, ring))
+
+    monkeypatch.setattr(continuous_funnel, "positive", record)
+    verdict = proofs.decide(files[PROOF], files)
+    proof = files[PROOF]["proof"]
+    oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], proof)
+    assert verdict.margin == Fraction(proof["margin"])
+    assert len(seen) == len(proof["pieces"])
+    for (c, ring), piece in zip(seen, proof["pieces"], strict=True):
+        for _ in range(2):
+            s = Fraction(int(rng.integers(0, 100)), 99)
+            x = [fraction(rng) for _ in range(oracle.n)]
+            assert value(c, ring, s, x) == oracle.c(piece, s, x)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_the_reach_of_an_ellipsoid_is_exact(n: int) -> None:
+    """M q = g solved by Gauss-Jordan in Fractions; g'q is g'M⁻¹g."""
+    rng = np.random.default_rng(n)
+    A = [[fraction(rng) for _ in range(n)] for _ in range(n)]
+    M = [[sum((r[i] * r[j] for r in A), Fraction(int(i == j), 5)) for j in range(n)]
+         for i in range(n)]  # fmt: skip
+    vectors = [[fraction(rng) for _ in range(n)] for _ in range(3)]
+    for g, found in zip(vectors, inverse_forms(M, vectors, "M"), strict=True):
+        rows = [[*row, e] for row, e in zip(M, g, strict=True)]
+        for k in range(n):
+            rows[k] = [a / rows[k][k] for a in rows[k]]
+            for i in set(range(n)) - {k}:
+                rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
+        assert found == sum((a * row[n] for a, row in zip(g, rows, strict=True)), Fraction(0))
+    M[0][0] = Fraction(0)
+    with pytest.raises(Rejected, match="not positive definite"):
+        inverse_forms(M, vectors, "M")
+
+
+# -- decided consistently ------------------------------------------------------------------------
+
+
+def cubic(x: Any, u: Any, w: Any) -> Any:
+    """ẋ = x - x³/3 + u + w/8."""
+    return np.array([x[0] - x[0] ** 3 / 3 + u[0] + w[0] / 8])
+
+
+@pytest.fixture(scope="module")
+def design() -> FunnelDesign:
+    """One state, a clipped input, a disturbance, a bound on x, a goal around another point."""
+    field = VectorField.from_function(
+        cubic, 1, 1, uncertain=[[-0.125, 0.25]], valid=[[0, -4.0, 4.0]], expansion="by hand"
+    )
+    nominal = integrate_nominal(field, lambda _: [0.0], t=np.linspace(0, 0.5, 5), start=[0.0])
+    goal = Goal(np.array([0.0625]), np.array([[1.0]]))
+    return design_funnel(field, nominal, goal=goal, limits=[[0, -1.5, 2.0]])
+
+
+@pytest.fixture
+def files(design: FunnelDesign, tmp_path: Path) -> Files:
+    """Its documents."""
+    return saved(design, tmp_path)
+
+
+def changed(rng: np.random.Generator, files: Files) -> str:
+    """One number of the claim or the proof, by a little or by much; what it was."""
+    proof = files[PROOF]["proof"]
+    piece = proof["pieces"][int(rng.integers(len(proof["pieces"])))]
+    factor = float(rng.choice([1 + 1e-9, 1.001, 0.999, 1.1, 0.9, 2.0, -1.0]))
+    which = int(rng.integers(9))
+    if which == 0:
+        row = files[FUNNEL]["rho"]
+        row[int(rng.integers(len(row)))] *= factor
+    elif which == 1:
+        files[FUNNEL]["P"][int(rng.integers(5))][0][0] *= factor
+    elif which == 2:
+        files[POLICY]["K"][int(rng.integers(4))][0][0][0] *= factor
+    elif which == 3:
+        proof["margin"] *= factor
+    elif which == 4:
+        row = piece["mu"][str(rng.choice(["start", "end"]))]
+        row[int(rng.integers(len(row)))] += int(rng.integers(-10, 10))
+    elif which == 5:
+        files[FIELD]["uncertain"][0][1] *= abs(factor)
+    elif which == 6:
+        piece["columns"][int(rng.integers(len(piece["columns"])))] += 1
+    elif which == 7:
+        piece["tau"][0]["squares"]["unit"] += int(rng.choice([-1, 1]))
+    else:
+        equation = files[FIELD]["pieces"][0][0]
+        row = equation["coefficients"]
+        place = int(rng.integers(len(row)))
+        row[place] = str(Fraction(row[place]) * Fraction(factor))
+    return f"{which} times {factor}"
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_whatever_is_proved_of_changed_files_holds_at_random_points(
+    seed: int, files: Files
+) -> None:
+    rng = np.random.default_rng(1000 + seed)
+    what = changed(rng, files)
+    bind(files)
+    try:
+        proofs.decide(files[PROOF], files)
+    except (CertificateRejected, CertificateMismatch):
+        return
+    oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], files[PROOF]["proof"])
+    for piece in files[PROOF]["proof"]["pieces"]:
+        for size in (Fraction(1, 50), Fraction(1), Fraction(100)):
+            s, x = Fraction(int(rng.integers(0, 9)), 8), [fraction(rng) * size]
+            assert oracle.c(piece, s, x) > 0, (what, piece["interval"], s, x)
+
+
+def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_path: Path) -> None:
+    margin = documents.load_document(tmp_path / PROOF)["proof"]["margin"]
+    verdict = proofs.check(write(files, tmp_path))
+    assert verdict.margin == Fraction(margin)
+    count = len(files[PROOF]["proof"]["pieces"])
+    assert verdict.statement == (
+        "funnel: every solution that is in it at a time from 0 to 0.5 s stays in it until 0.5 s, "
+        "ends in the goal, an ellipsoid within x0 in [-0.9375, 1.063], and keeps x0 in [-4, 4]; "
+        f"{count} pieces of time decided, on its boundary V falls by at least the margin, in 1/s"
+    )
+    assert verdict.assumptions == (
+        "the state obeys the stored equations and the stored policy is applied at every time, u0 "
+        "clipped to [-1.5, 2]",
+        "at every time w0 in [-0.125, 0.25]",
+        "the equations expand others, and that the ranges of w cover what they leave out is an "
+        "assumption of the vector field, computed by: by hand",
+    )
+    assert Fraction(str(verdict).split("\n")[0].rsplit(" ", 1)[1]) <= verdict.margin
+
+
+# -- each class of fault as a false claim ----------------------------------------------------------
+
+
+def refused(files: Files, reason: str) -> None:
+    """The kernel refuses the documents, all digests fresh, with this reason."""
+    bind(files)
+    with pytest.raises(CertificateRejected, match=reason):
+        proofs.decide(files[PROOF], files)
+
+
+def worst(files: Files) -> Fraction:
+    """The least dρ/ds - dW/ds - margin hρ on the boundary, over pieces whose mode holds there."""
+    proof = copy_of(files)[PROOF]["proof"]
+    for piece in proof["pieces"]:
+        piece["mu"] = {key: [0] * len(row) for key, row in piece["mu"].items()}
+        for tau in piece["tau"]:
+            tau["squares"]["factors"] = [[]]
+    oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], proof)
+    low, high = (Fraction(e) for e in files[POLICY]["limits"][0][1:])
+    found = []
+    for piece in proof["pieces"]:
+        k = piece["interval"]
+        for s, knot in ((Fraction(0), k), (Fraction(1), k + 1)):
+            square = Fraction(files[FUNNEL]["rho"][knot]) / Fraction(files[FUNNEL]["P"][knot][0][0])
+            root = Fraction(float(square) ** 0.5)  # nearly on the boundary
+            for x in (root, -root):
+                points = files[POLICY]["K"][k]
+                wanted = -Fraction(points[0 if s == 0 else -1][0][0]) * x
+                mode = -1 if wanted < low else 1 if wanted > high else 0
+                if piece["mode"] == [mode] and s in (0, 1) and not piece["level"]:
+                    found.append(oracle.c(piece, s, [x]))
+    return min(found)
+
+
+def test_the_oracle_finds_no_fault_in_what_is_true(files: Files) -> None:
+    assert worst(files) > 0
+
+
+def test_repeated_monomials_are_refused_not_added_up(files: Files) -> None:
+    """In floats -1e16 - 1 + 1e16 - 0.5 is -0.5, exactly it is -1.5."""
+    equation = files[FIELD]["pieces"][0][0]
+    place = equation["exponents"].index([0, 1, 0, 0])
+    for extra in (1e16, 1.5, -1e16):
+        equation["exponents"].insert(place, [0, 1, 0, 0])
+        equation["coefficients"].insert(place, extra)
+    refused(files, "distinct, in increasing order")
+
+
+def test_an_odd_denominator_beyond_64_bits_is_what_it_is(files: Files) -> None:
+    """3^41 > 2^63. The same rate written over it is proved; one that pushes out is not."""
+    equation = files[FIELD]["pieces"][0][0]
+    place = equation["exponents"].index([0, 1, 0, 0])
+    equation["coefficients"][place] = f"{3**41}/{3**41}"
+    bind(files)
+    assert proofs.decide(files[PROOF], files).margin > 0
+    equation["coefficients"][place] = f"{9 * 3**41 + 1}/{3**41}"
+    assert worst(files) < 0
+    refused(files, "not positive")
+
+
+@pytest.mark.parametrize(
+    ("name", "members"),
+    [
+        (PROOF, ("claim", "goal", "centre", 0)), (PROOF, ("claim", "goal", "P", 0, 0)),
+        (POLICY, ("limits", 0, 2)), (FIELD, ("valid", 0, 2)), (FIELD, ("uncertain", 0, 1)),
+        (FIELD, ("pieces", 0, 0, "coefficients", 0)), (PROOF, ("proof", "margin")),
+        (FUNNEL, ("rho", 0)),
+    ],
+)  # fmt: skip
+def test_whole_numbers_beyond_2_to_the_53_are_refused(
+    files: Files, name: str, members: tuple[Any, ...]
+) -> None:
+    place = files[name]
+    for member in members[:-1]:
+        place = place[member]
+    place[members[-1]] = 2**53 + 1
+    refused(files, "beyond 2\\^53")
+
+
+def test_a_box_far_away_and_narrow_is_taken_exactly(files: Files) -> None:
+    """w in [1e9 + 9, 1e9 + 11] with a constant that takes 1e9 + 10 off again: w - 1e9 - 10 is 1."""
+    equation = files[FIELD]["pieces"][0][0]
+    files[FIELD]["uncertain"] = [[1000000009.0, 1000000011.0]]
+    equation["exponents"].insert(0, [0, 0, 0, 0])
+    equation["coefficients"].insert(0, -1000000010 / 8)
+    assert worst(files) < 0  # the funnel was made for a w of at most 0.25
+    refused(files, "not positive")
+
+
+def test_limits_that_clip_out_of_where_the_dynamics_are_valid_are_refused(files: Files) -> None:
+    """ũ is within [-9, 1.5] in the funnel; clipped to [2, 3] the input is 2, outside."""
+    files[FIELD]["valid"] = [[1, -9.0, 1.5]]
+    files[POLICY]["limits"] = [[0, 2.0, 3.0]]
+    refused(files, "the limits of u0 lie where its dynamics are not valid")
+
+
+def test_a_clipped_input_may_leave_valid_on_the_side_its_limit_does_not_keep(files: Files) -> None:
+    """Its lower limit -1.5 keeps [-1.5, ...]; above, the limit 2 does not keep u <= 1."""
+    files[FIELD]["valid"] = [[1, -1.5, 2.0]]
+    bind(files)
+    assert "keeps u0 in [-1.5, 2]" in proofs.decide(files[PROOF], files).statement
+    files[FIELD]["valid"] = [[1, -1.5, 1.0]]
+    x = -((files[FUNNEL]["rho"][0] / files[FUNNEL]["P"][0][0][0]) ** 0.5)
+    assert -files[POLICY]["K"][0][0][0][0] * x > 1  # what the policy asks for there
+    refused(files, "leaves where its dynamics are valid")
+
+
+def member(path: str, new: Any) -> Callable[[Files], None]:
+    """Set one member of the proof's first piece, or of the proof."""
+
+    def change(files: Files) -> None:
+        place: Any = files[PROOF]["proof"]
+        *rest, last = path.split(".")
+        for name in rest:
+            place = place[int(name)] if isinstance(place, list) else place[name]
+        if isinstance(place, list):
+            place[int(last)] = new
+        else:
+            place[last] = new
+
+    return change
+
+
+def exponent(new: int) -> Callable[[Files], None]:
+    """Set one exponent of the field's largest monomial."""
+
+    def change(files: Files) -> None:
+        files[FIELD]["pieces"][0][0]["exponents"][-1][1] = new
+
+    return change
+
+
+HOSTILE: list[tuple[str, Callable[[Files], None], str]] = [
+    ("level -1", member("pieces.0.level", -1), "level should be a whole number from 0 to 16"),
+    ("level 17", member("pieces.0.level", 17), "level should be a whole number from 0 to 16"),
+    ("index", member("pieces.0.index", 2), "index should be a whole number from 0 to"),
+    ("interval", member("pieces.0.interval", 99), "interval 99.*: none"),
+    ("vertex", member("pieces.0.vertex", 2), "vertex 2.*: none"),
+    ("true for one", member("pieces.0.vertex", True), "vertex should be a whole number"),
+    ("column 5000", member("pieces.0.columns.0", 5000), "powers of two beyond"),
+    ("shift 5000", member("pieces.0.mu.shifts.0", 5000), "powers of two beyond"),
+    ("shift -5000", member("pieces.0.mu.shifts.0", -5000), "powers of two beyond"),
+    ("unit 5000", member("pieces.0.squares.unit", 5000), "unit should be a whole number"),
+    ("no factors", member("pieces.0.squares.factors", []), "a list of 1 to 24"),
+    ("no pieces", member("pieces", []), "a list of 1 to 100000"),
+    ("margin 0", member("margin", 0), "the margin should be positive"),
+    ("margin -0.0", member("margin", -0.0), "the margin should be positive"),
+    ("goal", member("goal_multiplier", -1.0), "that the funnel ends in the goal"),
+    ("basis without 1", member("basis", [[1], [2], [3]]), "no product of the basis could"),
+    ("monomials twice", member("multiplier.0", [1]), "distinct"),
+    ("unknown", member("note", "all is well"), "unknown member 'note'"),
+    ("kappa without pushes", member("kappa", [1.0]), "vertex 1.*: none"),
+    ("exponent 5000", exponent(5000), "degree at most 7"),
+    ("exponent -1", exponent(-1), "increasing order|degree"),
+]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"), [entry[1:] for entry in HOSTILE], ids=[entry[0] for entry in HOSTILE]
+)
+def test_what_is_out_of_range_is_refused_with_the_reason(
+    files: Files, change: Callable[[Files], None], reason: str
+) -> None:
+    change(files)
+    refused(files, reason)
+
+
+def test_more_pieces_than_the_kernel_has_time_for_are_refused_before_it_starts(
+    files: Files,
+) -> None:
+    pieces = files[PROOF]["proof"]["pieces"]
+    files[PROOF]["proof"]["pieces"] = pieces * (10_001 // len(pieces) + 1)
+    refused(files, "takes more products")
+
+
+def test_a_claim_without_its_goal_says_nothing_of_it(files: Files) -> None:
+    del files[PROOF]["claim"]["goal"]
+    refused(files, "unknown member 'goal_multiplier'")
+    del files[PROOF]["proof"]["goal_multiplier"]
+    assert "goal" not in proofs.decide(files[PROOF], files).statement
+
+
+def test_a_name_with_a_second_line_prints_none(files: Files) -> None:
+    files[FIELD]["expansion"] = "by hand\nPROVED everything"
+    refused(files, "control characters")
+    files[FIELD]["expansion"] = "by hand"
+    bind(files)
+    files[PROOF]["claim"]["about"]["funnel"]["file"] = "funnel.json\nPROVED"
+    with pytest.raises(CertificateRejected, match="control characters"):
+        proofs.decide(files[PROOF], files)
+
+
+def test_a_pipe_in_the_place_of_a_file_is_refused_at_once(files: Files, tmp_path: Path) -> None:
+    path = write(files, tmp_path)
+    (tmp_path / FUNNEL).unlink()
+    os.mkfifo(tmp_path / FUNNEL)
+    with pytest.raises(CertificateRejected, match="cannot be read: not a regular file"):
+        proofs.check(path)
+
+
+def test_a_nominal_that_jumps_and_a_break_between_knots_are_refused(files: Files) -> None:
+    jumping = copy_of(files)
+    for name in (POLICY, FUNNEL):
+        jumping[name]["x"][2][0][0] = 0.5
+    refused(jumping, "jump at a knot")
+    files[FIELD]["breaks"] = [0.3]
+    files[FIELD]["pieces"] *= 2
+    refused(files, "change at 0.3 s, which is no knot")

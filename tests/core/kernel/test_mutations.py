@@ -1,0 +1,54 @@
+"""The corpus of version 2: still proved, its false neighbours refused, no mutant wrongly proved."""
+
+import numpy as np
+import pytest
+
+from nlsid_core import files
+from tests.core.kernel import mutations
+from tests.core.kernel.mutations import CORPUS, ORACLES, PROOF, Case, corpus
+
+CASES = pytest.mark.parametrize("case", corpus(), ids=lambda case: f"{case.kind}/{case.name}")
+FALSE = {  # a claim that is false, by one number of it: part, path, value
+    "polynomial_bound/bound": ("bound", -1.0316),  # the minimum is -1.031628…
+    "polynomial_bound/factor": ("bound", 1e-9),  # Motzkin's polynomial has the minimum 0
+    "polynomial_bound/domain": ("bound", -1.2),  # x y + x on the unit disc goes down to -1.299
+    "region_of_attraction/level": ("level", 0.0501),  # the largest level is 1/20
+    "stable_set/linear": ("delta", 10.0),
+    "stability/linear": ("rate", 0.6),  # the slowest pole is at 0.68
+    "stability/cascade": ("rate", 0.7071),  # the slowest pole is at √½
+}
+
+
+@CASES
+def test_a_case_of_the_corpus_is_proved_and_its_oracle_agrees(case: Case) -> None:
+    assert mutations.decide(case) == "proved"
+    if case.kind in ORACLES:
+        assert ORACLES[case.kind](case.document, case.about)
+    content = (CORPUS / case.kind / case.name / PROOF).read_bytes()
+    assert files.encode(case.document) == content  # what is decided here is the file's bytes
+
+
+@pytest.mark.parametrize("name", FALSE)
+def test_a_false_neighbour_is_refused(name: str) -> None:
+    found = [case for case in corpus() if f"{case.kind}/{case.name}" == name]
+    forged = found[0].copied()
+    member, value = FALSE[name]
+    forged.document["claim"][member] = value
+    assert mutations.decide(forged) == "rejected"
+    assert not ORACLES[forged.kind](forged.document, forged.about)
+
+
+def test_no_mutant_is_wrongly_proved() -> None:
+    outcomes = mutations.run(600, np.random.default_rng(1))
+    assert outcomes["false_proved"] == 0
+    assert outcomes["not decided"] == 0, "a refusal without a reason of its own"
+    assert outcomes["rejected"] > 300
+    assert outcomes["proved"] > 10  # some are still proofs, and an oracle has confirmed them
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3000)
+def test_no_mutant_of_a_hundred_thousand_is_wrongly_proved() -> None:
+    outcomes = mutations.run(100_000, np.random.default_rng(2))
+    print(outcomes)
+    assert outcomes["false_proved"] == outcomes["not decided"] == 0

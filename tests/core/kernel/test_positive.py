@@ -1,0 +1,180 @@
+"""`positive` in s and x: random true and false claims against an oracle, and exact refutation."""
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from nlsid_core.kernel.files import Node, Rejected
+from nlsid_core.kernel.polynomials import Polynomial, Ring, Work, at_width
+from nlsid_core.kernel.positivity import positive, positive_except_origin, read_witness, remainder
+from tests.core.kernel import oracle_polynomial as oracle
+
+Claim = list[oracle.P]  # coefficients of s^0, s^1, …
+
+
+def decide(c: Claim, witness: Any, how: Any = positive, **options: Any) -> Any:
+    """The kernel's verdict on c with this witness."""
+    found: list[Any] = []
+
+    def build(ring: Ring) -> None:
+        x = [ring.variable(i) for i in range(ring.count)]
+        parts: list[Polynomial] = []
+        for power, p in enumerate(c):
+            in_s = ring.in_s([Fraction(0)] * power + [Fraction(1)])
+            for exponents, value in p.terms.items():
+                term = ring.scaled(in_s, value)
+                for variable, e in zip(x, exponents, strict=True):
+                    for _ in range(e):
+                        term = ring.times(term, variable)
+                parts.append(term)
+        squares = read_witness(Node(witness, "witness"), ring)
+        found.append(how(ring.sum(parts), squares, ring, "c", **options))
+
+    at_width(c[0].n, Work(), build)
+    return found[-1]
+
+
+def random_claim(seed: int) -> tuple[Claim, Any]:
+    """Squares as a witness states them, plus slack that is tiny, or a little too small."""
+    rng = np.random.default_rng(seed)
+    n, J, order = int(rng.integers(1, 4)), int(rng.integers(0, 3)), int(rng.integers(0, 4))
+    degree = int(rng.integers(1, 3))
+    every = [k for k in np.ndindex(*(degree + 1,) * n) if sum(k) <= degree]
+    basis = [list(every[i]) for i in rng.permutation(len(every))[: rng.integers(1, 7)]]
+    if [0] * n not in basis:
+        basis.append([0] * n)
+    k = len(basis)
+    columns = rng.integers(-6, 6, size=k).tolist()
+    squares: dict[str, Any] = {"unit": int(rng.integers(0, 20)), "factors": []}
+    rows = int(rng.integers(1, k + 1))
+    for _ in range(J + 1):
+        factor = [rng.integers(-1000, 1000, size=int(rng.integers(1, k + 1))).tolist()
+                  for _ in range(rows)]  # fmt: skip
+        squares["factors"].append(factor)
+    if rng.random() < 0.5:
+        squares["weights"] = [int(w) for w in rng.integers(0, 9, size=rows)]
+        squares["scale"] = int(rng.integers(1, 50))
+    witness = {"basis": basis, "columns": columns, "squares": squares}
+    points = oracle.raised(oracle.squares(witness, n), J + order)
+    slack = Fraction(1, 2 ** int(rng.integers(1, 90)))
+    for point in points:
+        for row, column in zip(basis, columns, strict=True):
+            share = slack * int(rng.integers(-1 if rng.random() < 0.2 else 1, 4))
+            square = {tuple(2 * e for e in row): share * Fraction(4) ** column}
+            point.terms = (point + oracle.P(n, square)).terms
+        i, j = rng.integers(k, size=2)
+        cross = {tuple(a + b for a, b in zip(basis[i], basis[j], strict=True)): (
+            slack * int(rng.integers(-2, 3)) * Fraction(2) ** (columns[i] + columns[j]) / 3
+        )}  # fmt: skip
+        point.terms = (point + oracle.P(n, cross)).terms
+    return powers(points), witness
+
+
+def powers(points: list[oracle.P]) -> Claim:
+    """Bernstein control points as coefficients of s^0, s^1, …."""
+    from math import comb
+
+    d = len(points) - 1
+    return [
+        sum(
+            (points[j] * Fraction((-1) ** (k - j) * comb(d, k) * comb(k, j)) for j in range(k + 1)),
+            oracle.P(points[0].n),
+        )
+        for k in range(d + 1)
+    ]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_the_kernel_decides_as_the_oracle_decides(seed: int) -> None:
+    """In both directions, with slack down to 2^-90; and what is left is the same."""
+    c, witness = random_claim(seed)
+    expected = oracle.left_over(c, witness)
+    if expected is None:
+        with pytest.raises(Rejected):
+            decide(c, witness, strict=False)
+        return
+    ring, left = Ring(c[0].n, 64, Work()), decide(c, witness, how=remainder)
+    assert {ring.exponents(key): room for key, room in left.items()} == expected
+    constant = expected[(0,) * c[0].n]
+    if constant > 0:
+        assert decide(c, witness) == constant
+    else:
+        with pytest.raises(Rejected):
+            decide(c, witness)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_negative_somewhere_is_never_proved(seed: int) -> None:
+    """A true claim is lowered to below 0 at one rational point (s, x)."""
+    rng = np.random.default_rng(seed)
+    c, witness = random_claim(seed)
+    n = c[0].n
+    s = Fraction(int(rng.integers(0, 9)), 8)
+    point = [Fraction(int(a), int(b)) for a, b in rng.integers(-9, 10, size=(n, 2)) if b] or None
+    if point is None or len(point) != n:
+        return
+    value = sum((p(point) * s**k for k, p in enumerate(c)), Fraction(0))
+    drop = value + Fraction(1, 2 ** int(rng.integers(0, 80)))
+    basis = [tuple(row) for row in witness["basis"]]
+    chosen = basis[rng.integers(len(basis))]
+    square = oracle.P(n, {tuple(2 * e for e in chosen): 1})
+    if not square(point):
+        square = oracle.P.constant(n, 1)
+    c[0] = c[0] - square * (drop / square(point))
+    assert sum((p(point) * s**k for k, p in enumerate(c)), Fraction(0)) < 0
+    for strict in (True, False):
+        with pytest.raises(Rejected):
+            decide(c, witness, strict=strict)
+
+
+def test_a_zero_at_one_end_of_s_is_nonnegative_and_not_positive() -> None:
+    """c = s(1 + x²) and (1 - s)(1 + x²): 0 at an end; s(1 - s)(1 + x²): 0 at both."""
+    one = oracle.P(1, {(0,): 1, (2,): 1})
+    nothing = oracle.P(1)
+    witness = {"basis": [[0], [1]], "columns": [0, 0], "squares": {"unit": 0, "factors": [[]]}}
+    for c in ([nothing, one], [one, one * -1], [nothing, one, one * -1]):
+        assert decide(c, witness, strict=False) == 0
+        with pytest.raises(Rejected, match="not positive"):
+            decide(c, witness)
+    below = [nothing - oracle.P.constant(1, Fraction(1, 10**30)), one]
+    with pytest.raises(Rejected):
+        decide(below, witness, strict=False)
+
+
+def test_positive_except_at_the_origin_needs_a_pure_power_of_every_variable() -> None:
+    witness = {
+        "basis": [[1, 0], [0, 1], [1, 1]], "columns": [0, 0, 0],
+        "squares": {"unit": 0, "factors": [[]]},
+    }  # fmt: skip
+    x, y, xy = _squared([1, 0]), _squared([0, 1]), _squared([1, 1])
+    assert decide([oracle.P(2, x | y)], witness, how=positive_except_origin) > 0
+    for terms in (x | xy, y | xy, xy):
+        with pytest.raises(Rejected, match="pure power"):
+            decide([oracle.P(2, terms)], witness, how=positive_except_origin)
+    with pytest.raises(Rejected, match="no product"):
+        decide([oracle.P(2, x | y | {(0, 0): 1})], witness, how=positive_except_origin)
+    with pytest.raises(Rejected, match="no product"):
+        decide([oracle.P(2, x | y | {(1, 0): Fraction(1, 10**50)})], witness,
+               how=positive_except_origin)  # fmt: skip
+
+
+def _squared(exponents: list[int]) -> dict[oracle.Key, Fraction | int]:
+    return {tuple(2 * e for e in exponents): 1}
+
+
+def test_the_same_square_does_not_balance_two_cross_terms() -> None:
+    """x²y² is the square of xy and the product of x² and y²: it counts once."""
+    witness = {
+        "basis": [[2, 0], [0, 2], [1, 1]], "columns": [0, 0, 0],
+        "squares": {"unit": 0, "factors": [[]]},
+    }  # fmt: skip
+    c = oracle.P(2, {(4, 0): 1, (0, 4): 1, (2, 2): -2})  # (x² - y²)²: true, with zeros
+    with pytest.raises(Rejected):
+        decide([c], witness, strict=False)
+    assert decide([oracle.P(2, {(4, 0): 1, (0, 4): 1})], witness, strict=False) == 0

@@ -1,0 +1,346 @@
+"""Sampled funnels whose truth is known in closed form, and false ones with a counterexample."""
+
+import copy
+import math
+import random
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import pytest
+
+from nlsid_core import files
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from tests.core.kernel import oracle_sampled as oracle
+from tests.core.kernel.sampled_claims import DIGEST, Scalar
+
+UP = 1 + 1e-7  # of a bound over what is true
+
+
+def one_step(form: str, rng: random.Random, room: float) -> tuple[Scalar, bool]:
+    """x⁺ = a x + b u, one step; and whether its claim is true, from the closed form in Fractions.
+
+    room: by which part the claim is on the safe side of what is true; negative if it is false.
+    """
+    a, b, k, A = (rng.uniform(-1.0, 1.0) for _ in range(4))
+    S, S_next = rng.uniform(1.0, 1.9), rng.uniform(0.3, 0.45)
+    s, bound, rate = rng.uniform(0.5, 2.0), rng.uniform(0.01, 0.5), 1.0
+    if form == "fading":
+        rate = rng.uniform(0.7, 0.99)
+    slope, ratio = Fraction(a) - Fraction(b) * Fraction(k), Fraction(S_next) / Fraction(S)
+    mu, off = abs(slope) * ratio, abs(slope - Fraction(A)) * ratio  # of |x̄|, and of |r|
+    added = {"peak": Fraction(bound), "response": off * Fraction(bound)}.get(form, Fraction(0))
+    needed = mu * Fraction(s) + added
+    least_gain = Fraction(rate) / (Fraction(rate) - mu**2)  # gain μ² = (gain - 1) rate
+    of_gain = form in ("energy", "fading") and rng.random() < 0.5
+    after = float(needed) * (1 + (1e-5 if of_gain else room))
+    gain = float(least_gain) * (1 + (room if of_gain else 1e-5))
+    if form not in ("energy", "fading"):
+        gain = 1.0
+    elif gain < 1:
+        return one_step(form, rng, room)
+    reach = min(float(mu) * s * UP, float(Fraction(after) - added))  # claims what it needs
+    chains = ("tube", "inlet")
+    claim = Scalar(
+        {(1, 0): a, (0, 1): b},
+        x=[0.0, 0.0],
+        u=[0.0],
+        K=[k],
+        S=[S, S_next],
+        A=[A],
+        tube=[s, after],
+        inlet=[s, after],
+        reach={chain: [reach] for chain in chains},
+        sigma={chain: [[[float(mu)]]] for chain in chains},
+        form=form,
+        bound=bound,
+        measured=bound,
+        rate=rate,
+        gain=gain,
+    )
+    claim.curvature = [float(off if form == "response" else mu) * UP * S * claim.T(0)]
+    stays = needed <= Fraction(after)
+    forgets = form in ("peak", "response") or Fraction(gain) >= least_gain
+    return claim, stays and forgets
+
+
+@pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
+def test_random_claims_are_decided_as_the_closed_form_decides(form: str) -> None:
+    rng = random.Random(form)
+    decided = {True: 0, False: 0}
+    for i in range(60):
+        claim, true = one_step(form, rng, 1e-5 if i % 2 else -1e-5)
+        assert true == bool(i % 2)
+        if true:
+            assert claim.decide().margin >= 0
+        else:
+            with pytest.raises(CertificateRejected, match=r"reach|deviations"):
+                claim.decide()
+        decided[true] += 1
+    assert decided == {True: 30, False: 30}
+
+
+def cancelling(slope: float) -> Scalar:
+    """x⁺ = slope x + x²/2 - x u at x = u = 2^54: x̄⁺ = slope x̄ + x̄²/2, claimed for the slope 0.
+
+    As floats are summed, 1 + 2^54 - 2^54 is 0.
+    """
+    s, at, both = 0.125, 2.0**54, ("tube", "inlet")
+    after = s**2 / 2 * UP + 0.01
+    return Scalar(
+        {(1, 0): slope, (2, 0): 0.5, (1, 1): -1.0},
+        x=[at, slope * at - 2.0**107],
+        u=[at],
+        K=[0.0],
+        S=[1.0, 1.0],
+        A=[0.0],
+        tube=[s, after],
+        inlet=[s, after],
+        reach={chain: [s**2 / 2 * UP] for chain in both},
+        sigma={chain: [[[s / 2, 0.0], [0.0, 0.5]]] for chain in both},
+        bound=0.01,
+        measured=0.01,
+        curvature=[slope, 0.5],
+        basis=2,
+    )
+
+
+def test_numbers_that_cancel_in_floats_are_combined_exactly() -> None:
+    assert (1.0 + 2.0**54) - 2.0**54 == 0.0
+    assert cancelling(0.0).decide().margin >= 0
+    false = cancelling(1.0)
+    documents = false.documents()
+    s = Fraction(false.tube[0])
+    (after,) = oracle.explicit_next(documents["model"], documents["policy"], 0, [s])
+    assert after == s + s**2 / 2  # the counterexample: from the tube's edge to far outside
+    assert after > Fraction(false.tube[1])
+    with pytest.raises(CertificateRejected, match="tube, step 0: reach"):
+        false.decide()
+
+
+def true_claim(**changes: Any) -> Scalar:
+    """x⁺ = x/2 + u from 1 to 0.6, |d| <= 0.05."""
+    both = ("tube", "inlet")
+    base = Scalar(
+        {(1, 0): 0.5, (0, 1): 1.0},
+        x=[0.0, 0.0],
+        u=[0.0],
+        K=[0.0],
+        S=[1.0, 1.0],
+        A=[0.5],
+        tube=[1.0, 0.6],
+        inlet=[1.0, 0.6],
+        reach={chain: [0.5 * UP] for chain in both},
+        sigma={chain: [[[0.5]]] for chain in both},
+        bound=0.05,
+        measured=0.03125,
+        curvature=[0.5],
+        box=4.0,
+    )
+    return replace(base, **changes)
+
+
+def test_the_whole_verdict_of_a_small_claim() -> None:
+    assert str(true_claim().decide()) == (
+        "PROVED funnel: a state estimate that starts with |S[0] (xhat - x[0])| <= 1 stays in the "
+        "tube, |S[k] (xhat - x[k])| <= tube[k], at all 2 samples over 0.5 s and ends within level "
+        "0.6001 m of the nominal; one that starts with |S[0] (xhat - x[0])| <= 1 ends within level "
+        "0.6001 m of it; at the samples both stay in the box of the model's data, level in [-4, 4] "
+        "m, input in [-4, 4], margin 0.08333\n"
+        "  assuming disturbance peak |S d| <= 0.05 at every sample, d = xhat+ - f(xhat, u) "
+        "(largest of 1 distinct commissioning runs 0.03125, safety factor 1)\n"
+        "  assuming the input applied at every sample is the policy's, u[k] - K[k] (xhat - x[k])"
+    )
+
+
+@pytest.mark.parametrize(
+    ("form", "said"),
+    [
+        ("response", "|S r| <= 0.05, r+ = A r + d from r = 0, at every sample"),
+        ("energy", "sqrt(E) <= 0.05, E+ = E + 2 |S d|^2 from E = 0, at every sample"),
+        ("fading", "sqrt(E) <= 0.05, E+ = 0.875 E + 2 |S d|^2 from E = 0, at every sample"),
+    ],
+)
+def test_every_form_says_what_it_bounds(form: str, said: str) -> None:
+    gain, rate = (1.0 if form == "response" else 2.0), (0.875 if form == "fading" else 1.0)
+    claim = true_claim(form=form, gain=gain, rate=rate, curvature=[0.5])
+    verdict = claim.decide()
+    assert f"disturbance {form} {said}" in verdict.assumptions[0]
+    assert "tube[k] + bound, at all" in verdict.statement
+    assert "within level 0.6501 m" in verdict.statement  # 0.6 and the bound
+
+
+def test_repeated_commissioning_runs_count_once() -> None:
+    other = "sha256:" + 64 * "3"
+    verdict = true_claim(runs=[DIGEST, DIGEST, other, DIGEST]).decide()
+    assert "2 distinct commissioning runs" in verdict.assumptions[0]
+
+
+def test_samples_and_time_are_those_covered() -> None:
+    both = ("tube", "inlet")
+    claim = true_claim(
+        x=[0.0] * 4,
+        u=[0.0] * 3,
+        K=[0.0] * 3,
+        S=[1.0] * 4,
+        A=[0.5] * 3,
+        tube=[1.0] * 4,
+        inlet=[1.0] * 4,
+        reach={chain: [0.5 * UP] * 3 for chain in both},
+        sigma={chain: [[[0.5]]] * 3 for chain in both},
+        period=0.1,
+    )
+    assert "at all 4 samples over 0.3 s" in claim.decide().statement
+
+
+FALSE: dict[str, tuple[dict[str, Any], str]] = {
+    "next radius below what is reached": ({"tube": [1.0, 0.54]}, "exceed the next radius"),
+    "inlet's goal below what is reached": ({"inlet": [1.0, 0.54]}, "exceed the next radius"),
+    "reach below what is reached": (
+        {"reach": {"tube": [0.49], "inlet": [0.5 * UP]}, "tube": [1.0, 0.55]},
+        "tube, step 0: reach",
+    ),
+    "a tube that starts beyond the inlet": ({"inlet": [0.9, 0.6]}, "start in the inlet"),
+    "a radius of zero": ({"tube": [1.0, 0.0], "inlet": [1.0, 0.0]}, "should be positive"),
+    "a negative radius": ({"tube": [-1.0, 0.6]}, "should be positive"),
+    "a negative reach": ({"reach": {"tube": [-0.5], "inlet": [0.5]}}, "not be negative"),
+    "a box that the tube leaves": ({"box": 0.9}, "can leave the box"),
+    "half-widths below the tube's": ({"widths": [1.0, 0.59]}, "half-width"),
+    "a negative half-width": ({"widths": [1.0, -0.6]}, "half-width"),
+    "a bound below what was measured": ({"measured": 0.06}, "safety_factor x measured"),
+    "no commissioning run": ({"runs": []}, "commissioning runs"),
+    "a commissioning run without a digest": ({"runs": [""]}, "commissioning runs"),
+    "the fitting bag as a commissioning run": (
+        {"runs": [DIGEST, "sha256:" + 64 * "1"]},
+        "commissioning runs",
+    ),
+    "a gain without a form that has one": ({"gain": 2.0}, "none of form"),
+    "a rate above one": ({"form": "fading", "rate": 1.5, "gain": 2.0}, "none of form"),
+    "a rate that energy does not have": ({"form": "energy", "rate": 0.9, "gain": 2.0}, "none of"),
+    "an unknown form": ({"form": "average"}, "form 'average'"),
+    "a shape of zero": ({"S": [1.0, 0.0], "widths": [1.0, 9.0]}, "nonzero diagonal"),
+    "a name on two lines": ({"name": "level\nPROVED everything"}, "control characters"),
+    "a period of zero": ({"period": 0.0}, "positive period"),
+    "a whole number beyond 2^53": ({"box": 2**53 + 1}, "beyond 2\\^53"),
+    "curvature below the slope": ({"form": "response", "curvature": [0.5], "A": [-0.5]}, "curvat"),
+}
+
+
+@pytest.mark.parametrize("what", FALSE)
+def test_a_false_neighbour_of_a_small_claim_is_refused(what: str) -> None:
+    changes, reason = FALSE[what]
+    with pytest.raises(CertificateRejected, match=reason):
+        true_claim(**changes).decide()
+
+
+@pytest.mark.parametrize("role", ["model", "policy", "funnel"])
+@pytest.mark.parametrize("how", ["member more", "member less", "version", "kind"])
+def test_documents_that_are_not_exactly_as_specified_are_refused(role: str, how: str) -> None:
+    claim = true_claim()
+    document = copy.deepcopy(claim.documents()[role])
+    if how == "member more":
+        document["more"] = 1
+    elif how == "member less":
+        del document["kind"]
+    elif how == "version":
+        document["version"] = 1
+    else:
+        document["kind"] = "linear"
+    with pytest.raises(CertificateRejected):
+        claim.decide(**{role: document})
+
+
+def test_repeated_monomials_are_refused() -> None:
+    claim = true_claim()
+    model = copy.deepcopy(claim.documents()["model"])
+    model["exponents"].append([1, 0])
+    model["coefficients"].append([0.25])
+    with pytest.raises(CertificateRejected, match="distinct"):
+        claim.decide(model=model)
+
+
+def test_a_policy_that_the_funnel_was_not_made_for_is_a_mismatch() -> None:
+    claim = true_claim()
+    other = claim.documents()["policy"] | {"law": "another"}
+    with pytest.raises(CertificateMismatch, match="funnel policy: made for another"):
+        claim.decide(policy=other)
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Where the numbers of a document are."""
+    if isinstance(value, dict):
+        return [p for key, entry in value.items() for p in places(entry, (*at, key))]
+    if isinstance(value, list):
+        return [p for i, entry in enumerate(value) for p in places(entry, (*at, i))]
+    return [at] if isinstance(value, int | float) and at[-1] != "version" else []
+
+
+def mutated(document: Any, rng: random.Random) -> Any:
+    """The document with one number changed, or two exchanged."""
+    changed = copy.deepcopy(document)
+    first, second = (rng.choice(places(document)) for _ in range(2))
+
+    def get(path: tuple[Any, ...]) -> Any:
+        value = changed
+        for key in path:
+            value = value[key]
+        return value
+
+    def put(path: tuple[Any, ...], value: Any) -> None:
+        get(path[:-1])[path[-1]] = value
+
+    value, kind = get(first), rng.randrange(6)
+    if kind == 0:
+        put(first, get(second))
+        put(second, value)
+    elif isinstance(value, int):
+        put(first, value + rng.choice((-1, 1)) * 2 ** rng.randrange(41))
+    elif kind == 1:
+        put(first, math.nextafter(value, rng.choice((-math.inf, math.inf))))
+    elif kind == 2:
+        put(first, -value)
+    elif kind == 3:
+        put(first, rng.choice((0.0, 1.0, -0.0, 5e-324, 1e300)))
+    else:
+        put(first, value * (1 + rng.choice((-1, 1)) * 2.0 ** -rng.randrange(1, 40)))
+    return changed
+
+
+def signed(documents: dict[str, Any]) -> dict[str, Any]:
+    """The documents with every digest made to fit."""
+    model = documents["model"]
+    policy = documents["policy"] | {"model": files.digest(model)}
+    bound = {"model": policy["model"], "policy": files.digest(policy)}
+    return {"model": model, "policy": policy, "funnel": documents["funnel"] | bound}
+
+
+@pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
+def test_no_mutation_of_a_claim_is_proved_that_a_grid_of_states_refutes(form: str) -> None:
+    rng = random.Random(f"mutate {form}")
+    outcomes = {"proved": 0, "refused": 0}
+    refutations: set[str] = set()
+    for i in range(200):
+        if i % 20 == 0:
+            claim, true = one_step(form, rng, 1e-5)
+            assert true
+        documents, proof = claim.documents(), claim.proof()
+        role = rng.choice(("model", "policy", "funnel", "proof"))
+        if role == "proof":
+            proof = mutated(proof, rng)
+        else:
+            documents = signed(documents | {role: mutated(documents[role], rng)})
+        try:
+            claim.decide(**documents, proof=proof)
+        except CertificateRejected:
+            outcomes["refused"] += 1
+            powers = [e for row in documents["model"]["exponents"] for e in row]
+            if role != "proof" and set(powers) <= {0, 1, 2, 3}:
+                try:
+                    refutations.add(oracle.refuted(documents))
+                except (ZeroDivisionError, OverflowError, TypeError, ValueError):
+                    continue
+        else:
+            assert oracle.refuted(documents) == ""
+            outcomes["proved"] += 1
+    assert min(outcomes.values()) > 30
+    assert refutations >= {"reach" if form == "peak" else "half-width", "bound"}

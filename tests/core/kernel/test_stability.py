@@ -1,0 +1,428 @@
+"""The claim `stability` of every class: oracle, sentence, exact counterexamples, forgeries."""
+
+import json
+import random
+from collections.abc import Callable
+from decimal import Context, Decimal
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlsid_core import files, proofs
+from nlsid_core.arrays import Json
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from nlsid_core.identification import prove_stability
+from nlsid_core.kernel import increments
+from nlsid_core.kernel.files import parse
+from tests.core.kernel import oracle_stability as oracle
+from tests.core.kernel.stability_claims import (
+    CONSTANT,
+    MODELS,
+    claim,
+    decide,
+    linear,
+    state_affine,
+)
+
+NAMES = list(MODELS)
+MATHEMATICS = ("decrease", "P is not")  # what a proof is refused for though its form is right
+
+
+def where(name: str, model: Json) -> str:
+    """The last part of the sentence, rounded by the decimal module."""
+    if name == "cascade":
+        low, high = oracle.slopes(model)
+        covered = f"[{rounded(low, 'ROUND_FLOOR')}, {rounded(high, 'ROUND_CEILING')}]"
+        return f"for every input (the slopes of its nonlinearity are in {covered} everywhere)"
+    if name in ("linear", "monotone"):
+        return "for every input"
+    low, high = map(Fraction, model["u_range"][0])
+    inner = f"[{rounded(low, 'ROUND_CEILING')}, {rounded(high, 'ROUND_FLOOR')}]"
+    return f"for every input (the model clips its inputs: command in {inner} V)"
+
+
+def rounded(value: Fraction, mode: str) -> str:
+    four = Context(prec=4, rounding=mode)
+    return f"{four.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize():f}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_sentence_is_this_and_the_oracle_agrees(name: str) -> None:
+    model, proof = claim(name)
+    verdict = decide(model, proof)
+    rate = proof["claim"]["rate"]
+    shown = rounded(Fraction(rate), "ROUND_CEILING")
+    assert verdict.statement == (
+        "incremental stability: two solutions with the same input approach each other, in the "
+        f"norm of P, by a factor of {shown} or less a sample of {model['period']} s, "
+        + where(name, model)
+    )
+    assert verdict.assumptions == ()
+    assert verdict.margin == 1 - Fraction(rate)
+    assert oracle.is_proved(model, proof["claim"], proof["proof"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_kernels_matrices_are_those_of_the_specification(name: str) -> None:
+    model, _ = claim(name)
+    form = increments.read_model(parse(files.encode(model), "model"))
+    F, m, box = oracle.increments(model)
+    assert F == form.F
+    assert box == form.box
+    assert m == form.unknowns
+    if m:
+        expected = oracle.vertices(model, box)
+        assert expected is not None
+        found = form.vertices(form.box, None)
+        # Extreme ones only, where one entry varies: each found is expected, each end is found.
+        assert all(E in expected for E in found)
+        for i in range(m):
+            for j in range(len(F[0])):
+                values = [E[i][j] for E in expected]
+                kept = [E[i][j] for E in found]
+                assert (min(values), max(values)) == (min(kept), max(kept))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
+    """Every number moved at random, a little or by its size: true and false claims."""
+    rng = random.Random(name)
+    decided = {True: 0, False: 0}
+    for trial in range(40):
+        model, proof = claim(name)
+        size = 10.0 ** rng.uniform(-5, 1)
+        change = rng.choice(("rate", "P", "N", "model"))
+        if change == "rate":
+            proof["claim"]["rate"] *= 1 + size * rng.choice((-1, 1))
+        elif change == "P":
+            _move(proof["proof"]["P"], size, rng, symmetric=True)
+        elif change == "N" and "multipliers" in proof["proof"]:
+            _move(_a_leaf(proof["proof"]["multipliers"], rng)["N"], size, rng)
+        elif name == "cascade":
+            _move([model["f"]["coefficients"], model["b1"][0]], size, rng)
+        elif name == "monotone":
+            _move([model["e"], model["a"]], size, rng)
+        elif name == "linear":
+            _move([model["a"]], size, rng)
+        else:
+            _move([row for block in model["G"][trial % 2]["coefficients"] for row in block],
+                  size, rng)  # fmt: skip
+        truth = oracle.is_proved(model, proof["claim"], proof["proof"])
+        decided[truth] += 1
+        if truth:
+            decide(model, proof)
+        else:
+            with pytest.raises(CertificateRejected):
+                decide(model, proof)
+    assert min(decided.values()) >= 5, decided
+
+
+def _move(
+    rows: list[list[float]], size: float, rng: random.Random, *, symmetric: bool = False
+) -> None:
+    i = rng.randrange(len(rows))
+    j = rng.randrange(len(rows[i]))
+    rows[i][j] = rows[i][j] * (1 + size * rng.choice((-1, 1))) + size * 1e-3
+    if symmetric:
+        rows[j][i] = rows[i][j]
+
+
+def _a_leaf(tree: Json, rng: random.Random) -> Json:
+    while "parts" in tree:
+        tree = rng.choice(tree["parts"])
+    return tree
+
+
+@pytest.mark.parametrize("name", [n for n in NAMES if n not in ("cascade", "monotone", "linear")])
+def test_solutions_of_the_model_itself_approach_at_the_stated_rate(name: str) -> None:
+    """Exact steps 0 = Σ G_k(w) Δ(t-k) at random inputs of the range, and at its ends."""
+    model, proof = claim(name)
+    rng, rate = random.Random(1), Fraction(proof["claim"]["rate"])
+    P = [[Fraction(entry) for entry in row] for row in proof["proof"]["P"]]
+    _, p, box = oracle.increments(model)
+    n = len(P)
+    for _ in range(100):
+        w = [low + (high - low) * Fraction(rng.choice((0, 8, rng.randrange(9))), 8)
+             for low, high in box]  # fmt: skip
+        E = oracle.value_at(model, w)
+        x = [[Fraction(rng.randrange(-9, 10))] for _ in range(n)]
+        right = [[-sum((E[a][p + k] * x[k][0] for k in range(n)), Fraction(0))] for a in range(p)]
+        after = (oracle.solved([row[:p] for row in E], right) + x)[:n]
+        assert _V(P, after) <= rate**2 * _V(P, x)
+
+
+def _V(P: oracle.Rows, x: oracle.Rows) -> Fraction:
+    n = range(len(P))
+    return sum((P[i][j] * x[i][0] * x[j][0] for i in n for j in n), Fraction(0))
+
+
+# -- claims that are false, each with its counterexample -------------------------------------
+
+
+def test_a_sum_that_floating_point_loses_is_not_lost() -> None:
+    """G_0 = w0 - 1e16 + 1e16 … as one term after another cancels to 0.5 at w = 0, not to 1.5."""
+    model, proof = claim("quadratic")
+    model["G"][0]["exponents"] += [[1, 0], [0, 1]]
+    model["G"][0]["coefficients"] += [[[1e16]], [[-1e16]]]
+    # At w = (0, 1e-16): G_0 = 1 - 1 + … = 0, where the next output is not determined.
+    box = oracle.increments(model)[2]
+    w = [Fraction(0), Fraction(1, 10**16)]
+    assert all(low <= entry <= high for entry, (low, high) in zip(w, box, strict=True))
+    assert abs(oracle.value_at(model, w)[0][0]) < Fraction(1, 10**15)
+    with pytest.raises(CertificateRejected):
+        decide(model, proof)
+
+
+def test_a_repeated_monomial_is_refused() -> None:
+    model, proof = claim("quadratic")
+    model["G"][0]["exponents"][1] = [0, 0]
+    with pytest.raises(CertificateRejected, match="each once"):
+        decide(model, proof)
+
+
+def test_a_whole_number_beyond_two_to_the_53_is_refused() -> None:
+    model, proof = claim("linear")
+    proof["proof"]["P"][0][0] = 2**53 + 1
+    with pytest.raises(CertificateRejected, match=r"beyond 2\^53"):
+        decide(model, proof)
+
+
+def test_a_box_far_away_keeps_every_digit_of_its_ends() -> None:
+    """G_0 = (w - 1e9)² - 2, w in [1e9 + 9, 1e9 + 11]: as exact numbers it is at least 79."""
+    G_0 = ([[0, 0], [1, 0], [2, 0]], [1e18 - 2.0, -2e9, 1.0])
+    model = state_affine(G_0, (CONSTANT, [-40.0]))
+    ranges = np.array([[1000000009.0, 1000000011.0]])
+    far = model.document() | {"u_range": ranges.tolist(), "u_offset": [0.0], "u_scale": [1.0]}
+    form = increments.read_model(parse(files.encode(far), "model"))
+    lead = [E[0][0] for E in form.vertices(form.box, None)]
+    exact = (Fraction(9) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2),
+             Fraction(11) ** 2 - 2 + (Fraction(1e18 - 2.0) - 10**18 + 2))  # fmt: skip
+    assert (min(lead), max(lead)) == exact
+
+
+def test_a_rate_of_nearly_one_is_not_printed_as_one() -> None:
+    model = linear().document() | {"a": [0.99999, 0.0, 0.0]}
+    about = {"model": proofs.binding("model.json", model)}
+    P = [[1.0, 0.0, 0.0], [0.0, 1e6, 0.0], [0.0, 0.0, 1e12]]
+    rate = 0.999995
+    stated = {"kind": "stability", "about": about, "rate": rate}
+    proof = proofs.proof_document(stated, {"P": P})
+    if not oracle.is_proved(model, stated, proof["proof"]):
+        found = prove_stability(type(linear()).from_document(model))
+        assert found is not None
+        proof = found.document(type(linear()).from_document(model), "model.json")
+        rate = found.rate
+    said = decide(model, proof).statement.split("by a factor of ")[1].split(" or less")[0]
+    assert Fraction(rate) <= Fraction(said) < 1
+
+
+def test_the_slopes_are_those_of_the_spline() -> None:
+    """One larger coefficient makes a slope of 2·10⁶; at it V grows: the claim is false."""
+    model, proof = claim("cascade")
+    model["f"]["coefficients"][-1] += 1e6
+    assert oracle.slopes(model)[1] > 1e6
+    F, m, _ = oracle.increments(model)
+    _, n1, n2, C, _ = oracle.cascade(model)
+    P = [[Fraction(entry) for entry in row] for row in proof["proof"]["P"]]
+    s = oracle.slopes(model)[1]
+    x = [[Fraction(1)]] + [[Fraction(0)] for _ in range(n1 + n2 - 1)]
+    nu = [[s * C[j][0]] for j in range(m)]
+    after = [[sum((f * z[0] for f, z in zip(row, nu + x, strict=True)), Fraction(0))] for row in F]
+    assert _V(P, after) > _V(P, x)
+    with pytest.raises(CertificateRejected, match="decrease"):
+        decide(model, proof)
+
+
+def test_a_flat_place_of_e_has_no_next_output() -> None:
+    """e' = 0 at v = -1: 3 + 6v + 3v²."""
+    model, proof = claim("monotone")
+    model["e"] = [3.0, 3.0, 1.0]
+    with pytest.raises(CertificateRejected, match="decrease"):
+        decide(model, proof)
+
+
+@pytest.mark.parametrize("e", [[1.0, 0.1, 0.0], [3.0, 0.0, -1.0]])
+def test_what_is_no_increasing_cubic_is_refused(e: list[float]) -> None:
+    model, proof = claim("monotone")
+    model["e"] = e
+    with pytest.raises(CertificateRejected, match="not increasing"):
+        decide(model, proof)
+
+
+# -- smallest false neighbours ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_rate_below_the_fastest_is_refused_and_a_slower_one_proved(name: str) -> None:
+    for factor, proved in ((1.001, True), (0.9, False)):
+        model, proof = claim(name)
+        proof["claim"]["rate"] = min(proof["claim"]["rate"] * factor, 1 - 1e-9)
+        if proved:
+            decide(model, proof)
+        else:
+            with pytest.raises(CertificateRejected, match="decrease"):
+                decide(model, proof)
+
+
+@pytest.mark.parametrize("rate", [1.0, 1.5, 0.0, -0.9])
+def test_a_rate_that_is_no_decay_is_refused(rate: float) -> None:
+    model, proof = claim("linear")
+    proof["claim"]["rate"] = rate
+    with pytest.raises(CertificateRejected, match="0 < rate < 1"):
+        decide(model, proof)
+
+
+@pytest.mark.parametrize("value", ["1", None, True, [1.0], {"a": 1}])
+def test_a_rate_of_another_type_is_refused(value: object) -> None:
+    model, proof = claim("linear")
+    proof["claim"]["rate"] = value
+    with pytest.raises(CertificateRejected, match="rate should be a number"):
+        decide(model, proof)
+
+
+def _lower_half(proof: Json) -> None:
+    proof["multipliers"] = proof["multipliers"]["parts"][0]
+
+
+CHANGES: dict[str, tuple[str, Callable[[Json, Json], None], str]] = {
+    "unstable": ("linear", lambda m, _: m.update(a=[1.9, -0.85, 0.0]), "decrease"),
+    "negative P": ("linear", lambda _, p: p.update(P=(-np.array(p["P"])).tolist()), "P is not"),
+    "triangular P": ("linear", lambda _, p: p.update(P=np.triu(p["P"]).tolist()), "symmetric"),
+    "small P": ("linear", lambda _, p: p.update(P=[[1.0]]), "shape"),
+    "multipliers": ("linear", lambda _, p: p.update(multipliers={"N": []}), "no multipliers"),
+    "stranger": ("linear", lambda _, p: p.update(lower=1.0), "unknown member"),
+    "no multipliers": ("quadratic", lambda _, p: p.pop("multipliers"), "needs multipliers"),
+    "wider box": ("moving_lags", lambda m, _: m.update(u_range=[[-8.0, 20.0]]), "decrease"),
+    "empty box": ("quadratic", lambda m, _: m.update(u_range=[[1.0, 1.0]]), "not empty"),
+    "no scale": ("quadratic", lambda m, _: m.update(u_scale=[0.0]), "positive"),
+    "other range": ("quadratic", lambda m, _: m.update(on_out_of_range="ignore"), "clip, refuse"),
+    "half the box": ("split", lambda _, p: _lower_half(p), "decrease"),
+    "no such variable": ("split", lambda _, p: p["multipliers"].update(split=2), "from 0 to 1"),
+    "three parts": ("split", lambda _, p: p["multipliers"].update(
+        parts=[p["multipliers"]["parts"][0]] * 3), "2 to 2"),
+    "exchanged parts": ("split", lambda _, p: p["multipliers"]["parts"].reverse(), "decrease"),
+    "a higher low end": ("ends", lambda _, p: p["multipliers"]["ends"].update(
+        low=p["multipliers"]["ends"]["low"] + 1e-4), "the low end"),
+    "a lower high end": ("ends", lambda _, p: p["multipliers"]["ends"].update(
+        high=p["multipliers"]["ends"]["high"] - 1e-4), "the high end"),
+    "ends of a wider box": ("ends", lambda m, _: m.update(u_range=[[-8.0, 20.0]]), "end of the"),
+    "a negative weight": ("ends", lambda _, p: p["multipliers"]["ends"].update(
+        low_weights=[-1.0] * len(p["multipliers"]["ends"]["low_weights"])), "0 or more"),
+    "ends of moving lags": ("split", lambda _, p: p.update(
+        multipliers={"N": [[1.0], [0.0]], "ends": {}}), "constant factors"),
+    "ends of nothing": ("monotone", lambda _, p: p["multipliers"].update(ends={}), "multiplier N"),
+    "leaf and node": ("split", lambda _, p: p["multipliers"].update(N=[[1.0]]), "a multiplier N"),
+    "singular": ("constant", lambda m, _: m["G"][0].update(
+        coefficients=[[[1.0, 0.5], [2.0, 1.0]]]), "decrease"),
+    "slower": ("constant", lambda m, _: m["G"][1]["coefficients"][0][1].__setitem__(1, -1.05),
+               "decrease"),
+    "ray": ("monotone", lambda _, p: p["multipliers"]["N"][1].__setitem__(0, 1e-9), r"\(T, 0"),
+    "negative T": ("monotone", lambda _, p: p["multipliers"].update(
+        N=(-np.array(p["multipliers"]["N"])).tolist()), r"\(T, 0"),
+    "pole outside": ("cascade", lambda m, _: m.update(a1=[1.9, -1.05]), "decrease"),
+    "pole on the circle": ("cascade", lambda m, _: m.update(a2=[1.0]), "decrease"),
+    "closer knots": ("cascade", lambda m, _: m["f"].update(spacing=0.05), "decrease"),
+    "no spacing": ("cascade", lambda m, _: m["f"].update(spacing=0.0), "spacing"),
+    "stronger": ("cascade", lambda m, _: m["b1"][1].__setitem__(0, 50.0), "decrease"),
+    "ragged": ("cascade", lambda m, _: m["b1"][1].append(0.0), "equal lengths"),
+    "another kind": ("linear", lambda m, _: m.update(kind="state_map"), "known: "),
+    "a note": ("linear", lambda m, _: m.update(note="stable"), "unknown member 'note'"),
+    "no period": ("linear", lambda m, _: m.update(period=0.0), "period"),
+    "a name on two lines": ("linear", lambda m, _: m["y"].update(name="a\nPROVED"), "control"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_forgery_with_right_digests_is_refused(change: str) -> None:
+    name, made, reason = CHANGES[change]
+    model, proof = claim(name)
+    made(model, proof["proof"])
+    if reason in MATHEMATICS:
+        assert not oracle.is_proved(model, proof["claim"], proof["proof"])
+    with pytest.raises(CertificateRejected, match=reason):
+        decide(model, proof)
+
+
+def test_too_much_work_is_refused_before_it_is_done() -> None:
+    """Nine inputs of degree 4 have 5⁹ coefficients."""
+    model, proof = claim("quadratic")
+    model["window"] = [[0, d % 3] for d in range(9)]
+    model["G"] = [{"exponents": [[4] * 9], "coefficients": [[[1.0]]]}] + [
+        {"exponents": [[0] * 9], "coefficients": [[[0.1]]]} for _ in range(2)
+    ]
+    model["p"] = {"exponents": [[0] * 9], "coefficients": [[0.0]]}
+    proof["proof"]["multipliers"] = {"N": [[1.0], [0.0], [0.0]]}
+    with pytest.raises(CertificateRejected, match="too many coefficients"):
+        decide(model, proof)
+
+
+def test_an_endless_tree_is_refused() -> None:
+    model, proof = claim("split")
+    tree: Json = {"N": [[1.0], [0.0]]}
+    for _ in range(60):
+        tree = {"split": 0, "parts": [tree, {"N": [[1.0], [0.0]]}]}
+    proof["proof"]["multipliers"] = tree
+    with pytest.raises(CertificateRejected):
+        decide(model, proof)
+
+
+# -- files -----------------------------------------------------------------------------------
+
+
+def written(folder: Path, name: str = "linear") -> Path:
+    model, proof = claim(name)
+    files.write_document(folder / "model.json", model)
+    files.write_document(folder / "model.proof.json", proof)
+    return folder / "model.proof.json"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_changed_digit_in_a_model_is_refused(tmp_path: Path, name: str) -> None:
+    path, model = written(tmp_path, name), tmp_path / "model.json"
+    original = model.read_text()
+    digits = [i for i, c in enumerate(original) if c in "12345678"]
+    for i in digits[:: max(1, len(digits) // 20)]:
+        model.write_text(original[:i] + str(int(original[i]) + 1) + original[i + 1 :])
+        with pytest.raises(CertificateMismatch, match=r"model\.json is not the model"):
+            proofs.check(path)
+
+
+@pytest.mark.parametrize("file", ["../model.json", "/etc/hostname", "a/b.json", "", "..\\x"])
+def test_a_file_name_that_leaves_the_folder_is_refused(tmp_path: Path, file: str) -> None:
+    path = written(tmp_path)
+    document = json.loads(path.read_text())
+    document["claim"]["about"]["model"]["file"] = file
+    files.write_document(path, document)
+    with pytest.raises(CertificateRejected, match="not a plain file name"):
+        proofs.check(path)
+
+
+@pytest.mark.parametrize("place", [("claim",), ("proof",), ("claim", "about"), ("claim", "kind")])
+def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str, ...]) -> None:
+    path = written(tmp_path)
+    document = json.loads(path.read_text())
+    inner = document
+    for key in place[:-1]:
+        inner = inner[key]
+    del inner[place[-1]]
+    files.write_document(path, document)
+    with pytest.raises(CertificateRejected, match=f"{place[-1]}.*missing|object with a kind"):
+        proofs.check(path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_proof_that_is_written_by_the_prover_is_the_same_every_time(name: str) -> None:
+    model = MODELS[name]()
+    first, second = (prove_stability(model) for _ in range(2))
+    assert first is not None
+    assert second is not None
+    assert first.document(model, "m.json") == second.document(model, "m.json")
+
+
+def test_what_is_not_stable_is_not_proved() -> None:
+    unstable = state_affine((CONSTANT, [1.0]), (CONSTANT, [-1.01]))
+    assert prove_stability(unstable) is None
+    for_some = state_affine(([[0, 0], [1, 0]], [1.0, 0.3]), (CONSTANT, [-0.8]))
+    assert prove_stability(for_some) is None  # G_0 = 0.53 at the lower end

@@ -1,0 +1,238 @@
+"""Continuous funnels at run time: held inputs, stages, the end; the same Monitor and Controller."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.chain.joint_bags import JOINTS, _make
+from bags.designs.design import WiredDesign, Wiring
+from bags.monitoring.announcement import Run
+from bags.monitoring.replay import replay_messages
+from bags.monitoring.watch import Watch
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
+from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Status
+from tests.continuous_stage import stage
+
+HELD = 0.02  # s
+LIMITS = Limits(lowest=-20.0, highest=20.0, stop_rate=1.0)
+
+
+def driven(
+    controller: Controller, monitor: Monitor, start: float, *, push: float = 0.0
+) -> tuple[list[FloatArray], list[Status]]:
+    """The exact solution of ẋ = u between samples, inputs held, until the controller ends."""
+    x, said, states = np.array([start]), [], []
+    for k in range(200):
+        u = controller.update(k * HELD, x)
+        states.append(x)
+        said.append(monitor.update(k * HELD, x, u).status)
+        if controller.ended:
+            break
+        x = x + HELD * u + (push if k == 20 else 0.0)
+    return states, said
+
+
+def test_a_held_policy_stays_inside_and_ends_before_an_input_would_act_beyond_the_proof() -> None:
+    field, policy, funnel = stage()
+    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
+    monitor = Monitor(field, policy, funnel, period=HELD)
+    states, said = driven(controller, monitor, 0.15)
+    assert set(said) == {Status.INSIDE}
+    assert controller.ended == "the proof is over"
+    assert len(states) == round(1.0 / HELD) + 1, "the last input acts until the end"
+    for k, x in enumerate(states):
+        radius = math.sqrt(np.interp(k * HELD, funnel.t, funnel.rho))
+        assert abs(x[0] - k * HELD) <= radius
+
+
+def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() -> None:
+    field, policy, funnel = stage()
+    x = np.array([0.1])
+    reading = Monitor(field, policy, funnel, period=HELD).update(0.0, x, policy(0.0, x))
+    assert (
+        reading.assuming == "the policy is applied continuously; here each input is held for 0.02 s"
+    )
+    assert math.isnan(reading.assumption)
+    assert reading.margin == pytest.approx(0.5)
+    assert (reading.worst_axis, reading.nominal, reading.measured) == ("x0", (0.0,), (0.1,))
+    pushed = VectorField.from_function(lambda x, u, w: [u[0] + w[0]], 1, 1, uncertain=[[-1.0, 1.0]])  # noqa: ARG005
+    policy = replace(policy, vector_field=files.digest(pushed.document()))
+    funnel = replace(
+        funnel, vector_field=policy.vector_field, policy=files.digest(policy.document())
+    )
+    reading = Monitor(pushed, policy, funnel, period=HELD).update(0.0, x, policy(0.0, x))
+    assert reading.assuming.endswith("held for 0.02 s, and w stays in its box")
+
+
+def test_a_push_is_outside_and_another_input_is_not_the_policys() -> None:
+    field, policy, funnel = stage()
+    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
+    _, said = driven(controller, Monitor(field, policy, funnel, period=HELD), 0.0, push=0.5)
+    assert said[20] is Status.INSIDE
+    assert said[21] is Status.OUTSIDE
+    monitor, x = Monitor(field, policy, funnel, period=HELD), np.array([0.0])
+    reading = monitor.update(0.0, x, policy(0.0, x) + 0.1)
+    assert reading.status is Status.ASSUMPTION_VIOLATED
+    assert "u0 1.1 is not the policy's 1" in reading.reason
+
+
+@pytest.mark.parametrize(
+    ("t", "x", "u", "reason"),
+    [
+        (HELD, [math.nan], [1.0], "state"),
+        (HELD, [HELD], None, "no input"),
+        (HELD, [HELD], [math.nan], "no input"),
+        (3 * HELD, [HELD], [1.0], "sample 1 of the run is missing"),
+        (1.5 * HELD, [HELD], [1.0], "from when the next one"),
+        (-HELD, [HELD], [1.0], "time went back"),
+    ],
+)
+def test_what_cannot_be_judged_ends_the_run(
+    t: float, x: list[float], u: list[float] | None, reason: str
+) -> None:
+    field, policy, funnel = stage()
+    monitor = Monitor(field, policy, funnel, period=HELD)
+    assert monitor.update(0.0, [0.0], [1.0]).status is Status.INSIDE
+    for reading in (monitor.update(t, x, u), monitor.update(2 * HELD, [0.0], [1.0])):
+        assert reading.status is Status.UNKNOWN
+        assert reason in reading.reason
+
+
+def test_after_the_end_nothing_is_claimed() -> None:
+    field, policy, funnel = stage()
+    monitor = Monitor(field, policy, funnel, period=0.25)
+    for k in range(4):
+        assert monitor.update(0.25 * k, [0.25 * k], [1.0]).status is Status.INSIDE
+    assert monitor.update(1.0, [1.0], None).status is Status.INSIDE
+    reading = monitor.update(1.25, [1.25], [1.0])
+    assert (reading.status, reading.reason) == (
+        Status.UNKNOWN,
+        "the proof covers 1 s; they are over",
+    )
+
+
+def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
+    """At 0.8 s of the first stage 0.15 m is outside, at the second's start it is inside."""
+    first, second = stage(), stage(1.0, 0.3)
+    monitor = Monitor.of_stages([first, second], period=0.2)
+    said = []
+    for k in range(11):
+        t = 0.2 * k
+        x = np.array([t + (0.15 if 3 < k < 6 else 0.0)])
+        policy = first[1] if t < 1.0 - 1e-9 else second[1]
+        said.append(monitor.update(t, x, policy(t, x)).status)
+    radius = 0.2 - 0.1 * 0.8
+    assert radius < 0.15 < 0.3
+    outside = [k for k, status in enumerate(said) if status is Status.OUTSIDE]
+    assert outside == [4]
+    assert set(said) == {Status.INSIDE, Status.OUTSIDE}
+    controller = Controller.of_stages([first, second], limits=LIMITS, settling=1.0, period=HELD)
+    states, said = driven(controller, Monitor.of_stages([first, second], period=HELD), 0.1)
+    assert controller.ended == "the proof is over"
+    assert len(states) == round(2.0 / HELD) + 1
+    assert set(said) == {Status.INSIDE}
+    with pytest.raises(CertificateMismatch, match="do not follow"):
+        Monitor.of_stages([second, first], period=HELD)
+
+
+def test_a_clipped_policy_is_proved_as_it_is_and_other_limits_end_the_run() -> None:
+    field, policy, funnel = stage(limit=1.2)
+    controller = Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=HELD)
+    assert controller.update(0.0, np.array([-0.15])) == pytest.approx(1.2)
+    narrow = Limits(lowest=-1.1, highest=1.1, stop_rate=1.0)
+    controller = Controller(field, policy, funnel, limits=narrow, settling=1.0, period=HELD)
+    controller.update(0.0, np.array([-0.15]))
+    assert "is not proved" in controller.ended
+    with pytest.raises(DataError, match="beyond the limits"):
+        Controller(
+            field,
+            policy,
+            funnel,
+            limits=Limits(lowest=0.0, highest=0.5, stop_rate=1.0),
+            settling=1.0,
+            period=HELD,
+        )
+
+
+def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
+    field, policy, funnel = stage()
+    controller = Controller(field, policy, funnel, limits=LIMITS, settling=0.1, period=HELD)
+    for k in range(10):
+        controller.update(k * HELD, np.array([0.5]))
+    assert "not at the start of the plan after 0.1 s" in controller.ended
+
+
+def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
+    field, policy, funnel = stage()
+    with pytest.raises(DataError, match="need a period"):
+        Monitor(field, policy, funnel)
+    with pytest.raises(DataError, match="need a period"):
+        Controller(field, policy, funnel, limits=LIMITS, settling=1.0)
+    with pytest.raises(CertificateMismatch, match="another policy"):
+        Monitor(field, stage(limit=2.0)[1], funnel, period=HELD)
+    with pytest.raises(ShapeError):
+        Monitor(field, policy, funnel, period=HELD).update(0.0, [0.0, 0.0], [1.0])
+
+
+def test_a_design_needs_to_be_told_where_its_signals_are() -> None:
+    design = WiredDesign(*stage())
+    with pytest.raises(DataError, match="names no signals"):
+        _ = design.response
+    wired = replace(
+        design, wiring=Wiring.parse(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
+    )
+    assert str(wired.response) == "/joints:position[0]"
+    watch = Watch(wired, announced=True)
+    said = watch.begin(0)
+    for k in range(3):
+        stamp_ns = round(k * HELD * 1e9)
+        x = np.array([k * HELD + 0.05])
+        said += watch.response(stamp_ns, x)
+        said += watch.excitation(stamp_ns, wired.policy(k * HELD, x))
+    assert [entry.reading.status for entry in said] == [Status.INSIDE] * 3
+
+
+def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_path: Path) -> None:
+    """The state in one message, the input in another, on a clock of nanoseconds."""
+    field, policy, funnel = stage()
+    wiring = Wiring.parse(["/joints:position[0]"], ["/effort:effort[0]"], HELD)
+    design = WiredDesign(field, policy, funnel, wiring)
+    controller = design.controller(LIMITS, 1.0)
+    x: FloatArray = np.array([0.1])
+    samples: list[tuple[FloatArray, FloatArray]] = []
+    while not controller.ended:
+        u = controller.update(len(samples) * HELD, x)
+        samples.append((x, u))
+        x = x + HELD * u
+    start_ns, period_ns, empty = 10**12, round(HELD * 1e9), np.zeros(0)
+    with BagWriter(tmp_path / "bag") as writer:
+
+        def write(topic: str, kind: str, stamp_ns: int, content: object) -> None:
+            data = bytes(standard_types().serialize_cdr(content, kind, little_endian=True))
+            writer.write(topic, kind, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
+
+        text = files.encode(Run(start_ns, design.digest).document()).decode()
+        string = "std_msgs/msg/String"
+        write("/controller/run", string, start_ns, _make(string, text))
+        for k, (state, effort) in enumerate([(samples[0][0], np.ones(1)), *samples]):
+            stamp_ns = start_ns + (k - 1) * period_ns
+            stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
+            header = _make("std_msgs/msg/Header", stamp, "")
+            write("/joints", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], state, empty, empty))
+            write("/effort", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], empty, empty, effort))
+    replayed = [entry.reading for entry in replay_messages(design, tmp_path / "bag")]
+    assert replayed[0].reason == "waiting for the controller to announce its start"
+    monitor = Monitor(field, policy, funnel, period=HELD)
+    direct = [monitor.update(k * period_ns / 1e9, x, u) for k, (x, u) in enumerate(samples)]
+    assert [r.margin for r in replayed[1:]] == [r.margin for r in direct]
+    assert {r.status for r in replayed[1:]} == {Status.INSIDE}

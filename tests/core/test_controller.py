@@ -1,0 +1,147 @@
+"""The controller in the loop with simulated plants, without ROS."""
+
+import math
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.errors import DataError
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.plants import ModelPlant, Pendulum, Satellite
+from nlsid_core.running.reading import Reading, Status
+from tests.conftest import PERIOD
+
+WIDE = Limits(lowest=-10.0, highest=10.0, stop_rate=1.0)
+
+
+@pytest.fixture(scope="module")
+def moving(design: TubeDesign, train: Dataset) -> TubeDesign:
+    """A tube that starts at a speed, so that the policy may also take input away."""
+    profile = [(0.0, 0.3), (2.0, 0.3), (5.0, 0.5), (7.0, 0.5)]
+    return design_tube(design.model, train, profile=profile, horizon=7.0, inlet=0.02)
+
+
+def closed_loop(
+    design: TubeDesign, *, noise: float, push: float
+) -> tuple[Controller, list[Reading]]:
+    """A run on the design's own model, pushed for four samples in the middle."""
+    plant = ModelPlant(design.model)
+    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=30.0)
+    monitor = Monitor(design.model, design.policy, design.funnel, centre=Centre.PROFILE)
+    rng = np.random.default_rng(4)
+    n = len(design.model)
+    history: list[tuple[float, float]] = []
+    readings: list[Reading] = []
+    k = 0
+    while not controller.ended:
+        u, index = controller.u, controller.k
+        y = float(plant.measure(np.array([u]))[0]) + noise * rng.standard_normal()
+        plant.step(np.array([u]), np.array([push if 20 <= index < 24 else 0.0]))
+        if index == 0:
+            for j in range(n):
+                monitor.update((k - n + j) * PERIOD, *history[j - n])
+        if index >= 0:
+            readings.append(monitor.update(k * PERIOD, y, u))
+        history.append((y, u))
+        controller.update(k * PERIOD, y)
+        k += 1
+    return controller, readings
+
+
+def test_the_monitor_finds_every_input_to_be_the_policys(moving: TubeDesign) -> None:
+    controller, readings = closed_loop(moving, noise=0.002, push=0.0)
+    assert controller.ended == "the plan is over"
+    assert len(readings) == len(moving.policy)
+    assert {reading.status for reading in readings} == {Status.INSIDE}
+
+
+def test_a_push_beyond_the_budget_is_seen_as_one(moving: TubeDesign) -> None:
+    _, readings = closed_loop(moving, noise=0.002, push=2.0)
+    worst = min(readings, key=lambda reading: reading.margin)
+    assert worst.status is Status.OUTSIDE
+    assert "above the budget" in worst.reason
+
+
+def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
+    design: TubeDesign,
+) -> None:
+    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
+    for k in range(12):
+        assert controller.update(k * PERIOD, 3.0) == design.policy.u[0]
+    assert "not at the start of the plan after 1 s" in controller.ended
+
+
+@pytest.mark.parametrize(
+    ("t", "y", "reason"),
+    [(0.3, math.nan, "speed is nan"), (0.5, 0.0, "missing"), (0.05, 0.0, "time went back")],
+)
+def test_a_state_that_cannot_be_used_ends_the_run(
+    design: TubeDesign, t: float, y: float, reason: str
+) -> None:
+    controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
+    for k in range(3):
+        controller.update(k * PERIOD, 3.0)
+    u = controller.u
+    assert controller.update(t, y) == u
+    assert reason in controller.ended
+
+
+def test_stopping_is_no_faster_than_allowed_and_arrives() -> None:
+    limits = Limits(lowest=-1.0, highest=1.0, stop_rate=2.0, stop_at=0.25)
+    inputs = [1.0]
+    while inputs[-1] != 0.25:
+        inputs.append(limits.towards_stop(inputs[-1], 0.1))
+    assert np.abs(np.diff(inputs)).max() <= 0.2 + 1e-12
+    assert len(inputs) == 5
+    assert limits.towards_stop(-1.0, 0.1) == pytest.approx(-0.8)
+
+
+@pytest.mark.parametrize(("lowest", "highest", "rate"), [(1, 0, 1), (1, 2, 1), (-1, 1, 0)])
+def test_limits_that_make_no_sense_are_refused(lowest: float, highest: float, rate: float) -> None:
+    with pytest.raises(DataError, match="limits"):
+        Limits(lowest=lowest, highest=highest, stop_rate=rate)
+
+
+def test_a_small_swing_of_the_pendulum_has_its_textbook_period() -> None:
+    pendulum = Pendulum(0.01, length=0.5, damping=0.0)
+    pendulum.step(np.zeros(1), np.array([0.05]))
+    angles = []
+    for _ in range(1000):
+        angles.append(pendulum.measure(np.zeros(1))[0])
+        pendulum.step(np.zeros(1), np.zeros(1))
+    signs = np.sign(angles)
+    crossings = np.flatnonzero((signs[:-1] < 0) & (signs[1:] >= 0))
+    assert np.diff(crossings).mean() * 0.01 == pytest.approx(
+        2 * math.pi * math.sqrt(0.5 / 9.81), rel=2e-3
+    )
+
+
+def test_a_free_satellite_keeps_its_angular_momentum_and_energy() -> None:
+    satellite = Satellite(0.01)
+    satellite.step(np.array([20.0, 30.0, -10.0]), np.zeros(3))
+
+    def momentum_and_energy() -> list[float]:
+        sigma, omega = np.split(satellite.measure(np.zeros(3)), 2)
+        H, cross = Satellite.INERTIA, np.cross(np.eye(3), sigma)
+        rotation = (
+            np.eye(3)
+            + (8 * cross @ cross - 4 * (1 - sigma @ sigma) * cross) / (1 + sigma @ sigma) ** 2
+        )  # from inertial to body axes; M. Shuster, A Survey of Attitude Representations
+        return [*(rotation.T @ (H * omega)), omega @ (H * omega)]
+
+    before = momentum_and_energy()
+    for _ in range(500):
+        satellite.step(np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(momentum_and_energy(), before, rtol=1e-9)
+
+
+def test_a_push_adds_to_the_satellites_torque() -> None:
+    pushed, driven = Satellite(0.01), Satellite(0.01)
+    pushed.step(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    driven.step(np.array([1.0, 0.0, 0.0]), np.zeros(3))
+    np.testing.assert_array_equal(pushed.measure(np.zeros(3)), driven.measure(np.zeros(3)))
+    assert pushed.measure(np.zeros(3))[3] > 0

@@ -1,0 +1,177 @@
+"""One verb and one Design: what problems refuse, and that a saved design is the one loaded."""
+
+import inspect
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import ContinuousTracking, LinearTube, SampledTracking, TubeDesign, design
+from nlsid_core.design.continuous.design import design_funnel
+from nlsid_core.design.linear import design_tube
+from nlsid_core.design.sampled.design import design_state_funnel
+from nlsid_core.designs import FUNNEL, MODEL, POLICY, PROOF, AnyDesign, Design, load_design
+from nlsid_core.errors import (
+    CertificateMismatch,
+    CertificateRejected,
+    DataError,
+    DocumentError,
+    OptionError,
+)
+from nlsid_core.identification import Fit
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.proofs import check
+from tests.tracked import assumption, designed, tracked
+
+PROFILE = ((0.0, 0.0), (7.0, 0.5))
+
+
+def test_the_verb_solves_what_each_problem_says(tube: TubeDesign, train: Dataset) -> None:
+    found = design(LinearTube(tube.model, train, PROFILE, 7.0))
+    assert found.funnel.assumption.samples == round(7.0 / tube.model.period)
+    assert "for 70 samples" in found.verdict.statement
+    base = tracked()
+    problem = SampledTracking(base.model, base.policy, base.feedback, assumption())
+    seen: list[str] = []
+    sampled = design(problem, progress=lambda what, _: seen.append(what))
+    assert sampled.documents() == designed().documents()
+    assert set(seen) == {"inlet", "tube"}
+
+
+@pytest.mark.parametrize(
+    ("problem", "search"),
+    [
+        (LinearTube, design_tube),
+        (SampledTracking, design_state_funnel),
+        (ContinuousTracking, design_funnel),
+    ],
+)
+def test_a_problem_states_what_its_search_takes(problem: type[Any], search: Any) -> None:
+    taken = {
+        name: parameter.default
+        for name, parameter in inspect.signature(search).parameters.items()
+        if name not in ("executor", "progress")
+    }
+    unset = (inspect.Parameter.empty,)
+    stated = {f.name: f.default for f in fields(problem)}
+    assert list(stated) == list(taken)
+    assert all(taken[name] in unset or taken[name] == stated[name] for name in taken), (
+        "the same defaults"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"horizon": 100.0}, "can be measured"),
+        ({"horizon": 0.0}, "horizon is 0.0; it should be a finite number above 0"),
+        ({"safety_factor": 0.99}, "safety_factor is 0.99; it should be a finite number, at least"),
+        ({"inlet": -1e-9}, "inlet is -1e-09; it should be a finite number, at least 0"),
+        ({"profile": [(0.0, 0.0)]}, "profile is .* it should be two or more corners"),
+        ({"profile": [(1.0, 0.0), (0.0, 1.0)]}, "times should increase"),
+        ({"lqr_weights": (0.0, 1.0)}, "lqr_weights is .* two numbers above 0, or None"),
+    ],
+)
+def test_a_tube_that_makes_no_sense_is_refused(
+    tube: TubeDesign, train: Dataset, options: dict[str, Any], reason: str
+) -> None:
+    sensible: dict[str, Any] = {"profile": PROFILE, "horizon": 7.0}
+    with pytest.raises(DataError, match=reason):
+        design(LinearTube(tube.model, train, **(sensible | options)))
+
+
+@pytest.mark.parametrize("options", [{"goal": 0.0}, {"start": -1.0}, {"goal": float("nan")}])
+def test_a_sampled_problem_refuses_radii_that_are_not_positive(options: dict[str, float]) -> None:
+    base = tracked()
+    (key,) = options
+    with pytest.raises(OptionError, match=f"{key} is .*; it should be a finite number above 0"):
+        SampledTracking(base.model, base.policy, base.feedback, assumption(), **options)
+
+
+@pytest.fixture(name="tube")
+def _tube(request: pytest.FixtureRequest) -> TubeDesign:
+    """The session's tube, by a name that is not the verb's."""
+    found: TubeDesign = request.getfixturevalue("design")
+    return found
+
+
+@pytest.fixture(params=["linear", "sampled"])
+def any_design(request: pytest.FixtureRequest, tube: TubeDesign) -> AnyDesign:
+    return tube if request.param == "linear" else designed()
+
+
+def test_a_design_is_loaded_as_it_was_saved(any_design: AnyDesign, tmp_path: Path) -> None:
+    paths = any_design.save(tmp_path / "made" / "here")
+    assert [path.name for path in paths] == [MODEL, POLICY, FUNNEL, PROOF]
+    assert check(paths[-1]) == any_design.verdict
+    loaded = load_design(paths[0].parent)
+    assert loaded.documents() == any_design.documents()
+    assert loaded.verdict == any_design.verdict
+    assert type(loaded.funnel) is type(any_design.funnel)
+    assert loaded.found is None
+    again = loaded.save(tmp_path / "again")
+    assert [p.read_bytes() for p in paths] == [p.read_bytes() for p in again]
+
+
+@pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
+def test_a_file_of_another_design_is_not_loaded(
+    any_design: AnyDesign, tmp_path: Path, name: str
+) -> None:
+    any_design.save(tmp_path)
+    document = files.load_document(tmp_path / name)
+    (tmp_path / name).write_text(json.dumps(document))  # the same content, other bytes
+    with pytest.raises(CertificateMismatch):
+        load_design(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(CertificateRejected):
+        load_design(tmp_path)
+
+
+def test_a_folder_without_a_proof_is_an_error_of_the_files(
+    any_design: AnyDesign, tmp_path: Path
+) -> None:
+    any_design.save(tmp_path)
+    (tmp_path / PROOF).unlink()
+    with pytest.raises(FileNotFoundError):
+        load_design(tmp_path)
+
+
+def test_a_proof_of_something_else_is_no_design(
+    fit: Fit[DifferenceEquation], tmp_path: Path
+) -> None:
+    files.write_document(tmp_path / MODEL, fit.model.document())
+    files.write_document(tmp_path / PROOF, fit.proof.document(fit.model, MODEL))
+    with pytest.raises(DocumentError, match="is about model, not about one funnel"):
+        load_design(tmp_path)
+
+
+def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: TubeDesign) -> None:
+    narrow = replace(tube.funnel, half_widths=tube.funnel.half_widths * 0.9)
+    with pytest.raises(CertificateRejected):
+        Design.proved(
+            tube.model, tube.policy, narrow, claim=tube.claim, proof=tube.proof, found=None
+        )
+    assert tube.decided() == tube.verdict
+    with pytest.raises(CertificateRejected):
+        replace(tube, proof={"slack": -1.0}).decided()
+    same = Design.proved(
+        tube.model, tube.policy, tube.funnel, claim=tube.claim, proof=tube.proof, found=None
+    )
+    assert same.verdict == tube.verdict
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"shape": "Q"}, "shape is 'Q'; it should be one of rho, P"),
+        ({"objective": "width"}, "objective is 'width'; it should be one of volume, reference"),
+        ({"gain": "square"}, "gain is 'square'; it should be one of constant, linear, cubic"),
+    ],
+)
+def test_a_continuous_problem_names_what_it_knows(options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(OptionError, match=reason):
+        ContinuousTracking(lambda x: x, None, **options)  # type: ignore[arg-type]

@@ -1,0 +1,187 @@
+"""One home for the nouns, and one `load` for whatever a file declares."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import nlsid_core
+from nlsid_core import files
+from nlsid_core.documents import load
+from nlsid_core.dynamics import Nominal, VectorField, constant_on, cubic_through, linear_through
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.linear import EnergyAssumption
+from nlsid_core.funnels.linear import LinearFunnel as EnergyTube
+from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.linear import LinearPolicy as TubePolicy
+from nlsid_core.policies.sampled import SampledPolicy
+
+
+def random_funnel(n: int = 3, knots: int = 6) -> ContinuousFunnel:
+    """A funnel with nothing round about it."""
+    rng = np.random.default_rng(5)
+    t = np.cumsum(rng.uniform(0.1, 1, knots))
+    x = cubic_through(t, rng.normal(size=(knots, n)), rng.normal(size=(knots, n)))
+    roots = rng.normal(size=(knots, n, n))
+    P = roots @ roots.transpose(0, 2, 1) + np.eye(n)
+    return ContinuousFunnel(
+        x, (P + P.transpose(0, 2, 1)) / 2, rng.uniform(0.1, 2, knots), "field", "policy"
+    )
+
+
+def random_policy(gain: str, n: int = 3, m: int = 2, knots: int = 6) -> ContinuousPolicy:
+    rng = np.random.default_rng(6)
+    x = random_funnel(n, knots).x
+    K = rng.normal(size=(knots, m, n))
+    pieces = {
+        "constant": constant_on(x.t, K[1:]),
+        "linear": linear_through(x.t, K),
+        "cubic": cubic_through(x.t, K, rng.normal(size=K.shape)),
+    }
+    return ContinuousPolicy(
+        x, linear_through(x.t, rng.normal(size=(knots, m))), pieces[gain], "field"
+    )
+
+
+def discrete_documents() -> dict[str, Any]:
+    """The other kinds of funnels and policies."""
+    assumption = DisturbanceAssumption("response", 0.2, 0.1, 2.0, (("run", "sha256:0"),))
+    two = np.array([np.eye(2)] * 3)
+    energy = EnergyAssumption(4.0, 10, 1.0, 2.0, (("trial", "sha256:1"),))
+    return {
+        "discrete": SampledFunnel(
+            two, two[:2], np.ones(3), np.ones(3), np.ones((3, 2)), assumption, "m", "p"
+        ),
+        "tube": EnergyTube(np.eye(2), 1.0, 0.5, np.array([0.3]), np.array([2.0]), energy, "m", "p"),
+        "tracking": SampledPolicy(
+            np.zeros((3, 2)), np.zeros((2, 1)), np.zeros((2, 1, 2)), np.eye(2), 0.1, "m"
+        ),
+        "tube_policy": TubePolicy(np.zeros((3, 2)), np.zeros(3), np.zeros(2), np.ones(2), 0.1, "m"),
+    }
+
+
+def test_the_promised_names_are_at_home_in_nlsid_core() -> None:
+    assert set(nlsid_core.__all__) == {"Nominal", "VectorField", "load"}
+    assert Nominal.__module__.startswith("nlsid_core.dynamics")
+
+
+def test_a_funnel_reads_back_bit_for_bit_with_every_promised_name(tmp_path: Path) -> None:
+    funnel = random_funnel()
+    funnel.save(tmp_path / "funnel.json")
+    again = ContinuousFunnel.load(tmp_path / "funnel.json")
+    assert again.document() == funnel.document()
+    assert (again.t0, again.tf) == (funnel.x.t[0], funnel.x.t[-1])
+    rng = np.random.default_rng(7)
+    for t in rng.uniform(funnel.t0, funnel.tf, 20).tolist():
+        X = rng.normal(size=(9, 3))
+        assert again.nominal(t).shape == (3,)
+        assert again.value(t, X).shape == (9,)
+        assert (again.value(t, X) == funnel.value(t, X)).all()
+        assert again.value(t, again.nominal(t)[None])[0] == 0
+        assert again.volume(t) == funnel.volume(t) > 0
+
+
+def test_value_and_gradient_agree_at_many_times_and_states() -> None:
+    funnel, rng, step = random_funnel(), np.random.default_rng(8), 1e-6
+    for t in rng.uniform(funnel.t0, funnel.tf, 10).tolist():
+        X = rng.normal(size=(50, 3))
+        gradient = funnel.gradient(t, X)
+        for j in range(3):
+            ahead, behind = X + step * np.eye(3)[j], X - step * np.eye(3)[j]
+            slope = (funnel.value(t, ahead) - funnel.value(t, behind)) / (2 * step)
+            assert gradient[:, j] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+        inside = funnel.boundary(t, X / np.linalg.norm(X, axis=1)[:, None])
+        assert funnel.value(t, inside) == pytest.approx(np.ones(50))
+
+
+def test_the_volume_is_the_share_of_random_points_inside() -> None:
+    funnel, rng = random_funnel(), np.random.default_rng(9)
+    t = (funnel.t0 + funnel.tf) / 2
+    half = np.sqrt(np.diag(np.linalg.inv(funnel.shape(t))))
+    X = funnel.nominal(t) + rng.uniform(-1, 1, size=(200_000, 3)) * half
+    share = (funnel.value(t, X) <= 1).mean()
+    assert funnel.volume(t) == pytest.approx(share * np.prod(2 * half), rel=0.01)
+
+
+@pytest.mark.parametrize("axes", [(0, 1), (2, 0), (0, 1, 2)])
+def test_an_outline_is_the_tightest_shadow(axes: tuple[int, ...]) -> None:
+    funnel, rng = random_funnel(4), np.random.default_rng(10)
+    t = funnel.t0 + 0.3
+    directions = rng.normal(size=(20_000, 4))
+    boundary = funnel.boundary(t, directions / np.linalg.norm(directions, axis=1)[:, None])
+    outline = funnel.outline(t, axes, points=60).reshape(-1, len(axes))
+    for direction in rng.normal(size=(20, len(axes))):
+        reach = (outline @ direction).max() - funnel.nominal(t)[list(axes)] @ direction
+        shadow = (boundary[:, list(axes)] @ direction).max() - funnel.nominal(t)[list(axes)] @ (
+            direction
+        )
+        assert reach == pytest.approx(shadow, rel=0.05)
+    with pytest.raises(ShapeError, match="2 or 3 axes"):
+        funnel.outline(t, (0,))
+
+
+def test_an_ellipsoid_is_inside_exactly_up_to_the_boundary() -> None:
+    funnel = random_funnel()
+    t = funnel.t0 + 0.5
+    shape, centre = funnel.shape(t), funnel.nominal(t)
+    for scale, inside in ((1.001, True), (0.999, False)):
+        assert funnel.contains_ellipsoid(t, centre, scale * shape) is inside
+        assert funnel.inside_ellipsoid(t, centre, shape / scale) is inside
+
+
+@pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])
+def test_a_policy_of_every_kind_of_gain_reads_back_and_takes_many_states(
+    gain: str, tmp_path: Path
+) -> None:
+    policy = random_policy(gain)
+    policy.save(tmp_path / "policy.json")
+    again = ContinuousPolicy.load(tmp_path / "policy.json")
+    assert again.document() == policy.document()
+    t, X = 0.4 * policy.t[0] + 0.6 * policy.t[1], np.random.default_rng(1).normal(size=(7, 3))
+    u = again(float(t), X)
+    assert u.shape == (7, 2)
+    one = policy.u(t) - policy.K(t) @ (X[3] - policy.x(t))
+    assert u[3] == pytest.approx(one)
+    middle = policy.K(t)
+    ends = policy.K.control[0, 0], policy.K.control[0, -1]
+    if gain == "constant":
+        assert (middle == ends[0]).all()
+    elif gain == "linear":
+        assert middle == pytest.approx(0.4 * ends[0] + 0.6 * ends[1])
+    else:
+        assert policy.K.degree == 3
+
+
+def test_load_reads_whatever_the_file_declares(tmp_path: Path) -> None:
+    field = VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0)
+    nouns: dict[str, Any] = {
+        "funnel": random_funnel(),
+        "policy": random_policy("linear"),
+        "field": field,
+    }
+    for name, noun in (nouns | discrete_documents()).items():
+        files.write_document(tmp_path / name, noun.document())
+        again = load(tmp_path / name)
+        assert type(again) is type(noun)
+        assert again.document() == noun.document()
+
+
+def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
+    discrete = discrete_documents()["discrete"].document()
+    files.write_document(tmp_path / "funnel.json", discrete)
+    with pytest.raises(DocumentError, match="kind is 'sampled', expected 'continuous'"):
+        ContinuousFunnel.load(tmp_path / "funnel.json")
+    files.write_document(tmp_path / "odd.json", discrete | {"kind": "odd"})
+    with pytest.raises(DocumentError, match="no 'nlsid/funnel' of kind 'odd' is known"):
+        load(tmp_path / "odd.json")
+
+
+def test_outside_its_times_a_funnel_says_so() -> None:
+    funnel = random_funnel()
+    with pytest.raises(DataError, match="the funnel is defined from"):
+        funnel.value(funnel.tf + 1e-6, np.zeros((1, 3)))
+    with pytest.raises(ShapeError, match=r"should have shape \(N, 3\)"):
+        funnel.value(funnel.t0, np.zeros(3))

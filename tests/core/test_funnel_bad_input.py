@@ -1,0 +1,246 @@
+"""Input that cannot give a funnel: what is wrong, by how much, where, and what to do instead.
+
+Each through Python and through `nlsid funnel --problem`, which say the same.
+"""
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bags.chain.problems import FunnelProblem
+from bags.commands import cli
+from nlsid_core import files
+from nlsid_core.arrays import Json
+from nlsid_core.design import Goal, design_funnel, integrate_nominal, tvlqr
+from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
+from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial
+
+KNOTS = 9
+
+
+def hanging() -> tuple[VectorField, Nominal]:
+    """A pendulum to third order, with torque, at rest for 2 s."""
+
+    def pendulum(x: Any, u: Any) -> Any:
+        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
+
+    field = VectorField.from_function(pendulum, 2, 1)
+    t = np.linspace(0, 2, KNOTS)
+    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+
+
+def fair() -> Json:
+    """A problem with nothing wrong."""
+    goal = Goal(np.zeros(2), 20 * np.eye(2))
+    return FunnelProblem(*hanging(), np.eye(2), np.eye(1), goal).document()
+
+
+def other(field: VectorField, **options: Any) -> Json:
+    """A problem of other dynamics, at rest, without a goal unless given."""
+    t = np.linspace(0, 1, 5)
+    rest = integrate_nominal(field, lambda _: np.zeros(field.m), t=t, start=np.zeros(field.n))
+    return FunnelProblem(field, rest, np.eye(field.n), np.eye(field.m), **options).document()
+
+
+def nominal_bent(problem: Json) -> Json:
+    problem["nominal"]["x"][3][1][0] += 0.1
+    return problem
+
+
+def nominal_with_a_jump(problem: Json) -> Json:
+    problem["nominal"]["x"][3][0][0] += 0.1
+    return problem
+
+
+def goal_elsewhere(problem: Json) -> Json:
+    problem["goal"]["centre"] = [0.5, 0.0]
+    return problem
+
+
+def goal_indefinite(problem: Json) -> Json:
+    problem["goal"]["P"] = [[1.0, 2.0], [2.0, 1.0]]
+    return problem
+
+
+def a_search_that_no_file_chooses(problem: Json) -> Json:
+    return problem | {"search": "alternation"}
+
+
+def uncontrollable(problem: Json) -> Json:
+    del problem
+    field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
+    return other(field)
+
+
+def state_weight_indefinite(problem: Json) -> Json:
+    return problem | {"Q": [[1.0, 0.0], [0.0, -0.5]]}
+
+
+def input_weight_zero(problem: Json) -> Json:
+    return problem | {"R": [[0.0]]}
+
+
+def weight_not_symmetric(problem: Json) -> Json:
+    return problem | {"Q": [[1.0, 0.5], [0.0, 1.0]]}
+
+
+def negative_power(problem: Json) -> Json:
+    problem["vector_field"]["pieces"][0][0]["exponents"][0][1] = -1
+    return problem
+
+
+def broken_power(problem: Json) -> Json:
+    problem["vector_field"]["pieces"][0][0]["exponents"][0][1] = 0.5
+    return problem
+
+
+def degree_too_high(problem: Json) -> Json:
+    del problem
+    field = VectorField.from_function(lambda x, u: np.array([u[0] - x[0] ** 7]), 1, 1)
+    return other(field, goal=Goal(np.zeros(1), np.eye(1)))
+
+
+def pushed_out(problem: Json) -> Json:
+    del problem
+    field = VectorField.from_function(
+        lambda x, u, w: np.array([x[0] + 0 * u[0] + w[0]]), 1, 1, uncertain=[[-9, 9]]
+    )
+    return other(field, goal=Goal(np.zeros(1), np.eye(1)))
+
+
+def knots_that_stand_still(problem: Json) -> Json:
+    problem["nominal"]["t"][4] = problem["nominal"]["t"][3]
+    return problem
+
+
+def knots_that_go_back(problem: Json) -> Json:
+    t = problem["nominal"]["t"]
+    t[4], t[5] = t[5], t[4]
+    return problem
+
+
+def unknown_shape(problem: Json) -> Json:
+    return problem | {"shape": "Q"}
+
+
+CASES: list[tuple[Callable[[Json], Json], str]] = [
+    (nominal_bent, r"does not obey the dynamics: dx0/dt is off by 1\.2 at t = 0\.75 s"),
+    (nominal_with_a_jump, "the nominal states should be continuous"),
+    (goal_elsewhere, r"the nominal ends outside the goal: \|x - centre\|² = 5 > 1"),
+    (goal_indefinite, "the goal's matrix should be symmetric positive definite"),
+    (a_search_that_no_file_chooses, "'search' is no member of a funnel problem; it has: .*shape"),
+    (uncontrollable, "cannot be stabilised by any gain .* it is uncontrollable"),
+    (state_weight_indefinite, r"Q should be positive semidefinite; its smallest .* is -0\.5"),
+    (input_weight_zero, "R should be positive definite; its smallest eigenvalue is 0"),
+    (weight_not_symmetric, "Q should be a symmetric 2x2 matrix"),
+    (negative_power, "exponents"),
+    (broken_power, "exponents"),
+    (degree_too_high, "degree 7; .* take a Taylor polynomial of lower degree, and its remainder"),
+    (pushed_out, r"no rho at t = .* Try more knots, another P .* or a smaller goal"),
+    (knots_that_stand_still, "time grid does not increase after knot 3: 0.75 s, then 0.75 s"),
+    (knots_that_go_back, "time grid does not increase after knot 4: 1.25 s, then 1 s"),
+    (unknown_shape, "shape is 'Q'; it should be one of rho, P"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "message"), CASES, ids=lambda c: getattr(c, "__name__", ""))
+def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line(
+    spoil: Callable[[Json], Json],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    problem, out = tmp_path / "problem.json", tmp_path / "out"
+    files.write_document(problem, spoil(fair()))
+    with pytest.raises(NlsidError, match=message):
+        FunnelProblem.load(problem).design()
+    given = ["nlsid", "funnel", "--problem", str(problem), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", given)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.startswith("error: ")
+    assert re.search(message, said)
+    assert not out.exists()
+
+
+def test_the_same_problem_unspoiled_is_designed(tmp_path: Path) -> None:
+    files.write_document(tmp_path / "problem.json", fair())
+    read = FunnelProblem.load(tmp_path / "problem.json")
+    assert read.document() == fair()
+    assert np.min(read.design().found.proved.margins) > 0
+
+
+# -- where Python takes what a file cannot hold ------------------------------------------------
+
+
+def test_a_nominal_that_disobeys_is_told_by_how_much_where_and_in_which_state() -> None:
+    field, nominal = hanging()
+    bent = nominal.x.control.copy()
+    bent[3, 1, 0] += 0.1  # the slope at 0.75 s is then 3·0.1/0.25 more
+    bad = Nominal(PiecewisePolynomial(nominal.t, bent), nominal.u)
+    with pytest.raises(DataError, match=r"dx0/dt is off by 1\.2 at t = 0\.75 s"):
+        design_funnel(field, bad, goal=20 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("function", "operation"),
+    [
+        (lambda x: np.array([np.sin(x[0])]), "sin"),
+        (lambda x: np.array([1 / x[0]]), "division"),
+        (lambda x: np.array([x[0] ** 0.5]), r"power 0\.5"),
+        (lambda x: np.array([abs(x[0])]), "abs"),
+    ],
+)
+def test_dynamics_that_are_not_polynomial_name_the_operation_and_offer_taylor(
+    function: Callable[[Any], Any], operation: str
+) -> None:
+    told = f"{operation} .*taylor_field makes cubics along a motion, .* as a bounded w"
+    _, nominal = hanging()
+    still = integrate_nominal(
+        VectorField.from_function(lambda x: np.array([-x[0]]), 1, 0), lambda _: [],
+        t=nominal.t, start=[0.0],
+    )  # fmt: skip
+    with pytest.raises(NotPolynomial, match=told):
+        design_funnel(function, still, goal=np.eye(1))
+
+
+def test_a_nominal_of_other_sizes_is_told() -> None:
+    field = VectorField.from_function(lambda x, u: np.array([-x[0] + u[0]]), 1, 1)
+    with pytest.raises(DataError, match="the nominal has 2 states and 1 inputs, the dynamics 1"):
+        design_funnel(field, hanging()[1], goal=np.eye(1))
+
+
+def test_a_policy_of_other_dynamics_or_around_another_nominal_is_told() -> None:
+    field, nominal = hanging()
+    policy = tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).policy
+    second = VectorField.from_function(lambda x, u: np.array([x[1], -x[0] - x[1] / 5 + u[0]]), 2, 1)
+    with pytest.raises(DataError, match="made for other dynamics"):
+        design_funnel(second, nominal, goal=20 * np.eye(2), policy=policy)
+    t = np.linspace(0, 2, KNOTS)
+    away = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.array([0.01, 0]))
+    with pytest.raises(DataError, match="around another nominal"):
+        design_funnel(field, away, goal=20 * np.eye(2), policy=policy)
+
+
+def test_an_uncontrollable_linearisation_may_still_have_a_goal_and_a_riccati_solution() -> None:
+    field = VectorField.from_function(lambda x, u: np.array([x[0], -x[1] + u[0]]), 2, 1)
+    t = np.linspace(0, 1, 5)
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=t, start=[0.0, 0.0])
+    with pytest.raises(Infeasible, match="uncontrollable"):
+        design_funnel(field, nominal)
+    assert tvlqr(field, nominal, Q=np.eye(2), R=np.eye(1), S_final=np.eye(2)).S.shape == (5, 2, 2)
+
+
+def test_dynamics_valid_only_where_the_nominal_is_not_are_told() -> None:
+    field, nominal = hanging()
+    short = VectorField(field.pieces, 2, 1, valid=np.array([[0, 0.1, 0.3]]))
+    with pytest.raises(DataError, match=r"entry 0 of \(x, u\) is 0 at 0 s, not well within"):
+        design_funnel(short, nominal, goal=20 * np.eye(2))

@@ -1,0 +1,58 @@
+"""What funnels and policies of every kind have in common: sizes, widths, one `load` each."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlsid_core import files
+from nlsid_core.design import TubeDesign
+from nlsid_core.errors import DocumentError
+from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.protocol import AnyFunnel, Funnel, load_funnel
+from nlsid_core.policies.protocol import AnyPolicy, Policy, load_policy
+from tests.continuous_stage import stage
+from tests.tracked import designed
+
+
+def pairs(linear: TubeDesign) -> list[tuple[AnyPolicy, AnyFunnel]]:
+    """One of each kind."""
+    sampled, (_, policy, funnel) = designed(), stage()
+    return [
+        (linear.policy, linear.funnel),
+        (sampled.policy, sampled.funnel),
+        (policy, funnel),
+    ]
+
+
+def test_every_kind_answers_the_same_questions(design: TubeDesign) -> None:
+    for policy, funnel in pairs(design):
+        common: Funnel = funnel
+        plan: Policy = policy
+        for when in (0, common.last):
+            widths = common.widths(when)
+            assert common.size(when, np.zeros(len(widths))) <= 1e-12
+            assert not common.size(when, np.full(len(widths), np.nan)) <= 1.0
+            for i, width in enumerate(widths):
+                inside = np.zeros(len(widths))
+                inside[i] = width
+                assert common.size(when, 1.001 * inside) > 1.0, "beyond its width on an axis"
+        assert common.made_for == (plan.made_for, files.digest(plan.document()))
+        n = len(common.widths(0)) - isinstance(funnel, LinearFunnel)  # its last axis is e
+        low, high = plan.covers(0, np.zeros(n))
+        assert np.all(low <= high)
+        assert plan.last <= common.last
+
+
+def test_one_load_reads_every_kind_and_refuses_what_is_none(
+    design: TubeDesign, tmp_path: Path
+) -> None:
+    for policy, funnel in pairs(design):
+        files.write_document(tmp_path / "policy.json", policy.document())
+        files.write_document(tmp_path / "funnel.json", funnel.document())
+        assert load_policy(tmp_path / "policy.json").document() == policy.document()
+        read = load_funnel(tmp_path / "funnel.json")
+        assert (type(read), read.document()) == (type(funnel), funnel.document())
+    files.write_document(tmp_path / "funnel.json", funnel.document() | {"kind": "round"})
+    with pytest.raises(DocumentError, match="kind is 'round'"):
+        load_funnel(tmp_path / "funnel.json")

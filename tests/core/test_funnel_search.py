@@ -1,0 +1,221 @@
+"""The searches beside the sweep: the sampled relaxation, which proves nothing, and alternations."""
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
+from nlsid_core.design.continuous.pieces import prove_pieces
+from nlsid_core.design.continuous.setting import Setting, prepare
+from nlsid_core.design.continuous.vstep import improve
+from nlsid_core.design.thesis.alternation import (
+    alternate_rho,
+    design_by_alternation,
+    exponential_start,
+)
+from nlsid_core.design.thesis.relaxation import sample_funnel
+from nlsid_core.design.thesis.soundness import simulate_boundary
+from nlsid_core.designs import Design
+from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.proofs import Verdict, check
+
+GOAL = 20 * np.eye(2)
+DEFAULTS: Any = {"policy": None, "Q": None, "R": None, "gain": "constant"}
+
+
+def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
+    """A pendulum to third order, with torque, at rest for 2 s."""
+
+    def pendulum(x: Any, u: Any) -> Any:
+        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
+
+    field = VectorField.from_function(pendulum, 2, 1)
+    t = np.linspace(0, 2, knots)
+    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+
+
+def pulsed() -> tuple[VectorField, Nominal]:
+    """Stable at 0, 1 and 2 s, and unstable in between, where knots do not look."""
+    field = VectorField.from_function(
+        lambda t, x: np.array([x[0] * (20 * (t * (1 - t) * (2 - t)) ** 2 - 0.5)]), 1, 0
+    )
+    t = np.array([0.0, 1.0, 2.0])
+    return field, integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0])
+
+
+# -- time samples ----------------------------------------------------------------------------
+
+
+def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
+    tmp_path: Path,
+) -> None:
+    field, nominal = pulsed()
+    options: Any = {"goal": np.eye(1), "Q": np.zeros((1, 1))}
+    found = sample_funnel(field, nominal, samples=2, **options)
+    assert str(found).startswith("NOT PROVED")
+    assert not hasattr(found, "certificate")
+    assert not hasattr(found, "save")
+    setting = prepare(field, nominal, policy=None, R=None, gain="constant", **options)
+    parts = (field, setting.policy, found.funnel)
+    run = simulate_boundary(*parts, starts=100, rng=np.random.default_rng(1), substeps=50)
+    assert run.violations == 100
+    proved = prove_pieces(setting.steps, setting.policy, found.funnel)
+    assert proved.unproved
+    # What was proved of it, written as if it were all there is to prove.
+    basis = proved.pieces.basis.tolist()
+    proof = {"margin": 1.0, "basis": basis, "multiplier": basis, "pieces": [],
+             "goal_multiplier": 0.995}  # fmt: skip
+    claimed = Verdict("continuous_funnel", "all of it", Fraction(1))
+    goal = {"centre": setting.goal.centre.tolist(), "P": setting.goal.P.tolist()}
+    claim = {"kind": "continuous_funnel", "goal": goal}
+    forged = Design(*parts, claim, proof, claimed, None)
+    with pytest.raises(CertificateRejected, match="pieces should be a list of 1 to"):
+        check(forged.save(tmp_path)[-1])
+
+
+def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> None:
+    with pytest.raises(Infeasible, match=r"no rho at t = 1\.5 s"):
+        sample_funnel(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1)), samples=3)
+    sampled = sample_funnel(*hanging(), goal=GOAL)
+    proved = design_funnel(*hanging(), goal=GOAL)
+    assert 0.999 <= sampled.volumes[0] / proved.funnel.volume_integral() < 1.01
+
+
+def test_a_sample_at_one_end_only_is_refused() -> None:
+    with pytest.raises(DataError, match="its two ends are the least"):
+        sample_funnel(*hanging(), goal=GOAL, samples=1)
+
+
+# -- the thesis's alternation for ρ ------------------------------------------------------------
+
+
+def test_the_alternation_is_proved_and_ends_within_one_percent_of_the_sweep() -> None:
+    sweep = design_funnel(*hanging(), goal=GOAL)
+    found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL))
+    assert np.min(found.found.proved.margins) > 0
+    ratio = found.funnel.volume_integral() / sweep.funnel.volume_integral()
+    assert 0.99 <= ratio <= 1.001
+
+
+def test_the_alternation_may_start_from_a_given_rho() -> None:
+    sweep = design_funnel(*hanging(), goal=GOAL)
+    first = 0.9 * sweep.funnel.rho * np.linspace(0.7, 1, 9)
+    found = design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL), rho=first)
+    assert found.funnel.rho[-1] == 0.9
+    assert (found.funnel.rho[:-1] > first[:-1]).all()
+    assert np.min(found.found.proved.margins) > 0
+
+
+@pytest.mark.parametrize(
+    ("rho", "error", "reason"),
+    [
+        (np.linspace(0.05, 1.2, 9), DataError, r"does not end in the goal: rho\(t_f\) = 1.2"),
+        (np.linspace(0.05, 0.9, 8), DataError, "9 positive numbers"),
+        (np.linspace(-0.05, 0.9, 9), DataError, "9 positive numbers"),
+        (np.linspace(1.8, 0.9, 9), Infeasible, r"does not hold: its margin is -.* Try"),
+    ],
+)
+def test_a_first_rho_that_cannot_start_is_refused(
+    rho: FloatArray, error: type[Exception], reason: str
+) -> None:
+    with pytest.raises(error, match=reason):
+        design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL), rho=rho)
+
+
+@pytest.mark.parametrize("option", ["shape", "objective", "gain"])
+def test_an_unknown_option_is_named_with_the_known_ones(option: str) -> None:
+    chosen: Any = {option: "magic"}
+    with pytest.raises(OptionError, match=f"{option} is 'magic'; it should be one of "):
+        ContinuousTracking(*hanging(), goal=GOAL, **chosen)
+
+
+def test_every_iterate_of_the_alternation_is_larger_than_the_last() -> None:
+    setting = prepare(*hanging(), goal=GOAL, **DEFAULTS)
+    start = exponential_start(setting.steps, setting.policy, setting.P)
+    found = alternate_rho(setting.steps, setting.policy, start, stop=1e-3)
+    assert (np.diff(found.volumes) > 0).all()
+    ratio = np.log(start.rho[0]) / np.log(start.rho[4])
+    assert ratio == pytest.approx(2)  # exponential in t
+
+
+# -- the general P(t) --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def setting() -> Setting:
+    return prepare(*hanging(), goal=GOAL, **DEFAULTS)
+
+
+def test_both_objectives_grow_the_funnel_and_are_proved() -> None:
+    rho = design_funnel(*hanging(), goal=GOAL)
+    found = {
+        name: design_funnel(*hanging(), goal=GOAL, shape="P", objective=name)
+        for name in ("volume", "reference")
+    }
+    for design in found.values():
+        assert design.funnel.volume_integral() > 1.05 * rho.funnel.volume_integral()
+        assert np.min(design.found.proved.margins) > 0
+        volumes = [volume for _, volume in design.found.history[1:]]
+        assert (np.diff(volumes) > 0).all()
+    # Each is best at what it asks for: the volume, or the least blown-up copy of the first shape.
+    assert volume_of(found["volume"]) >= volume_of(found["reference"])
+    first = rho.funnel
+    assert least_copies(found["reference"], first) >= 0.999 * least_copies(found["volume"], first)
+
+
+def volume_of(design: FunnelDesign) -> float:
+    return design.funnel.volume_integral()
+
+
+def least_copies(design: FunnelDesign, first: ContinuousFunnel) -> float:
+    """Σ over knots of the largest r with r·(first ellipsoid) inside the funnel's, by radius²."""
+    total = 0.0
+    for t in first.t[:-1].tolist():
+        L = np.linalg.inv(np.linalg.cholesky(first.shape(t)))
+        total += 1 / np.linalg.eigvalsh(L @ design.funnel.shape(t) @ L.T)[-1]
+    return total
+
+
+def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_further(
+    setting: Setting,
+) -> None:
+    """Σ trace(D) is the volume's slope at D = 0; far from there it is no volume."""
+    from nlsid_core.design.continuous.knots import KnotForms
+    from nlsid_core.design.continuous.shape import solve_ends
+
+    rho = exponential_start(setting.steps, setting.policy, setting.P).rho
+    P = setting.P / rho[:, None, None]
+    funnel = ContinuousFunnel(setting.policy.x, (P + P.transpose(0, 2, 1)) / 2, np.ones(9), "", "")
+    ends = solve_ends(setting.steps, setting.policy, funnel)
+    forms = KnotForms(setting.steps, setting.policy, funnel, ends, margin=0.0)
+    largest = {}
+    for trust in (0.05, 0.2):
+        D = improve(forms.samples, forms.pairs, 8, forms.basis, weights=np.ones(8),
+                    margins=forms.margins, trust=trust)  # fmt: skip
+        largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()
+        assert largest[trust] <= trust + 1e-4
+    assert largest[0.05] == pytest.approx(0.05, rel=0.01)
+    assert largest[0.2] > 0.1
+
+
+def test_p_of_a_pushed_field_is_refused_before_anything_slow() -> None:
+    field = VectorField.from_function(
+        lambda x, w: np.array([x[1] + w[0], -x[0] - x[1] + w[1] + w[2]]), 2, 0,
+        uncertain=[[-1e-3, 1e-3]] * 3,
+    )  # fmt: skip
+    t = np.linspace(0, 1, 5)
+    nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
+    with pytest.raises(DataError, match="fewer than three pushes"):
+        design_funnel(field, nominal, goal=GOAL, shape="P")
+
+
+def test_a_design_knows_how_it_was_found() -> None:
+    design = design_funnel(*hanging(), goal=GOAL)
+    assert set(design.found.seconds) == {"policy", "rho", "proof"}
+    assert design.found.history[0] == ("rho", design.funnel.volume_integral())

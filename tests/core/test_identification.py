@@ -1,0 +1,126 @@
+"""Robust simulation error: the bound, its derivatives, its iterates, and what is refused."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import (
+    Fit,
+    LinearClass,
+    identify,
+    prove_stability,
+    simulation_percent,
+)
+from nlsid_core.identification.linear import build_regression, least_squares
+from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.models import DifferenceEquation, Signal
+from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
+
+EXACT = 1e-10  # agreement of two floating-point routes to the same number
+
+
+def test_the_bound_never_goes_up_over_the_iterates(train: Dataset) -> None:
+    regression = build_regression(train, 3)
+    bounds = [iterate.J for iterate in robust_simulation_error(regression.rows)]
+    assert len(bounds) > 2
+    assert all(after <= before for before, after in pairwise(bounds))
+
+
+def test_noise_free_data_give_the_true_coefficients_back() -> None:
+    model = identify(synthetic_dataset(0.0), LinearClass(2)).model
+    np.testing.assert_allclose(model.a, TRUE_A, atol=1e-6)
+    np.testing.assert_allclose(model.b, TRUE_B, atol=1e-6)
+
+
+def test_final_iterate_simulates_as_well_as_direct_minimisation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
+    assert fit["rse"].error_percent(train) <= 1.001 * fit["sem"].error_percent(train)
+    assert fit["rse"].error_percent(train) < fit["rse_first"].error_percent(train)
+
+
+def test_every_recorded_sample_scale_is_undone_once(train: Dataset) -> None:
+    regression = build_regression(train, 2)
+    model = least_squares(regression)
+    rows = []
+    targets = []
+    for trial in train:
+        y, u = trial.y[:, 0], trial.u[:, 0]
+        for t in range(2, len(trial)):
+            rows.append([y[t - 1], y[t - 2], u[t], u[t - 1], u[t - 2], 1.0])
+            targets.append(y[t])
+    expected = np.linalg.lstsq(np.array(rows), np.array(targets), rcond=None)[0]
+    np.testing.assert_allclose([*model.a, *model.b, model.c], expected, atol=1e-9)
+
+
+def test_observer_form_simulates_the_difference_equation(
+    fit: Fit[DifferenceEquation], train: Dataset
+) -> None:
+    model = fit.model
+    trial = train.trajectories[0]
+    y, u, n = trial.y[:, 0], trial.u[:, 0], len(model)
+    simulated = model.simulate(u, y[:n])
+    x = model.state_after(y[:n], u[:n])
+    for t in range(n, len(trial)):
+        assert x[0] + model.D * u[t] + model.c == pytest.approx(simulated[t], abs=EXACT)
+        x = model.A @ x + model.B[:, 0] * u[t] + model.offset
+
+
+def test_an_unstable_model_gets_no_proof() -> None:
+    model = DifferenceEquation(
+        a=np.array([1.01]), b=np.array([0.0, 1.0]), c=0.0, period=0.1,
+        y=Signal("y"), u=Signal("u"), u_range=(0.0, 1.0),
+    )  # fmt: skip
+    assert prove_stability(model) is None
+
+
+def test_a_model_just_inside_the_unit_circle_is_proved() -> None:
+    model = DifferenceEquation(
+        a=np.array([1.9985, -0.99850045]), b=np.zeros(3), c=0.0, period=0.1,
+        y=Signal("y"), u=Signal("u"), u_range=(0.0, 1.0),
+    )  # fmt: skip
+    proof = prove_stability(model)
+    assert proof is not None
+    assert float(np.abs(model.poles).max()) < proof.rate < 1.0
+
+
+def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
+    return Dataset(
+        (Trajectory(t=np.linspace(0.0, PERIOD * (len(u) - 1), len(u)), y=y, u=u, name="run"),)
+    )
+
+
+def test_a_constant_input_is_refused_with_the_reason() -> None:
+    y = np.random.default_rng(0).standard_normal(100)
+    with pytest.raises(DataError, match=r"excitation 0 is constant \(0.4\)"):
+        identify(_dataset(np.full(100, 0.4), y), LinearClass(2))
+
+
+def test_an_input_that_excites_too_few_lags_is_refused() -> None:
+    u = np.tile([0.0, 1.0], 50)
+    with pytest.raises(DataError, match="does not excite 4 lags"):
+        identify(_dataset(u, np.random.default_rng(0).standard_normal(100)), LinearClass(4))
+
+
+def test_too_few_rows_are_refused_with_how_many_are_needed() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(DataError, match="28 rows for 6 parameters; give at least 30"):
+        identify(_dataset(rng.standard_normal(30), rng.standard_normal(30)), LinearClass(2))
+
+
+def test_several_outputs_are_refused() -> None:
+    rng = np.random.default_rng(0)
+    trial = Trajectory(t=np.arange(50.0), y=rng.standard_normal((50, 2)), u=rng.random(50))
+    with pytest.raises(ShapeError, match="there are 2 and 1"):
+        identify(Dataset((trial,)), LinearClass(2))
+
+
+def test_error_percent_is_zero_for_the_truth(fit: Fit[DifferenceEquation]) -> None:
+    clean = synthetic_dataset(0.0, trials=2)
+    truth = DifferenceEquation(
+        a=TRUE_A, b=TRUE_B, c=0.0, period=PERIOD, y=fit.model.y, u=fit.model.u, u_range=(0.0, 1.0)
+    )
+    assert simulation_percent(truth, clean) < 1e-9

@@ -1,0 +1,161 @@
+"""One verb for every model class and method, in Python and on the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from bags.chain.shipped import config_file
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.pictures.report import page
+from bags.samples import f1tenth
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.identification import (
+    CertifiedRse,
+    FirstRse,
+    LeastSquares,
+    LinearClass,
+    Method,
+    Rie,
+    Rse,
+    Sem,
+    StateAffineClass,
+    describe,
+    identify,
+    select,
+    validate,
+)
+from nlsid_core.models import DifferenceEquation, StateAffineModel
+from nlsid_core.proofs import check
+from tests.conftest import TRUE_A, synthetic_dataset
+
+STATE_AFFINE = {
+    "lags": 2, "model": "state_affine", "method": "rse_certified", "iterations": 5,
+    "leading_degree": 1, "right_degree": 1, "input_range": [0.0, 0.5],
+}  # fmt: skip
+BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "04", "05", "13", "24", "34"}]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    """The shipped configuration with a state-affine model."""
+    content = yaml.safe_load(config_file("f1tenth.yaml").read_text())
+    content["identification"] = STATE_AFFINE
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+@pytest.mark.parametrize("method", [FirstRse(), Rse(), Sem(), LeastSquares()])
+def test_each_method_of_a_linear_class_can_be_chosen(train: Dataset, method: Method) -> None:
+    fit = identify(train, LinearClass(2), method=method)
+    assert isinstance(fit.model, DifferenceEquation)
+    assert fit.chosen.method is method
+    assert fit[method.name] is fit.chosen
+    assert fit.proof.rate < 1.0
+
+
+def test_a_fit_says_what_was_found(train: Dataset) -> None:
+    test = synthetic_dataset(0.01, trials=2)
+    fit = identify(train, LinearClass(2), validation=test, test=test)
+    text = str(fit)
+    assert "train  validation        test" in text
+    assert f"* {Rse.title}" in text
+    assert fit.errors["test"]["rse"] == fit.chosen.error_percent(test)
+
+
+def test_a_state_affine_class_contains_the_linear_truth(train: Dataset) -> None:
+    fit = identify(train, StateAffineClass(2), method=CertifiedRse())
+    assert isinstance(fit.model, StateAffineModel)
+    linear = identify(train, LinearClass(2))
+    assert fit["rse"].error_percent(train) == pytest.approx(
+        linear["rse"].error_percent(train), rel=1e-4
+    )
+    assert set(fit.methods) >= {"least_squares", "rie", "rse_certified"}
+    lagged = np.array([g.coefficients[0, 0, 0] for g in fit.model.G])
+    np.testing.assert_allclose(-lagged[1:] / lagged[0], TRUE_A, atol=0.02)
+
+
+def test_an_unknown_method_and_one_of_another_class_are_refused(train: Dataset) -> None:
+    with pytest.raises(DataError, match="'magic' is no method; there are: LeastSquares, Rie"):
+        identify(train, LinearClass(2), method="magic")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=r"Rie\(\) is not for this model class \(LinearClass\)"):
+        identify(train, LinearClass(2), method=Rie())
+
+
+def unstable_recordings() -> Dataset:
+    """A pole at 1.02, excited for 150 samples at a time."""
+    trials = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        u, y = rng.standard_normal(150), np.zeros(150)
+        for t in range(1, 150):
+            y[t] = 1.02 * y[t - 1] + u[t - 1] + 0.1 * rng.standard_normal()
+        trials.append(Trajectory(t=np.linspace(0.0, 14.9, 150), y=y, u=u, name=f"run {seed}"))
+    return Dataset(tuple(trials))
+
+
+def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not_white() -> None:
+    data = unstable_recordings()
+    with pytest.raises(Infeasible, match="no proof of stability"):
+        identify(data, LinearClass(1), method=LeastSquares())
+    unproved = identify(data, LinearClass(1), method=LeastSquares(), allow_unproved=True)
+    with pytest.raises(Infeasible, match="has no proof"):
+        _ = unproved.proof
+    stable = identify(data, StateAffineClass(1), method=CertifiedRse())
+    assert stable.proof.rate < 1.0
+    scores = validate(stable.model, data)
+    assert not scores.white
+    assert "NOT white" in str(scores)
+    report = page(stable, data, data, robot="unstable")
+    assert "simulation residual is NOT white (99 %)" in report
+    assert "one-step residual is NOT white (99 %)" in report
+
+
+def test_selection_takes_the_class_with_the_least_validation_error(train: Dataset) -> None:
+    validation = synthetic_dataset(0.01, trials=3)
+    classes = [LinearClass(1), LinearClass(2), LinearClass(60)]
+    seen: list[str] = []
+    chosen = select(train, validation, classes, progress=lambda what, _: seen.append(what))
+    assert chosen.best == LinearClass(2)
+    assert chosen.errors[0] > chosen.errors[1]
+    assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
+    assert seen == [*map(describe, classes), "done"]
+    assert "linear, lags 2" in str(chosen)
+    with pytest.raises(Infeasible, match="no class has a proved model"):
+        select(train, validation, [LinearClass(60)])
+
+
+def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
+    config: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    made = CliRunner().invoke(app, ["identify", *BAGS, "--config", str(config), "--out", str(out)])
+    assert made.exit_code == 0, made.output
+    verdict = check(out / documents.MODEL_PROOF)
+    assert "clips its inputs" in verdict.statement
+    refused = CliRunner().invoke(
+        app,
+        ["funnel", "--model", str(out / documents.MODEL), "--config", str(config),
+         "--out", str(out)],
+    )  # fmt: skip
+    assert refused.exit_code != 0
+    assert "kind is 'state_affine'" in str(refused.exception)
+
+
+def test_the_command_line_compares_methods_on_the_same_bags(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A console that was made by an earlier test keeps the width it found.
+    monkeypatch.setattr("bags.commands.cli.out._width", 200)
+    made = CliRunner().invoke(
+        app, ["compare", *BAGS, "--config", str(config), "--lags", "1", "--lags", "2"]
+    )
+    assert made.exit_code == 0, made.output
+    for method in (LeastSquares, Rie, Rse, CertifiedRse):
+        assert made.output.count(method.title) == 2
+    assert "20 ahead" in made.output

@@ -1,0 +1,277 @@
+"""Implicit models searched in each stable set: bounds that hold, known truths, what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+
+from nlsid_core import files
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError
+from nlsid_core.identification import (
+    ImplicitClass,
+    LeastSquares,
+    LinearStateClass,
+    identify,
+    predict,
+    simulate_trial,
+)
+from nlsid_core.identification.implicit_class import StableSet, build_implicit_rows
+from nlsid_core.identification.implicit_search import minimise_implicit_rie
+from nlsid_core.models import ImplicitModel
+from nlsid_core.proofs import check, proof_document
+from tests import implicit_models
+
+SCHEMA = Path(__file__).resolve().parents[2] / "docs" / "schema" / "implicit.schema.json"
+STATE = (1,)  # delays where the output is the state
+SPRING = ImplicitClass(1, STATE)
+CLASSES = [
+    SPRING,
+    ImplicitClass(1, STATE, "2.10"),
+    ImplicitClass(1, STATE, "2.12"),
+    ImplicitClass(1, STATE, "2.13", 5, 3),
+    ImplicitClass(1, STATE, "2.19", 1),
+    ImplicitClass(2, (0, 1), "2.11"),
+    ImplicitClass(2, (0, 1), "2.10"),
+    ImplicitClass(1, STATE, "2.10", 5, 2, storage_degree=2),
+    ImplicitClass(1, STATE, "2.13", 3, 3, coupled=True, box=((-4.0, 4.0), (-2.5, 2.5))),
+    ImplicitClass(2, STATE, "2.11", 3, 3, box=((-4.0, 4.0), (-2.5, 2.5))),
+]
+
+
+def spring(samples: int, seed: int, *, noise: float, gain: float = 1.0, mean: float = 0.0) -> (
+    Trajectory
+):  # fmt: skip
+    """v + v³/2 = 0.6 x + u, measured in other units."""
+    rng = np.random.default_rng(seed)
+    u, x = rng.uniform(-2.0, 2.0, samples), np.zeros(samples)
+    for t in range(1, samples):
+        r = 0.6 * x[t - 1] + u[t - 1]
+        root = np.cbrt(r + np.sqrt(r**2 + 8.0 / 27.0))  # Cardano: v³ + 2v = 2r
+        x[t] = root - 2.0 / (3.0 * root)
+    y = gain * (x + noise * rng.standard_normal(samples)) + mean
+    return Trajectory(t=0.01 * np.arange(samples), y=y, u=u, name=f"run {seed}")
+
+
+def coupled(samples: int, seed: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    u = rng.uniform(-1.0, 1.0, (samples, 1))
+    x = implicit_models.coupled().simulate(np.zeros((1, 2)), u[None, :-1])[0]
+    y = (x + 0.01 * rng.standard_normal(x.shape)) * [1.0, 50.0] + [0.0, 20.0]
+    return Trajectory(t=0.1 * np.arange(samples), y=y, u=u, name=f"run {seed}")
+
+
+def decay(a: float, samples: int, noise: float) -> Dataset:
+    """x⁺ = a x + u."""
+    rng = np.random.default_rng(3)
+    u, x = rng.uniform(-1.0, 1.0, samples), np.zeros(samples)
+    for t in range(1, samples):
+        x[t] = a * x[t - 1] + u[t - 1]
+    y = x + noise * rng.standard_normal(samples)
+    return Dataset((Trajectory(t=0.01 * np.arange(samples), y=y, u=u, name="decay"),))
+
+
+def slopes(model: ImplicitModel) -> np.ndarray:
+    """h's coefficients of v, v³, x, w over that of v."""
+    at = {tuple(row): k for k, row in enumerate(model.h.exponents.tolist())}
+    rows = [at[key] for key in ((1, 0, 0), (3, 0, 0), (0, 1, 0), (0, 0, 1))]
+    return np.asarray(model.h.coefficients[rows, 0] / model.h.coefficients[rows[0], 0])
+
+
+@pytest.mark.parametrize("model_class", CLASSES, ids=str)
+def test_the_bound_is_above_the_simulation_error_in_every_set(model_class: ImplicitClass) -> None:
+    for noise in (0.02, 0.3):
+        data = Dataset((spring(150, 0, noise=noise), spring(110, 1, noise=noise)))
+        rows = build_implicit_rows(data, model_class)
+        fit = minimise_implicit_rie(rows)
+        h, lags = fit.model.history, model_class.lags
+        weight, spread = np.diag(rows.weight), float(rows.y_scale[1][0])
+        total, count = 0.0, 0
+        for trial in data:
+            error = (trial.y - simulate_trial(fit.model, trial))[:, 0] / spread
+            states = np.column_stack([error[h - k : len(trial) - k] for k in range(1, lags + 1)])
+            total += float((states**2 @ weight).sum())
+            count += len(states)
+        assert 0.0 < total / count <= fit.bound
+
+
+def test_the_linear_bound_is_the_best_there_is_of_first_order() -> None:
+    """Proposition 3.1: |x⁺ - ax - bw|²/(1 - |a|)², which is also Proposition 2.19's lower bound."""
+    data = decay(0.7, 400, 0.1)
+    bound = minimise_implicit_rie(build_implicit_rows(data, CLASSES[4])).bound
+    trial = data.trajectories[0]
+    y, u = ((part - part.mean()) / part.std() for part in (trial.y[:, 0], trial.u[:, 0]))
+    right = np.column_stack([u[:-1], np.ones(len(u) - 1)])
+    values = []
+    for a in np.linspace(-0.9, 0.9, 1801):
+        left = y[1:] - a * y[:-1]
+        error = left - right @ np.linalg.lstsq(right, left, rcond=None)[0]
+        values.append(float(np.mean(error**2)) / (1.0 - abs(a)) ** 2)
+    assert min(values) * (1.0 - 1e-6) <= bound <= 1.011 * min(values)
+
+
+def test_the_linear_bound_is_above_the_lower_bound_of_proposition_2_19() -> None:
+    """sup |(zI - A)⁻¹(x̃⁺ - Ax̃ - Bw)|²_Q over |z| = 1, sample by sample, two states."""
+    trial = coupled(300, 0)
+    rows = build_implicit_rows(Dataset((trial,)), CLASSES[4])
+    fit, spread = minimise_implicit_rie(rows), rows.y_scale[1]
+    x, w = trial.y[:-1], trial.u[:-1]
+    after = fit.model.step(x, w)
+    A = fit.model.jacobian(after, x, w)[0, :, :2] * spread / spread[:, None]
+    errors = (trial.y[1:] - after) / spread
+    z = np.exp(1j * np.linspace(0.0, np.pi, 181))
+    reached = np.linalg.inv(z[:, None, None] * np.eye(2) - A) @ errors.T  # (z, state, sample)
+    lower = float(np.mean(np.max(np.sum(np.abs(reached) ** 2, axis=1), axis=0)))
+    assert 0.5 * fit.bound < lower <= fit.bound
+
+
+@pytest.mark.parametrize("name", ["2.10", "2.11", "2.12", "2.13"])
+def test_a_cubic_spring_without_noise_is_found(name: StableSet) -> None:
+    data = Dataset((spring(300, 0, noise=0.0),))
+    fit = identify(data, replace(SPRING, set=name), comparators=())
+    np.testing.assert_allclose(slopes(fit.model), [1.0, 0.5, -0.6, -1.0], atol=2e-3)
+    assert fit.errors["train"]["rie"] < 0.05
+
+
+def test_a_cubic_spring_is_found_within_the_noise_where_a_linear_model_is_far_off() -> None:
+    data = Dataset((spring(700, 0, noise=0.01), spring(500, 1, noise=0.01)))
+    test = Dataset((spring(300, 7, noise=0.0),))
+    fit = identify(data, SPRING, test=test)
+    linear = identify(data, LinearStateClass(), test=test)
+    noise = 100.0 * 0.01 / float(test.trajectories[0].y.std())
+    assert fit.errors["test"]["rie"] < noise
+    assert linear.errors["test"]["least_squares"] > 10.0 * noise
+    np.testing.assert_allclose(slopes(fit.model), [1.0, 0.5, -0.6, -1.0], atol=0.05)
+
+
+@pytest.mark.parametrize("name", ["2.10", "2.11", "2.12", "2.13"])
+def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> None:
+    plain, large, small = (
+        identify(
+            Dataset((spring(200, 0, noise=0.01, gain=g, mean=m),)),
+            replace(SPRING, set=name), comparators=(),
+        ).errors["train"]["rie"]
+        for g, m in ((1.0, 0.0), (1e3, 4e3), (1e-3, -5e-3))
+    )  # fmt: skip
+    assert large == pytest.approx(plain, abs=1e-3)
+    assert small == pytest.approx(plain, abs=1e-3)
+
+
+def test_several_states_of_different_units_are_identified_together() -> None:
+    data, test = Dataset((coupled(400, 0), coupled(300, 1))), Dataset((coupled(200, 5),))
+    cubic, linear = (
+        identify(data, model_class, test=test, comparators=())
+        for model_class in (ImplicitClass(1, STATE, "2.13"), ImplicitClass(1, STATE, "2.19", 1))
+    )
+    assert cubic.errors["test"]["rie"] < 0.8 * linear.errors["test"]["rie"]
+    assert cubic.model.states == ("y0(t-1)", "y1(t-1)")
+
+
+def test_the_nearest_stable_model_of_an_unstable_truth_is_found_and_least_squares_not_proved() -> (
+    None
+):  # fmt: skip
+    fit = identify(decay(1.02, 100, 0.0), SPRING, comparators=[LeastSquares()])
+    assert fit["least_squares"].proof is None
+    assert fit.errors["train"]["least_squares"] < 0.1 < fit.errors["train"]["rie"]
+    assert fit.proof.rate == 1.0
+    assert "proved, no rate" in str(fit)
+    assert "squared spreads of the outputs, at most 0." in str(fit)
+
+
+def test_one_step_predictions_are_steps_of_the_model() -> None:
+    trial = spring(120, 0, noise=0.1)
+    model = identify(Dataset((trial,)), CLASSES[5], comparators=()).model
+    assert (model.lags, model.history) == (2, 2)
+    x = np.column_stack([trial.y[1:-1, 0], trial.y[:-2, 0]])
+    w = np.column_stack([trial.u[2:, 0], trial.u[1:-1, 0]])
+    np.testing.assert_allclose(predict(model, trial, 1), model.step(x, w)[:, :1], atol=1e-12)
+
+
+def test_a_model_that_diverges_scores_infinity() -> None:
+    trial = spring(100, 0, noise=0.01)
+    model = identify(Dataset((trial,)), LinearStateClass()).model
+    coefficients = np.array(model.h.coefficients)
+    coefficients[model.h.exponents[:, 1] == 1] *= -500.0
+    wild = replace(model, h=replace(model.h, coefficients=coefficients))
+    assert np.isinf(simulate_trial(wild, trial)[-1]).all()
+    assert np.isfinite(simulate_trial(wild, trial)[:2]).all()
+
+
+# -- files ---------------------------------------------------------------------------------------
+
+
+def test_a_coefficient_that_was_changed_with_all_digests_is_refused(tmp_path: Path) -> None:
+    fit = identify(Dataset((spring(300, 0, noise=0.01),)), SPRING, comparators=())
+    document, proof = fit.model.document(), fit.proof.document(fit.model, "model.json")
+    path = tmp_path / "model.proof.json"
+    files.write_document(tmp_path / "model.json", document)
+    files.write_document(path, proof)
+    assert check(path).statement.startswith("the implicit model with 1 state has")
+    document["h"]["coefficients"][-1][0] += -10.0
+    files.write_document(tmp_path / "model.json", document)
+    with pytest.raises(CertificateMismatch, match="is not the model"):
+        check(path)
+    proof["claim"]["about"]["model"]["digest"] = files.digest(document)
+    files.write_document(path, proof_document(proof["claim"], proof["proof"]))
+    with pytest.raises(CertificateRejected, match="inequality monotone: not positive"):
+        check(path)
+
+
+def test_the_document_keeps_signals_and_validates_against_the_published_schema() -> None:
+    model = identify(Dataset((spring(200, 0, noise=0.01),)), CLASSES[5], comparators=()).model
+    document, schema = model.document(), files.load_document(SCHEMA)
+    jsonschema.validate(document, schema)
+    again = ImplicitModel.from_document(document)
+    assert (again.y, again.u, again.window) == (model.y, model.u, ((0, 0), (0, 1)))
+    assert again.document() == document
+    damages: tuple[dict[str, Any], ...] = (
+        {"window": [[0, -1], [0, 1]]}, {"window": [[3, 0], [0, 1]]}, {"window": []}, {"u": ["u"]},
+    )  # fmt: skip
+    for damage in damages:
+        with pytest.raises(DataError):
+            ImplicitModel.from_document(document | damage)
+
+
+# -- bad input -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"lags": 2, "set": "2.12"}, "set 2.12 is for 1 lag"),
+        ({"storage_degree": 1}, "storage_degree is for set 2.10"),
+        ({"set": "2.19"}, "set 2.19 is linear"),
+        ({"set": "2.13", "right_degree": 3}, "right_degree 3 needs left_degree 5"),
+        ({"right_degree": 2}, "needs a box in set 2.11"),
+        (
+            {"set": "2.10", "right_degree": 2, "storage_degree": 1},
+            "needs storage_degree 2 or a box",
+        ),
+        ({"set": "2.10", "right_degree": 3, "storage_degree": 2}, "needs left_degree 5 or a box"),
+        ({"coupled": True}, "on a box only"),
+    ],
+)
+def test_a_class_that_no_model_can_be_in_is_refused(options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(DataError, match=reason):
+        ImplicitClass(**options)
+
+
+def test_data_that_do_not_fit_the_class_are_refused() -> None:
+    data = Dataset((spring(60, 0, noise=0.01),))
+    for model_class, reason in (
+        (ImplicitClass(70), "60 samples, a history of 70 needs more"),
+        (ImplicitClass(20), "steps for 42 regressors; give more data"),
+        (replace(SPRING, box=((-4.0, 4.0),)), "1 intervals for 1 outputs and 1 inputs"),
+        (replace(SPRING, box=((-0.5, 4.0), (-3.0, 3.0))), r"y0 reaches \[.*outside the box"),
+    ):
+        with pytest.raises(DataError, match=reason):
+            identify(data, model_class)
+    still = replace(data.trajectories[0], u=np.full((60, 1), 0.4))
+    with pytest.raises(DataError, match=r"excitation 0 is constant \(0.4\)"):
+        identify(Dataset((still,)), SPRING)
+    square = replace(data.trajectories[0], u=np.tile([0.0, 1.0], 30)[:, None])
+    with pytest.raises(DataError, match="regressors of rank"):
+        identify(Dataset((square,)), ImplicitClass(1, (0, 1)))

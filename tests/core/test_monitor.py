@@ -1,0 +1,211 @@
+"""The tube holds in simulation when its assumption does, and the monitor says when it does not."""
+
+import math
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design.linear import innovations
+from nlsid_core.errors import CertificateMismatch
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
+from tests.conftest import PERIOD
+
+ROUNDING = 1e-9  # relative: the monitor evaluates in floating point
+
+
+def make_monitor(design: TubeDesign, centre: Centre = Centre.COMMAND) -> Monitor:
+    return Monitor(design.model, design.policy, design.funnel, centre=centre)
+
+
+def run(design: TubeDesign, y: np.ndarray, u: np.ndarray) -> list[Reading]:
+    monitor = make_monitor(design)
+    return [monitor.update(k * PERIOD, y[k], u[k]) for k in range(len(y))]
+
+
+def excite(design: TubeDesign, e: np.ndarray, engaged: np.ndarray) -> list[float]:
+    """V + e² along the error dynamics, from a start on the inlet's boundary."""
+    model, policy, funnel = design.model, design.policy, design.funnel
+    direction = np.ones(len(model))
+    x = direction * math.sqrt(funnel.inlet / (direction @ funnel.P @ direction))
+    values = []
+    for innovation, kappa in zip(e, engaged, strict=True):
+        values.append(funnel.value(x, innovation))
+        closed = model.A - kappa * model.B @ policy.K[None, :]
+        x = closed @ x + policy.L * innovation
+    return values
+
+
+def test_no_disturbance_within_the_budget_leaves_the_tube(design: TubeDesign) -> None:
+    rng = np.random.default_rng(3)
+    samples, budget = design.funnel.assumption.samples, design.funnel.assumption.budget
+    for _ in range(300):
+        e = rng.standard_normal(samples) * rng.random(samples) ** rng.integers(0, 40)
+        e *= math.sqrt(budget / np.sum(e**2))
+        values = excite(design, e, rng.random(samples) if rng.random() < 0.5 else np.zeros(samples))
+        assert max(values) <= design.funnel.level * (1 + ROUNDING)
+
+
+def test_the_worst_disturbance_nearly_reaches_the_boundary(
+    design: TubeDesign, train: Dataset
+) -> None:
+    prediction = design_tube(
+        design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0, lqr_weights=None
+    )
+    model, L = prediction.model, prediction.policy.L
+    samples = prediction.funnel.assumption.samples
+    response = [1.0] + [float((np.linalg.matrix_power(model.A, k) @ L)[0]) for k in range(samples)]
+    worst = np.array(response[:samples][::-1])  # matched to the output at the last sample
+    worst *= math.sqrt(prediction.funnel.assumption.budget / np.sum(worst**2))
+    x = np.zeros(len(model))
+    for innovation in worst:
+        output = x[0] + innovation
+        x = model.A @ x + L * innovation
+    reached = output / prediction.funnel.half_width
+    assert 0.98 < reached <= 1
+
+
+def test_training_trials_are_inside_and_spend_at_most_the_measured_share(
+    design: TubeDesign, train: Dataset
+) -> None:
+    for trial in train:
+        readings = run(design, trial.y[:, 0], trial.u[:, 0])
+        judged = [r for r in readings if r.status is not Status.UNKNOWN]
+        assert {r.status for r in judged} == {Status.INSIDE}
+        assert judged[-1].assumption <= 1 / design.funnel.assumption.safety_factor**2 + ROUNDING
+
+
+def test_the_monitor_spends_the_energy_the_design_measured(
+    design: TubeDesign, train: Dataset
+) -> None:
+    trial = train.trajectories[0]
+    e = innovations(design.model, design.policy.L[None, :], trial)[:, 0]
+    readings = [r for r in run(design, trial.y[:, 0], trial.u[:, 0]) if not math.isnan(r.margin)]
+    budget = design.funnel.assumption.budget
+    np.testing.assert_allclose(
+        [r.assumption for r in readings], np.cumsum(e**2)[: len(readings)] / budget, rtol=1e-9
+    )
+
+
+def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: TubeDesign) -> None:
+    model, policy = design.model, design.policy
+    rng = np.random.default_rng(5)
+    monitor = make_monitor(design, Centre.PROFILE)
+    n = len(model)
+    rest = policy.u[0]
+    y_rest = (model.b.sum() * rest + model.c) / (1 - model.a.sum())
+    for k in range(n):
+        monitor.update(k * PERIOD, y_rest, rest)
+    e = rng.standard_normal(len(policy))
+    e *= 0.9 * math.sqrt(design.funnel.assumption.budget / np.sum(e**2))
+    x = model.state_after([y_rest] * n, [rest] * n)
+    for k in range(len(policy)):
+        u = policy(k, x)
+        y = x[0] + model.D * u + model.c + e[k]
+        reading = monitor.update((n + k) * PERIOD, y, u)
+        if not model.u_range[0] <= u <= model.u_range[1]:
+            assert reading.status is Status.ASSUMPTION_VIOLATED
+            assert "outside the fitted range" in reading.reason
+            return
+        assert reading.status is Status.INSIDE, reading
+        x = model.A @ x + model.B[:, 0] * u + model.offset + policy.L * e[k]
+
+
+def test_a_command_that_is_not_the_policys_violates_the_assumption(design: TubeDesign) -> None:
+    model, policy = design.model, design.policy
+    monitor = make_monitor(design, Centre.PROFILE)
+    n, rest = len(model), policy.u[0]
+    y_rest = (model.b.sum() * rest + model.c) / (1 - model.a.sum())
+    for k in range(n):
+        monitor.update(k * PERIOD, y_rest, rest)
+    reading = monitor.update(n * PERIOD, y_rest, 0.5)
+    assert reading.status is Status.ASSUMPTION_VIOLATED
+    assert "is not the policy's" in reading.reason
+
+
+def test_a_sensor_that_reads_60_percent_is_caught_and_named(
+    design: TubeDesign, train: Dataset
+) -> None:
+    for trial in train:
+        readings = run(design, 0.6 * trial.y[:, 0], trial.u[:, 0])
+        bad = next(r for r in readings if r.status in (Status.OUTSIDE, Status.ASSUMPTION_VIOLATED))
+        assert "above the budget" in bad.reason
+        assert f"t = {bad.t:g} s" in bad.reason
+
+
+def test_outside_always_comes_with_a_violated_assumption(
+    design: TubeDesign, train: Dataset
+) -> None:
+    trial = train.trajectories[0]
+    for scale in np.linspace(0.0, 2.0, 21):
+        for reading in run(design, scale * trial.y[:, 0], trial.u[:, 0]):
+            if reading.status is Status.OUTSIDE:
+                assert "although" not in reading.reason
+
+
+@pytest.mark.parametrize(
+    ("sample", "reason"),
+    [
+        ((10 * PERIOD, math.nan, 0.1), "speed is nan"),
+        ((10 * PERIOD, math.inf, 0.1), "speed is inf"),
+        ((10 * PERIOD, 0.1, math.nan), "no command"),
+        ((math.nan, 0.1, 0.1), "stamp is nan"),
+        ((11 * PERIOD, 0.1, 0.1), "of the run is missing"),
+        ((10.4 * PERIOD, 0.1, 0.1), "from when the next one"),
+        ((9 * PERIOD, 0.1, 0.1), "time went back"),
+        ((5 * PERIOD, 0.1, 0.1), "time went back"),
+    ],
+)
+def test_a_sample_that_cannot_be_judged_reads_unknown_until_restarted(
+    design: TubeDesign, train: Dataset, sample: tuple[float, float, float], reason: str
+) -> None:
+    trial = train.trajectories[0]
+    y, u = trial.y[:, 0], trial.u[:, 0]
+    monitor = make_monitor(design)
+    for k in range(10):
+        last = monitor.update(k * PERIOD, y[k], u[k])
+    assert last.status is Status.INSIDE
+    for reading in (monitor.update(*sample), monitor.update(12 * PERIOD, y[12], u[12])):
+        assert reading.status is Status.UNKNOWN
+        assert math.isnan(reading.margin)
+        assert reason in reading.reason
+    monitor.restart()
+    for k in range(10):
+        last = monitor.update(k * PERIOD, y[k], u[k])
+    assert last.status is Status.INSIDE
+
+
+def test_a_missing_state_reads_unknown_never_inside(design: TubeDesign) -> None:
+    monitor = make_monitor(design)
+    reading = monitor.missing(1.0, "no speed for 0.1 s")
+    assert (reading.status, reading.reason) == (Status.UNKNOWN, "no speed for 0.1 s")
+    assert monitor.update(2.0, 0.0, 0.0).status is Status.UNKNOWN
+
+
+def test_beyond_the_horizon_the_proof_says_nothing(design: TubeDesign, train: Dataset) -> None:
+    trial = train.trajectories[0]
+    readings = run(design, trial.y[:, 0], trial.u[:, 0])
+    samples = len(design.model) + design.funnel.assumption.samples
+    assert readings[samples - 1].status is Status.INSIDE
+    assert readings[samples].status is Status.UNKNOWN
+    assert "they are over" in readings[samples].reason
+
+
+def test_a_command_outside_the_fitted_range_violates_the_assumption(
+    design: TubeDesign, train: Dataset
+) -> None:
+    trial = train.trajectories[0]
+    u = trial.u[:, 0].copy()
+    u[20:] = 1.5
+    reading = run(design, trial.y[:, 0], u)[20]
+    assert reading.status in (Status.ASSUMPTION_VIOLATED, Status.OUTSIDE)
+    assert "outside the fitted range" in reading.reason
+
+
+def test_parts_that_do_not_belong_together_are_refused(design: TubeDesign, train: Dataset) -> None:
+    other = design_tube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
+    with pytest.raises(CertificateMismatch, match="another policy"):
+        Monitor(design.model, other.policy, design.funnel)

@@ -1,0 +1,80 @@
+"""Monotone equations: the model, its identification, and its proof on pairs of solutions."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import DataError
+from nlsid_core.identification.moment_rie import MomentFit
+from nlsid_core.identification.monotone import (
+    identify_from_repeats,
+    simulate_banded,
+)
+from nlsid_core.models import MonotoneEquation
+from nlsid_core.models.monotone_equation import is_increasing, solve_increasing
+from tests.repeated import CLASS, NOISE, pair, percent, run, truth
+
+
+@pytest.fixture(scope="module")
+def fit() -> MomentFit:
+    return identify_from_repeats(Dataset(pair(4000, 1)), CLASS)
+
+
+@pytest.mark.parametrize("e", [(1.0, 0.0, 0.0), (3.0, 1.0, 1.0), (0.1, 0.0, 5.0), (1.0, -1.7, 1.0)])
+def test_an_increasing_cubic_is_inverted_from_any_guess(e: tuple[float, float, float]) -> None:
+    for v in (-1e4, -3.0, -1e-9, 0.0, 0.2, 7.0, 1e5):
+        target = ((e[2] * v + e[1]) * v + e[0]) * v
+        for guess in (0.0, -50.0, 1e3, v):
+            found = solve_increasing(e, target, guess)
+            slope = (3 * e[2] * v + 2 * e[1]) * v + e[0]
+            sizes = abs(e[2] * v**3) + abs(e[1] * v**2) + abs(e[0] * v)
+            assert abs(found - v) <= 1e-13 * (abs(v) + sizes / slope) + 1e-300
+
+
+def test_a_function_that_is_not_increasing_is_refused() -> None:
+    assert is_increasing(np.array([1.0, 1.7, 1.0]))
+    assert not is_increasing(np.array([1.0, 1.75, 1.0]))
+    assert not is_increasing(np.array([3.0, 3.0, 1.0])), "the slope vanishes at -1"
+    for e in ([0.0, 0.0, 0.0], [1.0, 0.1, 0.0], [1.0, 0.0, -1.0]):
+        with pytest.raises(DataError, match="increasing"):
+            replace(truth(), e=np.array(e))
+
+
+def test_simulation_solves_the_equation_and_documents_round_trip() -> None:
+    model = replace(truth(), y_offset=0.3, u_offset=np.array([0.1]), window=((0, 0), (0, 3)),
+                    b=np.array([1.0, -0.4]))  # fmt: skip
+    u = np.random.default_rng(0).standard_normal(200)
+    y = model.simulate(u, np.array([0.2, -0.1, 0.4])) - 0.3
+    left = ((1.0 * y + 0.6) * y + 3.0) * y
+    right = 0.1 + 1.2 * y[2:-1] - 0.5 * y[1:-2] + (u[3:] - 0.1) - 0.4 * (u[:-3] - 0.1)
+    np.testing.assert_allclose(left[3:], right, atol=1e-13)
+    again = MonotoneEquation.from_document(json.loads(json.dumps(model.document())))
+    assert again.document() == model.document()
+    np.testing.assert_array_equal(again.simulate(u), model.simulate(u))
+
+
+def test_the_banded_simulation_is_the_models_own() -> None:
+    trial = run(np.random.default_rng(3).uniform(-2, 2, 500), NOISE, 3)
+    own = truth().simulate(trial.u, trial.y[:2, 0])
+    banded = simulate_banded(truth(), trial)
+    assert banded is not None
+    assert np.abs(banded - own).max() < 1e-11
+
+
+def test_the_truth_is_found_and_proved(fit: MomentFit) -> None:
+    assert percent(fit.model) < 2.0
+    assert 0.0 < fit.proof.rate < 1.0
+    assert "proved stable" in str(fit)
+
+
+def test_the_proof_holds_on_pairs_of_solutions(fit: MomentFit) -> None:
+    rng, P = np.random.default_rng(0), fit.proof.P
+    for _ in range(20):
+        u = rng.uniform(-20.0, 20.0, 40)
+        first, second = (fit.model.simulate(u, rng.normal(scale=5.0, size=2)) for _ in range(2))
+        gap = first - second
+        V = np.array([[gap[t], gap[t - 1]] @ P @ [gap[t], gap[t - 1]] for t in range(1, 40)])
+        assert (V[1:] <= fit.proof.rate**2 * V[:-1] * (1 + 1e-9) + 1e-20).all()

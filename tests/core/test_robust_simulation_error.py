@@ -1,0 +1,262 @@
+"""The banded kernel of the robust simulation error against dense formulas and a cone solver."""
+
+from itertools import pairwise
+
+import cvxpy as cp
+import numpy as np
+import pytest
+
+from benchmarks.rwse_scaling import boundary_rows, linear_matrix_inequality
+from nlsid_core.identification.banded import Rows
+from nlsid_core.identification.newton import SchurBarrier, minimise, smallest_eigenvalues
+from nlsid_core.identification.prediction import one_step_residual
+from nlsid_core.identification.rie import IdentificationErrorBound, robust_identification_error
+from nlsid_core.identification.rse import Bound, robust_simulation_error
+from nlsid_core.identification.state_affine import (
+    StateAffineClass,
+)
+from tests.state_affine_rows import EXACT, dense, near_identity, problem
+
+SOLVER = 1e-6  # agreement with a cone solver's optimum
+
+
+def dense_K(rows: Rows, theta: np.ndarray, theta_m: np.ndarray | None) -> np.ndarray:
+    H = np.eye(len(rows)) if theta_m is None else dense(rows, theta_m)
+    product = dense(rows, theta) @ H.T
+    return np.asarray(product + product.T - H @ H.T)
+
+
+def dense_J(rows: Rows, theta: np.ndarray, theta_m: np.ndarray | None) -> float:
+    """J_m with the best p, by a dense generalised least-squares problem."""
+    L = np.linalg.cholesky(dense_K(rows, theta, theta_m))
+    left, right = np.linalg.solve(L, rows.errors @ theta), np.linalg.solve(L, rows.Q)
+    p = np.linalg.lstsq(right, left, rcond=None)[0]
+    return float(np.sum((left - right @ p) ** 2))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("first", [True, False])
+def test_banded_value_gradient_and_hessian_equal_the_dense_formula(
+    outputs: int, first: bool
+) -> None:
+    rows = problem(outputs=outputs).rows
+    theta = near_identity(rows, 0, 0.02)
+    theta_m = None if first else near_identity(rows, 1, 0.05)
+    bound = Bound(rows, theta_m)
+    point = bound.at(theta)
+    assert pytest.approx(dense_J(rows, theta, theta_m), rel=EXACT) == point.J
+
+    K = dense_K(rows, theta, theta_m)
+    unit = np.eye(len(theta))
+    still = dense_K(rows, np.zeros(len(theta)), theta_m)
+    slopes = [dense_K(rows, unit[i], theta_m) - still for i in range(len(theta))]
+    inverse = np.linalg.inv(K)
+    e = rows.errors @ theta - rows.Q @ point.p
+    V = np.column_stack([rows.errors[:, i] - S @ inverse @ e for i, S in enumerate(slopes)])
+    everything = np.column_stack([V, -rows.Q])
+    full = 2.0 * everything.T @ inverse @ everything
+    n = len(theta)
+    reduced = full[:n, :n] - full[:n, n:] @ np.linalg.solve(full[n:, n:], full[n:, :n])
+    expected = rows.errors.T @ inverse @ e + V.T @ inverse @ e
+    gradient, hessian = bound.derivatives(point)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=EXACT * abs(expected).max())
+    np.testing.assert_allclose(hessian, reduced, rtol=1e-7, atol=1e-9 * abs(reduced).max())
+
+    U = np.linalg.qr(np.random.default_rng(2).standard_normal((len(rows), 3)))[0]
+    barrier = SchurBarrier(bound, U)
+    middle = U.T @ inverse @ U
+    assert barrier.value(point) == pytest.approx(np.linalg.slogdet(middle)[1], rel=1e-9)
+    moved = [-U.T @ inverse @ S @ inverse @ U for S in slopes]
+    weights = np.linalg.inv(middle)
+    slope, curvature = barrier.derivatives(point)
+    np.testing.assert_allclose(slope, [np.trace(weights @ d) for d in moved], rtol=1e-7, atol=1e-9)
+    second = [
+        [2.0 * np.trace(weights @ U.T @ inverse @ S @ inverse @ T @ inverse @ U)
+         - np.trace(weights @ d @ weights @ c) for T, c in zip(slopes, moved, strict=True)]
+        for S, d in zip(slopes, moved, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(curvature, second, rtol=1e-6, atol=1e-8 * np.abs(second).max())
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_bound_is_above_the_simulation_error_and_equal_where_it_was_linearised(
+    outputs: int,
+) -> None:
+    stacked = problem(outputs=outputs)
+    rows = stacked.rows
+    theta_m = near_identity(rows, 4, 0.05)
+    bound = Bound(rows, theta_m)
+
+    def simulation_error(theta: np.ndarray, p: np.ndarray) -> float:
+        model = stacked.model(theta, p)
+        total = 0.0
+        for trial in stacked.dataset:
+            simulated = model.simulate(trial.u, trial.y[: len(model)])
+            total += float(np.sum(((trial.y - simulated) / model.y_scale) ** 2))
+        return total
+
+    at = bound.at(theta_m)
+    assert pytest.approx(simulation_error(theta_m, at.p), rel=1e-8) == at.J
+    for seed in range(10):
+        point = bound.at(theta_m + 0.01 * (near_identity(rows, seed, 1.0) - rows.identity))
+        assert simulation_error(point.theta, point.p) * (1 - EXACT) <= point.J
+
+
+@pytest.mark.parametrize("lagged_degree", [0, 1])
+def test_first_minimum_equals_the_matrix_inequality_solved_by_a_cone_solver(
+    lagged_degree: int,
+) -> None:
+    """min t with [K, ε; ε', t] ⪰ 0, also where the minimiser is on the boundary of K ⪰ 0."""
+    for seed, noise in ((3, 0.05), (5, 1.0)):
+        stacked = problem(
+            trials=1, samples=26, noise=noise, seed=seed,
+            model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+        )  # fmt: skip
+        rows = stacked.rows
+        found = minimise(Bound(rows, None), rows.identity)
+        theta, p, t = cp.Variable(len(rows.identity)), cp.Variable(rows.Q.shape[1]), cp.Variable()
+        eye = np.eye(len(rows.identity))
+        still = dense_K(rows, np.zeros(len(eye)), None)
+        K = still + sum(theta[i] * (dense_K(rows, eye[i], None) - still) for i in range(len(eye)))
+        N = len(rows)
+        error = rows.errors @ theta - rows.Q @ p
+        frame, last = np.eye(N, N + 1), np.eye(N + 1)[:, -1:]
+        M = frame.T @ K @ frame + t * (last @ last.T)
+        M += sum(error[r] * (np.outer(frame[r], last) + np.outer(last, frame[r])) for r in range(N))
+        solved = cp.Problem(cp.Minimize(t), [(M + M.T) / 2 >> 0])
+        solved.solve(solver="CLARABEL")
+        assert pytest.approx(float(solved.value), rel=SOLVER) == found.point.J
+
+
+def test_bounds_never_go_up_over_the_iterates_of_a_nonlinear_model() -> None:
+    rows = problem(trials=2, samples=120).rows
+    bounds = [iterate.J for iterate in robust_simulation_error(rows, iterations=8)]
+    assert len(bounds) > 1
+    assert all(after <= before * (1 + EXACT) for before, after in pairwise(bounds))
+
+
+def test_robust_simulation_error_is_at_most_the_robust_identification_error() -> None:
+    """Proposition 4.4 with P = I."""
+    for seed in range(4):
+        stacked = problem(
+            trials=1, samples=80, seed=seed, noise=0.2,
+            model_class=StateAffineClass(2, leading_degree=1),
+        )  # fmt: skip
+        rows = stacked.rows
+        _, J_identification = robust_identification_error(stacked)
+        assert J_identification >= minimise(Bound(rows, None), rows.identity).point.J
+
+
+def test_theorem_4_7_the_bound_per_sample_tends_to_an_integral_over_frequencies() -> None:
+    """J → ∫|q Y - p U|²/(2 Re q* - 1) for a scalar linear model and a finite signal."""
+    n_padding, length = 400, 30
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal(length), rng.standard_normal(length)
+    padded_u = np.concatenate([np.zeros(n_padding), u, np.zeros(n_padding)])
+    padded_y = np.concatenate([np.zeros(n_padding), y, np.zeros(n_padding)])
+    q, p = np.array([1.0, -0.4, 0.1]), np.array([0.5, 0.2, 0.0])
+    N = len(padded_y) - 2
+    lags = [padded_y[2 - k : N + 2 - k] for k in range(3)]
+    inputs = [padded_u[2 - k : N + 2 - k] for k in range(3)]
+    errors = np.column_stack(lags) @ q - np.column_stack(inputs) @ p
+    row = np.arange(N)
+    rows = Rows(
+        offsets=(0, 1, 2),
+        weights=np.asfortranarray(np.column_stack([row >= k for k in range(3)]).astype(float)),
+        errors=np.column_stack([errors, np.zeros(N), np.zeros(N)]),
+        Q=np.eye(N)[:, -1:],  # only the last, zero, error can be moved by p
+        identity=np.array([1.0, 0.0, 0.0]),
+    )
+    K = 2 * dense(rows, q)
+    expected_dense = float(errors @ np.linalg.solve((K + K.T) / 2 - np.eye(N), errors))
+    scaled = Rows(rows.offsets, rows.weights, rows.errors / q[0], rows.Q, rows.identity)
+    J = Bound(scaled, None).at(q).J
+    z = np.exp(2j * np.pi * np.arange(4096) / 4096)
+    Y, U = (np.polyval(signal[::-1], 1 / z) for signal in (y, u))
+    Q_star, P_star = np.polyval(q[::-1], 1 / z), np.polyval(p[::-1], 1 / z)
+    integral = float(np.mean(abs(Q_star * Y - P_star * U) ** 2 / (2 * Q_star.real - 1)))
+    assert expected_dense == pytest.approx(integral, rel=1e-6)
+    assert pytest.approx(expected_dense, rel=1e-9) == J
+
+
+def test_the_identification_error_is_above_the_lower_bound_of_proposition_2_19() -> None:
+    """Σ ε² sup_z |e₁'(zI - A)⁻¹e₁|², conservative where the model is lightly damped."""
+    for seed in range(4):
+        stacked = problem(
+            trials=1, samples=120, seed=seed, noise=0.1, model_class=StateAffineClass(2)
+        )
+        model, J = robust_identification_error(stacked)
+        trial = stacked.dataset.trajectories[0]
+        errors = one_step_residual(model, trial)[:, 0] / model.y_scale[0]
+        gains, _ = model.explicit(np.zeros((1, len(model.window))))
+        A = np.array([gains[0, 0], [1.0, 0.0]])
+        z = np.exp(1j * np.linspace(0.0, np.pi, 2001))
+        responses = np.linalg.inv(z[:, None, None] * np.eye(2) - A)[:, 0, 0]
+        assert np.max(abs(responses)) ** 2 * (errors @ errors) <= J * (1 + SOLVER)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("lagged_degree", [0, 1])
+def test_the_identification_error_is_the_worst_case_over_states_and_above_both_bounds(
+    outputs: int, lagged_degree: int
+) -> None:
+    """(2.28) maximised row by row, from the polynomials of the model, for the P that was found."""
+    stacked = problem(
+        trials=1, samples=120, outputs=outputs, noise=0.1,
+        model_class=StateAffineClass(2, leading_degree=1, lagged_degree=lagged_degree),
+    )  # fmt: skip
+    bound = IdentificationErrorBound(stacked)
+    found = minimise(bound, bound.start(), inequalities=(bound.storage(),)).point
+    n_g, m = len(stacked.rows.identity), outputs
+    model = stacked.model(found.theta[:n_g], found.p)
+    P = np.zeros((2 * m, 2 * m))
+    P[np.triu_indices(2 * m)] = found.theta[n_g:]
+    P = P + np.triu(P, 1).T
+    trial = stacked.dataset.trajectories[0]
+    y = (trial.y - model.y_offset) / model.y_scale
+    w = model.windows(trial.u)
+    lead, lags = model.G[0](w), np.concatenate([g(w) for g in model.G[1:]], axis=-1)
+    rng, total = np.random.default_rng(0), 0.0
+    for row, t in enumerate(range(2, len(trial))):
+        past = np.concatenate([y[t - 1], y[t - 2]])
+        error = lead[row] @ y[t] + lags[row] @ past + model.p(w)[row]
+
+        def integrand(z: np.ndarray, row: int = row, error: np.ndarray = error) -> float:
+            gap, nu = z[: 2 * m], z[2 * m :]
+            after = np.concatenate([nu, gap[:m]])
+            h = lead[row] @ nu + lags[row] @ gap + error
+            return float(gap[:m] @ gap[:m] - gap @ P @ gap + after @ P @ after - 2.0 * nu @ h)
+
+        unit = np.eye(3 * m)
+        zero, ones = integrand(np.zeros(3 * m)), [integrand(e) for e in unit]
+        minus = [integrand(-e) for e in unit]
+        slope = 0.5 * (np.array(ones) - np.array(minus))
+        square = np.array([
+            [0.5 * (integrand(a + b) - integrand(a) - integrand(b) + zero) for a in unit]
+            for b in unit
+        ])  # fmt: skip
+        worst = -0.5 * np.linalg.solve(square, slope)
+        assert np.linalg.eigvalsh(square)[-1] < 0.0
+        total += integrand(worst)
+        assert integrand(worst) >= integrand(worst + 0.1 * rng.standard_normal(3 * m))
+    assert pytest.approx(total, rel=1e-7) == found.J
+    start = bound.at(bound.start()).J
+    assert 0.9 * start > found.J
+    best = minimise(Bound(stacked.rows, None), stacked.rows.identity).point
+    assert best.J <= found.J * (1 + SOLVER)
+    simulated = (model.simulate(trial.u, trial.y[:2]) - trial.y) / model.y_scale
+    assert np.sum(simulated**2) <= found.J * (1 + EXACT)
+
+
+@pytest.mark.parametrize("N", [300, 500])
+def test_minimisers_where_eigenvalues_vanish_equal_the_cone_solver_s(N: int) -> None:
+    """A burst its input says nothing of: K is singular at the minimiser."""
+    rows = boundary_rows(N)
+    optimum, _ = linear_matrix_inequality(rows)
+    found = minimise(Bound(rows, None), rows.identity)
+    assert found.on_boundary
+    smallest, _ = smallest_eigenvalues(found.point.factor, len(rows), 4)
+    assert smallest[0] < 1e-4 * float(np.median(found.point.factor.pivots))
+    assert pytest.approx(optimum, rel=SOLVER) == found.point.J
+    dense_smallest = np.linalg.eigvalsh(dense_K(rows, found.point.theta, None))[0]
+    assert smallest[0] == pytest.approx(dense_smallest, rel=1e-2)

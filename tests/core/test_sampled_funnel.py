@@ -1,0 +1,334 @@
+"""Sampled funnels of identified models: what is proved holds, its neighbours are refused."""
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nlsid_core import files, proofs
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
+from nlsid_core.design.sampled.motion import plan_motion
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
+from nlsid_core.proofs import check
+from tests.tracked import (
+    STEPS,
+    assumption,
+    designed,
+    pendulum,
+    resigned,
+    step,
+    tracked,
+    write,
+)
+
+
+@pytest.mark.parametrize("form", ["response", "peak", "energy", "fading"])
+def test_a_funnel_of_a_nonlinear_model_is_proved_exactly(form: str, tmp_path: Path) -> None:
+    verdict = check(write(designed(form), tmp_path))
+    assert verdict.margin > 0
+    assert form in verdict.assumptions[0]
+
+
+def test_reaches_are_tight_to_one_percent_of_what_starts_on_the_boundary_do() -> None:
+    design = designed()
+    rng = np.random.default_rng(1)
+    z = rng.standard_normal((4000, 2))
+    z /= np.linalg.norm(z, axis=1)[:, None]
+    for k in range(0, STEPS, 6):
+        x = design.policy.x[k] + design.funnel.inlet[k] * z @ np.linalg.inv(design.funnel.S[k]).T
+        moved = (step(design, k, x) - design.policy.x[k + 1]) @ design.funnel.S[k + 1].T
+        farthest = np.linalg.norm(moved, axis=1).max()
+        reach = design.proof["steps"][k]["inlet"]["reach"]
+        assert 0.99 * reach < farthest <= reach
+
+
+@pytest.mark.parametrize("form", ["response", "peak"])
+def test_the_worst_disturbance_inside_the_assumption_stays_in_the_tube(form: str) -> None:
+    design = designed(form)
+    largest = adversary(design, design.funnel.tube[0] * circle(180), np.zeros((180, 2)), 0)
+    assert max(largest) <= 1.0
+    assert largest[0] > 0.999  # of the radius; later samples cannot all be worst in one run
+
+
+@pytest.mark.parametrize("form", ["response", "peak"])
+def test_every_step_of_the_tube_is_tight_to_one_percent_under_the_worst_disturbance(
+    form: str,
+) -> None:
+    """From all that the claim allows at a sample, radius and response, to the next sample."""
+    design = designed(form)
+    funnel = design.funnel
+    for k in range(STEPS):
+        start = funnel.tube[k] * circle(360)
+        for response in (-1.0, 0.0, 1.0) if form == "response" else (0.0,):
+            r = response * funnel.assumption.bound * circle(360)
+            assert adversary(design, start, r, k, last=k + 1)[0] <= 1.0
+        assert adversary(design, start, np.zeros((360, 2)), k, last=k + 1)[0] > 0.99
+
+
+def circle(count: int) -> FloatArray:
+    """(count, 2) directions."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def adversary(
+    design: TrackingDesign, xi: FloatArray, r: FloatArray, k: int, *, last: int = STEPS
+) -> list[float]:
+    """Largest |S x̄|/radius at samples k + 1 … last, from x̄ = ξ + r in units of S at sample k.
+
+    The disturbance pushes away from the nominal, and against what comes, as far as is allowed.
+    """
+    funnel, policy, bound = design.funnel, design.policy, 0.9999 * design.funnel.assumption.bound
+    found = []
+    for sign in (1.0, -1.0):
+        r_now = r @ np.linalg.inv(funnel.S[k]).T
+        x = policy.x[k] + xi @ np.linalg.inv(funnel.S[k]).T + r_now
+        sizes = []
+        for i in range(k, last):
+            S, after = funnel.S[i + 1], step(design, i, x)
+            carried = r_now @ funnel.A[i].T if funnel.assumption.form == "response" else 0.0
+            away = (after - carried - policy.x[i + 1]) @ S.T
+            pushed = away / np.linalg.norm(away, axis=1)[:, None] @ np.linalg.inv(S).T
+            r_now = sign * bound * pushed
+            x = after - carried + r_now
+            size = np.linalg.norm((x - policy.x[i + 1]) @ S.T, axis=1)
+            sizes.append(float(np.max(size)) / float(funnel.radius[i + 1]))
+        found.append(sizes)
+    return [max(pair) for pair in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize("form", ["energy", "fading"])
+def test_disturbances_that_spend_their_energy_at_once_or_slowly_stay_in_the_tube(form: str) -> None:
+    design = designed(form)
+    funnel, policy, a = design.funnel, design.policy, design.funnel.assumption
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        z = rng.standard_normal(2)
+        x = policy.x[0] + np.linalg.solve(funnel.S[0], z / np.linalg.norm(z) * funnel.tube[0])
+        energy, share = 0.0, rng.uniform(0.05, 1.0)
+        for k in range(STEPS):
+            away = funnel.S[k + 1] @ (step(design, k, x) - policy.x[k + 1])
+            left = (0.999 * a.bound) ** 2 - a.rate * energy
+            d = np.sqrt(share * left / a.gain) * away / np.linalg.norm(away)
+            energy = a.rate * energy + a.gain * float(d @ d)
+            x = step(design, k, x) + np.linalg.solve(funnel.S[k + 1], d)
+            size = float(np.linalg.norm(funnel.S[k + 1] @ (x - policy.x[k + 1])))
+            assert size <= funnel.radius[k + 1]
+
+
+@pytest.mark.parametrize(("rate", "gain"), [(0.9, 90.0), (0.99, 5.0), (1.0, 90.0), (0.99, 0.5)])
+def test_a_fading_assumption_the_loop_does_not_keep_up_with_is_refused(
+    rate: float, gain: float, tmp_path: Path
+) -> None:
+    design = designed("fading" if rate < 1 else "energy")
+    changed = replace(design.funnel.assumption, rate=rate, gain=gain)
+    if rate == 1.0:
+        changed = replace(changed, rate=0.9)
+    proof = write(resigned(design, funnel=replace(design.funnel, assumption=changed)), tmp_path)
+    with pytest.raises(CertificateRejected, match=r"rate|gain"):
+        check(proof)
+
+
+def forged(design: TrackingDesign, what: str) -> TrackingDesign:
+    """The design with one thing made better than it is, and all digests made to fit."""
+    funnel = design.funnel
+    if what == "tube cut by 2 %":
+        tube = funnel.tube.copy()
+        tube[1:] *= 0.98
+        return resigned(design, funnel=replace(funnel, tube=tube))
+    if what == "one level of the tube cut by 2 %":
+        tube = funnel.tube.copy()
+        tube[7] *= 0.98
+        return resigned(design, funnel=replace(funnel, tube=tube))
+    if what == "goal 2 % below what is reached":
+        inlet = funnel.inlet.copy()
+        inlet[-1] = 0.98 * design.proof["steps"][-1]["inlet"]["reach"]
+        return resigned(design, funnel=replace(funnel, inlet=inlet))
+    if what == "inlet raised by 2 %":
+        return resigned(design, funnel=replace(funnel, inlet=1.02 * funnel.inlet))
+    if what == "levels and reaches cut by 2 %":
+        proof = copy.deepcopy(design.proof)
+        for entry in proof["steps"]:
+            for chain in ("tube", "inlet"):
+                entry[chain]["reach"] *= 0.98
+        tube = funnel.tube * np.r_[1.0, np.full(STEPS, 0.98)]
+        return resigned(design, funnel=replace(funnel, tube=tube), proof=proof)
+    if what == "assumption made smaller":
+        smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
+        return resigned(design, funnel=replace(funnel, assumption=smaller))
+    if what == "safety factor below one":
+        smaller = replace(funnel.assumption, safety_factor=0.5)
+        return resigned(design, funnel=replace(funnel, assumption=smaller))
+    if what == "commissioning runs are the fitting bags":
+        borrowed = replace(funnel.assumption, measured_on=design.model.bags)
+        return resigned(design, funnel=replace(funnel, assumption=borrowed))
+    if what == "no commissioning runs":
+        unmeasured = replace(funnel.assumption, measured_on=())
+        return resigned(design, funnel=replace(funnel, assumption=unmeasured))
+    if what == "half-widths cut by a millionth":
+        return resigned(design, funnel=replace(funnel, half_widths=funnel.half_widths / 1.000001))
+    if what == "half-widths cut by an ulp at the end":
+        widths = funnel.half_widths.copy()
+        widths[-1, 1] = np.nextafter(widths[-1, 1], 0.0)
+        return resigned(design, funnel=replace(funnel, half_widths=widths))
+    if what == "another form":
+        other = replace(funnel.assumption, form="peak")
+        return resigned(design, funnel=replace(funnel, assumption=other))
+    if what == "another nominal":
+        return resigned(design, policy=designed(goal=0.3).policy)
+    if what == "gain 3 % smaller":
+        return resigned(design, policy=replace(design.policy, K=0.97 * design.policy.K))
+    if what == "another model":
+        heavier = replace(design.model, coefficients=1.002 * design.model.coefficients)
+        return resigned(design, model=heavier)
+    if what == "narrower data box":
+        return resigned(design, model=replace(design.model, x_range=0.5 * design.model.x_range))
+    if what == "weaker drive":
+        return resigned(design, model=replace(design.model, u_range=0.5 * design.model.u_range))
+    proof = copy.deepcopy(design.proof)
+    taken = proof["steps"][5]
+    if what == "a factor's entry changed":
+        taken["tube"]["squares"]["factors"][0][0][0] *= 2
+    elif what == "a multiplier left out":
+        taken["tube"]["ball"]["squares"]["factors"] = [[]]
+    elif what == "a multiplier twice as large":
+        taken["tube"]["ball"]["squares"]["unit"] -= 1
+    elif what == "T shrunk":
+        taken["T"] = (0.5 * np.array(taken["T"])).tolist()
+    elif what == "T with a zero on its diagonal":
+        taken["T"][1][1] = 0.0
+    elif what == "curvature made smaller":
+        taken["curvature"][2] *= 0.999
+    elif what == "curvature left out":
+        taken["curvature"].pop()
+    elif what == "curvature negative":
+        taken["curvature"][2] *= -1.0
+    elif what == "kappa below one":
+        taken["kappa"] = 0.999
+    elif what == "two steps exchanged":
+        proof["steps"][5], proof["steps"][6] = proof["steps"][6], proof["steps"][5]
+    elif what == "the chains exchanged":
+        taken["tube"], taken["inlet"] = taken["inlet"], taken["tube"]
+    elif what == "reach negative":
+        taken["tube"]["reach"] *= -1.0
+    elif what == "a member more":
+        taken["more"] = 1
+    else:
+        raise ValueError(what)
+    return replace(design, proof=proof)
+
+
+FORGERIES = [
+    "tube cut by 2 %",
+    "one level of the tube cut by 2 %",
+    "goal 2 % below what is reached",
+    "inlet raised by 2 %",
+    "levels and reaches cut by 2 %",
+    "assumption made smaller",
+    "safety factor below one",
+    "commissioning runs are the fitting bags",
+    "no commissioning runs",
+    "another nominal",
+    "gain 3 % smaller",
+    "another model",
+    "narrower data box",
+    "weaker drive",
+    "a factor's entry changed",
+    "a multiplier left out",
+    "a multiplier twice as large",
+    "T shrunk",
+    "T with a zero on its diagonal",
+    "curvature made smaller",
+    "curvature left out",
+    "curvature negative",
+    "kappa below one",
+    "two steps exchanged",
+    "the chains exchanged",
+    "reach negative",
+    "a member more",
+    "half-widths cut by a millionth",
+    "half-widths cut by an ulp at the end",
+    "another form",
+]
+
+
+@pytest.mark.parametrize("what", FORGERIES)
+def test_a_forged_funnel_is_refused_though_every_digest_fits(what: str, tmp_path: Path) -> None:
+    proof = write(forged(designed(), what), tmp_path)
+    with pytest.raises(CertificateRejected) as refusal:
+        check(proof)
+    assert not isinstance(refusal.value, CertificateMismatch)  # refused for what it says
+
+
+def test_a_policy_swapped_without_new_digests_is_a_mismatch(tmp_path: Path) -> None:
+    proof = write(designed(), tmp_path)
+    files.write_document(tmp_path / "policy.json", designed(goal=0.3).policy.document())
+    with pytest.raises(CertificateMismatch, match="policy"):
+        check(proof)
+
+
+@pytest.mark.parametrize("key", ["x_range", "u_range"])
+def test_a_model_without_its_data_box_is_refused(key: str, tmp_path: Path) -> None:
+    design = designed()
+    proof = write(design, tmp_path)
+    document = design.model.document()
+    del document[key]
+    files.write_document(tmp_path / "model.json", document)
+    with pytest.raises(CertificateMismatch):
+        check(proof)
+    whole = files.load_document(proof)
+    whole["claim"]["about"]["model"]["digest"] = files.digest(document)
+    files.write_document(proof, proofs.proof_document(whole["claim"], whole["proof"]))
+    with pytest.raises(CertificateRejected, match=key):
+        check(proof)
+
+
+def test_a_model_made_to_keep_the_checker_busy_is_refused_at_once(tmp_path: Path) -> None:
+    design = designed()
+    exponents = design.model.exponents.copy()
+    exponents[-1] = [15, 15, 15]
+    huge = resigned(design, model=replace(design.model, exponents=exponents))
+    proof = write(huge, tmp_path)
+    with pytest.raises(CertificateRejected, match="too large to decide"):
+        check(proof)
+
+
+def test_a_missing_step_is_refused(tmp_path: Path) -> None:
+    design = designed()
+    proof = copy.deepcopy(design.proof)
+    del proof["steps"][3]
+    with pytest.raises(CertificateRejected, match="steps"):
+        check(write(replace(design, proof=proof), tmp_path))
+
+
+def test_commissioning_on_the_fitting_bags_is_refused_before_anything_is_written() -> None:
+    base = tracked()
+    borrowed = replace(assumption(), measured_on=base.model.bags)
+    with pytest.raises(CertificateRejected, match="fitted on"):
+        design_state_funnel(base.model, base.policy, base.feedback, assumption=borrowed)
+
+
+def test_a_disturbance_too_large_for_the_goal_is_infeasible_and_says_where() -> None:
+    base = tracked()
+    with pytest.raises(Infeasible, match="at sample"):
+        design_state_funnel(
+            base.model, base.policy, base.feedback, assumption=assumption("peak", 1.0)
+        )
+
+
+def test_a_start_beyond_the_inlet_is_refused() -> None:
+    base = tracked()
+    with pytest.raises(DataError, match="inlet"):
+        design_state_funnel(
+            base.model, base.policy, base.feedback, assumption=assumption(), start=100.0
+        )
+
+
+def test_a_motion_out_of_reach_of_the_data_is_infeasible() -> None:
+    with pytest.raises(Infeasible, match="out of reach"):
+        plan_motion(pendulum(), [0.0, 0.0], [1.1, 0.0], steps=5)
+    with pytest.raises(DataError, match="angle"):
+        plan_motion(pendulum(), [0.0, 0.0], [1.3, 0.0], steps=50)

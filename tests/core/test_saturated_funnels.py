@@ -1,0 +1,322 @@
+"""Funnels of policies whose inputs saturate: proved mode by mode, simulated, and forged."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.chain.problems import FunnelProblem
+from bags.commands.cli import app
+from examples import torque_limited_pendulum as pendulum
+from nlsid_core import files as documents
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
+from nlsid_core.design.continuous.graded import Graded, monomials_of
+from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
+from nlsid_core.dynamics import Nominal, VectorField, constant_on
+from nlsid_core.errors import CertificateRejected, DataError
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.proofs import check
+from tests.funnel_files import Files, saved, write
+
+LIMIT = 9.0
+GOAL = np.diag([100.0, 10.0])
+
+
+def still(field: VectorField, knots: int, seconds: float) -> Nominal:
+    """Rest at the origin."""
+    t = np.linspace(0, seconds, knots)
+    return integrate_nominal(field, lambda _: np.zeros(field.m), t=t, start=np.zeros(field.n))
+
+
+@pytest.fixture(scope="module")
+def design() -> FunnelDesign:
+    """The pendulum with less torque, for the last 0.5 s."""
+    field, _ = pendulum.problem()
+    return design_funnel(
+        field, still(field, 21, 0.5), goal=GOAL, Q=pendulum.Q, R=pendulum.R,
+        limits=[[0, -LIMIT, LIMIT]],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def files(design: FunnelDesign, tmp_path_factory: pytest.TempPathFactory) -> Files:
+    """Its four documents."""
+    return saved(design, tmp_path_factory.mktemp("saturated"))
+
+
+def demand(found: FunnelDesign, t: float) -> float:
+    """The largest |u₀ - Kx̄| on the funnel's boundary."""
+    edge = found.funnel.outline(t, (0, 1))
+    asked = found.policy.u(t) - (edge - found.policy.x(t)) @ found.policy.K(t).T
+    return float(np.abs(asked).max())
+
+
+def test_a_funnel_in_which_the_input_saturates_is_proved_and_says_so(
+    design: FunnelDesign, tmp_path: Path
+) -> None:
+    assert demand(design, 0.0) > 1.2 * LIMIT
+    proof = design.save(tmp_path)[-1]
+    exact = check(proof)
+    assert "u0 clipped to [-9, 9]" in exact.assumptions[0]
+    assert "without" not in exact.assumptions[0]
+    assert exact.margin > 0
+    policy = ContinuousPolicy.load(tmp_path / "policy.json")
+    edge = design.funnel.outline(0.0, (0, 1))
+    assert np.abs(policy(0.0, edge)).max() == LIMIT
+
+
+def test_no_start_leaves_with_the_true_sine_and_with_less_torque_some_do(
+    design: FunnelDesign,
+) -> None:
+    truth, rng = TrueDynamics(pendulum.truth), np.random.default_rng(2)
+    for knot in (0, 6):
+        run = simulate_boundary(
+            truth, design.policy, design.funnel, starts=3000, rng=rng, knot=knot
+        )
+        assert run.violations == 0
+    weaker = replace(design.policy, limits=np.array([[0, -LIMIT / 2, LIMIT / 2]]))
+    assert simulate_boundary(truth, weaker, design.funnel, starts=500, rng=rng).violations > 0
+
+
+def test_what_is_proved_in_a_mode_is_what_the_clipped_loop_does(design: FunnelDesign) -> None:
+    """c + Στq = dρ/ds - dW/ds where ρ = W, with V̇ of the simulated dynamics in that mode."""
+    rng = np.random.default_rng(5)
+    pieces, seen = design.found.proved.pieces, set()
+    for i in rng.permutation(len(pieces))[:60].tolist():
+        piece = pieces.select(np.array([i]))
+        s = float(rng.uniform())
+        share = (float(piece.index[0]) + s) / 2.0 ** float(piece.level[0])
+        k = int(piece.interval[0])
+        t, h = design.funnel.t[k], design.funnel.t[k + 1] - design.funnel.t[k]
+        when = float(t + share * h)
+        X = design.funnel.boundary(when, unit(rng, 40))
+        x_bar = X - design.funnel.nominal(when)
+        asked = design.policy.u(when) - x_bar @ design.policy.K(when).T
+        side = np.where(asked > LIMIT, 1, np.where(asked < -LIMIT, -1, 0))[:, 0]
+        here = side == piece.mode[0, 0]
+        if not here.any():
+            continue
+        seen.add(int(piece.mode[0, 0]))
+        w = design.model.vertices()[int(piece.vertex[0])]
+        rate = design.model(when, X, design.policy(when, X), w) - design.policy.x.derivative()(when)
+        P = (1 - share) * design.funnel.P[k] + share * design.funnel.P[k + 1]
+        P_rate = design.funnel.P[k + 1] - design.funnel.P[k]
+        growth = design.funnel.rho[k + 1] - design.funnel.rho[k]
+        W_rate = 2 * h * np.einsum("ni,ij,nj->n", x_bar, P, rate)
+        W_rate += np.einsum("ni,ij,nj->n", x_bar, P_rate, x_bar)
+        z = np.linalg.solve(piece.T[0], x_bar.T).T
+        c = value(design, piece, z, s)
+        bare = value(design, replace(piece, tau=0 * piece.tau), z, s)
+        assert bare[here] == pytest.approx((growth - W_rate)[here], rel=1e-6, abs=1e-9)
+        assert (c[here] <= bare[here] + 1e-9).all()  # τq ≥ 0 in the mode
+        assert (c > 0).all()  # and everywhere on the boundary c is what the proof says it is
+    assert seen == {-1, 0, 1}
+
+
+def value(design: FunnelDesign, piece: Pieces, z: FloatArray, s: float) -> FloatArray:
+    """c(s, z) of one piece, from the search's own expansion."""
+    return sum_of(closed_loop_polynomial(design.model, design.policy, design.funnel, piece), z, s)
+
+
+def sum_of(c: Graded, z: FloatArray, s: float) -> FloatArray:
+    total = np.zeros(len(z))
+    for q, part in c.items():
+        S = part.shape[1] - 1
+        weights = np.array([s**k * (1 - s) ** (S - k) for k in range(S + 1)])
+        rows: IntArray = monomials_of(z.shape[1], q)
+        total += monomial_values(rows, z) @ (weights @ part[0])
+    return total
+
+
+def unit(rng: np.random.Generator, count: int) -> FloatArray:
+    """Points of the unit circle."""
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+# -- forgeries -------------------------------------------------------------------------------
+
+
+def pieces_of(files: Files) -> list[Any]:
+    """The proof's pieces."""
+    found: list[Any] = files["funnel.proof.json"]["proof"]["pieces"]
+    return found
+
+
+def limits_widened(files: Files) -> None:
+    """By 1 %, after the fact."""
+    files["policy.json"]["limits"] = [[0, -1.01 * LIMIT, 1.01 * LIMIT]]
+
+
+def limits_dropped(files: Files) -> None:
+    """As if the motor could do anything."""
+    files["policy.json"]["limits"] = []
+
+
+def mode_missing(files: Files) -> None:
+    """Nothing is shown for the high limit."""
+    kept = [piece for piece in pieces_of(files) if piece["mode"] != [1]]
+    files["funnel.proof.json"]["proof"]["pieces"] = kept
+
+
+def mode_renamed(files: Files) -> None:
+    """The free mode's piece, called high."""
+    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [0])
+    piece["mode"] = [1]
+
+
+def mode_unknown(files: Files) -> None:
+    """There is no mode 2."""
+    pieces_of(files)[0]["mode"] = [2]
+
+
+def multiplier_flipped(files: Files) -> None:
+    """τ ≤ 0 would allow V to grow in its mode."""
+    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [1])
+    squares = piece["tau"][0]["squares"]
+    squares["weights"] = [-1] * max(map(len, squares["factors"]))
+
+
+def multiplier_changed(files: Files) -> None:
+    """Four times as large: another polynomial than its factors stand for."""
+    piece = next(piece for piece in pieces_of(files) if piece["mode"] == [-1])
+    piece["tau"][0]["squares"]["unit"] -= 1
+
+
+FORGERIES: list[tuple[Callable[[Files], None], str]] = [
+    (limits_widened, "not positive"),
+    (limits_dropped, "unknown member 'sides'"),
+    (mode_missing, r"piece of interval 0 is missing \(vertex 0, mode \(1,\)"),
+    (mode_renamed, "missing"),
+    (mode_unknown, r"mode \(2,\): none"),
+    (multiplier_flipped, "weight of 0 or more"),
+    (multiplier_changed, "not positive"),
+]
+
+
+@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
+def test_a_forged_saturated_funnel_is_refused(
+    files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
+) -> None:
+    forged = json.loads(json.dumps(files))
+    forge(forged)
+    with pytest.raises(CertificateRejected, match=reason):
+        check(write(forged, tmp_path, rebind=True))
+
+
+def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> None:
+    assert check(write(files, tmp_path, rebind=True)).margin > 0
+
+
+# -- more inputs, bad input --------------------------------------------------------------------
+
+
+def test_a_saturated_funnel_comes_near_the_radius_known_in_closed_form() -> None:
+    """ẋ = x + clip(u, ±1), |x(1)| ≤ 0.2: at the limit x(0) = 1 - 0.8/e, and no start beyond it."""
+    field = VectorField.from_function(lambda x, u: np.array([x[0] + u[0]]), 1, 1)
+    found = design_funnel(
+        field, still(field, 41, 1.0), goal=np.array([[25.0]]), limits=[[0, -1.0, 1.0]]
+    )
+    radius = 1 / np.sqrt(found.funnel.shape(0.0)[0, 0])
+    best = 1 - 0.8 / np.e
+    assert 0.97 * best <= radius < best
+    assert radius * found.policy.K(0.0)[0, 0] > 1.5  # it asks for far more than there is
+
+
+def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
+    def pair(x: Any, u: Any) -> Any:
+        return np.array([x[0] + x[0] ** 3 / 6 + u[0], x[1] / 2 + x[0] / 4 + u[1]])
+
+    field = VectorField.from_function(pair, 2, 2)
+    found = design_funnel(
+        field, still(field, 9, 0.4), goal=4 * np.eye(2),
+        limits=[[0, -0.9, 0.9], [1, -0.6, 0.8]],
+    )  # fmt: skip
+    assert len(np.unique(found.found.proved.pieces.mode, axis=0)) == 9
+    edge = found.funnel.outline(0.0, (0, 1))
+    asked = -(edge - found.policy.x(0.0)) @ found.policy.K(0.0).T
+    assert (np.abs(asked).max(axis=0) > [0.9, 0.8]).all()
+    assert check(found.save(tmp_path)[-1]).margin > 0
+    rng = np.random.default_rng(7)
+    assert (
+        simulate_boundary(field, found.policy, found.funnel, starts=3000, rng=rng).violations == 0
+    )
+
+
+def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1] + w[1], x[0] - x[0] ** 3 / 6 + u[0] + w[0] - 2 * w[2]])
+
+    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=[[2, -1.0, 1.0]])
+    found = design_funnel(field, still(field, 13, 0.6), goal=20 * np.eye(2), limits=[[0, -0.5, 1]])
+    assert found.found.proved.pieces.kappa is not None
+    assert demand(found, 0.0) > 0.6
+    assert check(found.save(tmp_path)[-1]).margin > 0
+    rng = np.random.default_rng(10)
+    run = simulate_boundary(field, found.policy, found.funnel, starts=2000, rng=rng, adversary=True)
+    assert run.violations == 0
+
+
+def test_a_policy_clips_what_it_asks_for_and_refuses_limits_that_are_none() -> None:
+    t = np.array([0.0, 1.0])
+    parts = (
+        constant_on(t, np.zeros((1, 2))),
+        constant_on(t, np.zeros((1, 4))),
+        constant_on(t, np.ones((1, 4, 2))),
+        "",
+    )
+    policy = ContinuousPolicy(*parts, limits=np.array([[2, -1.0, 3.0]]))
+    assert policy(0.5, [[5.0, 5.0], [-9.0, 0.0]]) == pytest.approx(
+        np.array([[-10.0, -10.0, -1.0, -10.0], [9.0, 9.0, 3.0, 9.0]])
+    )
+    assert ContinuousPolicy.from_document(policy.document()).limits.tolist() == [[2, -1, 3]]
+    for limits in ([[4, -1, 1]], [[0, 1, -1]], [[0, -1, 1], [0, -2, 2]], [[0, -1, np.inf]]):
+        with pytest.raises(DataError, match="rows of limits"):
+            ContinuousPolicy(*parts, limits=np.array(limits, dtype=float))
+    with pytest.raises(DataError, match=r"3\^4 modes"):
+        ContinuousPolicy(*parts, limits=np.array([[i, -1.0, 1.0] for i in range(4)]))
+
+
+def test_a_nominal_beyond_the_limits_and_the_general_shape_are_refused() -> None:
+    field, _ = pendulum.problem()
+    nominal = still(field, 5, 0.2)
+    with pytest.raises(DataError, match="no room is left"):
+        design_funnel(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]])
+    with pytest.raises(DataError, match="with limits take shape rho"):
+        design_funnel(field, nominal, goal=GOAL, shape="P", limits=[[0, -6.0, 6.0]])
+
+
+def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:
+    field, _ = pendulum.problem()
+    asked = FunnelProblem(
+        field, still(field, 13, 0.3), pendulum.Q, pendulum.R, Goal(np.zeros(2), GOAL),
+        limits=np.array([[0, -LIMIT, LIMIT]]),
+    )  # fmt: skip
+    file = tmp_path / "problem.json"
+    documents.write_document(file, asked.document())
+    made = CliRunner().invoke(app, ["funnel", "--problem", str(file), "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert ContinuousPolicy.load(tmp_path / "policy.json").limits.tolist() == [[0, -LIMIT, LIMIT]]
+    checked = CliRunner().invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
+    assert "u0 clipped to [-9, 9]" in " ".join(checked.output.split())
+
+
+@pytest.mark.slow
+def test_the_torque_limited_pendulum_covers_most_of_its_best_ellipse() -> None:
+    found = pendulum.designed()
+    assert demand(found, 0.0) > 1.5 * pendulum.TORQUE
+    everything, ellipse = pendulum.area_fractions(found.policy, found.funnel, points=201)
+    assert 0.1 < everything < 1
+    assert 0.8 < ellipse <= 1.02
+    truth, rng = TrueDynamics(pendulum.truth), np.random.default_rng(3)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=10_000, rng=rng)
+    assert run.violations == 0

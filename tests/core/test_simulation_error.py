@@ -1,0 +1,246 @@
+"""Simulation error: its derivatives, weights, and the last step that keeps the certificate."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.recorded import heat_exchanger, single
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import LinearClass, identify, prove_stability
+from nlsid_core.identification.banded import Rows
+from nlsid_core.identification.certified import certified_simulation_error, descend_certified
+from nlsid_core.identification.linear import (
+    build_regression,
+    least_squares,
+    minimise_simulation_error,
+)
+from nlsid_core.identification.newton import minimise
+from nlsid_core.identification.rie import robust_identification_error
+from nlsid_core.identification.rse import Bound, robust_simulation_error
+from nlsid_core.identification.simulation_error import SimulationError
+from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.validation import simulation_percent
+from nlsid_core.models import StateAffineModel
+from nlsid_core.proofs import check
+from tests.conftest import synthetic_dataset
+from tests.state_affine_rows import EXACT, dense, near_identity, problem
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def with_covariance(rows: Rows, *, moving_average: float) -> Rows:
+    """Weights that are not diagonal: W⁻¹ = B B' with B = I + moving_average·shift."""
+    N = len(rows)
+    inside = (np.arange(N) >= 1).astype(float)
+    size = 1.0 + 0.5 * np.cos(np.arange(N))
+    diagonal = size**2 + moving_average**2 * np.concatenate([[0.0], size[:-1] ** 2])
+    below = moving_average * inside * np.concatenate([[0.0], size[:-1] ** 2])
+    above = np.concatenate([below[1:], [0.0]])
+    return Rows(
+        rows.offsets, rows.weights, rows.errors, rows.Q, rows.identity,
+        covariance={0: diagonal, 1: below, -1: above},
+    )  # fmt: skip
+
+
+def dense_covariance(rows: Rows) -> np.ndarray:
+    assert rows.covariance is not None
+    N = len(rows)
+    S = np.zeros((N, N))
+    for D, entries in rows.covariance.items():
+        r = np.arange(max(D, 0), N + min(D, 0))
+        S[r, r - D] = entries[r]
+    return S
+
+
+def largest(values: FloatArray) -> float:
+    return float(np.max(np.abs(values)))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("moving_average", [0.0, 0.4])
+@pytest.mark.parametrize("first", [True, False])
+def test_the_weighted_bound_and_its_derivatives_equal_the_dense_formula(
+    outputs: int, moving_average: float, first: bool
+) -> None:
+    """J = ε'P (P'G + G'P - W)⁻¹ P'ε with P = G_m⁻ᵀ W, written as in the thesis."""
+    rows = with_covariance(problem(outputs=outputs).rows, moving_average=moving_average)
+    theta_m = rows.identity if first else near_identity(rows, 1, 0.05)
+    theta = theta_m + 0.01 * (near_identity(rows, 0, 1.0) - rows.identity)
+    bound = Bound(rows, None if first else theta_m)
+    point = bound.at(theta)
+    W = np.linalg.inv(dense_covariance(rows))
+    P = np.linalg.inv(dense(rows, theta_m)).T @ W
+
+    def value(theta: np.ndarray) -> float:
+        G = dense(rows, theta)
+        middle = np.linalg.inv(P.T @ G + G.T @ P - W)
+        weight = P @ middle @ P.T
+        L = np.linalg.cholesky((weight + weight.T) / 2).T
+        left, right = L @ (rows.errors @ theta), L @ rows.Q
+        p = np.linalg.lstsq(right, left, rcond=None)[0]
+        return float(np.sum((left - right @ p) ** 2))
+
+    assert pytest.approx(value(theta), rel=EXACT) == point.J
+    gradient, hessian = bound.derivatives(point)
+    step = 1e-5
+    for i, unit in enumerate(np.eye(len(theta))):
+        ahead, behind = bound.at(theta + step * unit), bound.at(theta - step * unit)
+        slope = (ahead.J - behind.J) / (2 * step)
+        assert gradient[i] == pytest.approx(slope, rel=1e-5, abs=1e-6 * largest(gradient))
+        curvature = (bound.derivatives(ahead)[0] - bound.derivatives(behind)[0]) / (2 * step)
+        np.testing.assert_allclose(hessian[i], curvature, rtol=1e-5, atol=1e-6 * largest(hessian))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("moving_average", [None, 0.4])
+def test_the_simulation_error_of_the_rows_is_that_of_the_model(
+    outputs: int, moving_average: float | None
+) -> None:
+    stacked = problem(outputs=outputs)
+    rows = stacked.rows
+    if moving_average is not None:
+        rows = with_covariance(rows, moving_average=moving_average)
+    theta = near_identity(rows, 4, 0.05)
+    objective = SimulationError(rows)
+    point = objective.at(theta)
+    model = stacked.model(theta, point.p)
+    errors = np.concatenate([
+        ((model.simulate(trial.u, trial.y[: len(model)]) - trial.y) / model.y_scale)[len(model) :]
+        for trial in stacked.dataset
+    ]).ravel()  # fmt: skip
+    W = np.eye(len(rows)) if moving_average is None else np.linalg.inv(dense_covariance(rows))
+    assert pytest.approx(errors @ W @ errors, rel=1e-9) == point.J
+    assert pytest.approx(point.J, rel=1e-9) == Bound(rows, theta).at(theta).J
+    gradient, hessian = objective.derivatives(point)
+    step = 1e-6
+    for i, unit in enumerate(np.eye(len(theta))):
+        slope = (objective.at(theta + step * unit).J - objective.at(theta - step * unit).J) / (
+            2 * step
+        )
+        assert gradient[i] == pytest.approx(slope, rel=1e-5, abs=1e-5 * largest(gradient))
+    assert np.linalg.eigvalsh(hessian)[0] >= -EXACT * largest(hessian)
+
+
+def test_weighted_iterates_never_go_up_and_end_at_the_weighted_simulation_error() -> None:
+    rows = with_covariance(problem(trials=2, samples=120).rows, moving_average=0.3)
+    iterates = list(robust_simulation_error(rows, iterations=8))
+    bounds = [iterate.J for iterate in iterates]
+    assert len(bounds) > 2
+    assert bounds == sorted(bounds, reverse=True)
+    at_last = SimulationError(rows).at(iterates[-1].theta).J
+    assert at_last <= bounds[-1] * (1 + EXACT)
+
+
+def test_a_weight_buys_accuracy_where_it_is_put() -> None:
+    """A wrong second half pulls the fit; weighing it down brings the fit of the first half back."""
+    stacked = problem(trials=1, samples=400, noise=0.02, model_class=StateAffineClass(1))
+    rows = stacked.rows
+    half = len(rows) // 2
+    weights = np.where(np.arange(len(rows)) < half, 1.0, 1e-4)
+
+    def first_half(used: Rows) -> float:
+        *_, last = robust_simulation_error(used, iterations=10)
+        model = stacked.model(last.theta, last.p)
+        trial = stacked.dataset.trajectories[0]
+        error = model.simulate(trial.u, trial.y[:1]) - trial.y
+        return float(np.sum(error[1 : 1 + half] ** 2))
+
+    weighted = first_half(rows.weighted(weights))
+    assert weighted < 0.999 * first_half(rows)
+    same = minimise(Bound(rows.weighted(np.full(len(rows), 2.0)), None), rows.identity).point
+    plain = minimise(Bound(rows, None), rows.identity).point
+    assert pytest.approx(2.0 * plain.J, rel=1e-6) == same.J
+
+
+def test_weights_that_make_no_sense_are_refused() -> None:
+    stacked = problem(model_class=StateAffineClass(1))
+    rows = stacked.rows
+    for wrong in (np.ones(len(rows) - 1), np.zeros(len(rows)), np.full(len(rows), np.nan)):
+        with pytest.raises(DataError, match="weights should be"):
+            rows.weighted(wrong)
+
+
+def test_the_last_step_of_a_linear_model_keeps_its_proof_and_never_goes_up() -> None:
+    dataset = synthetic_dataset(0.4)
+    regression = build_regression(dataset, 3)
+    start = least_squares(regression)
+    assert prove_stability(start) is not None
+    found = minimise_simulation_error(regression, start, stable=True)
+    assert prove_stability(found) is not None
+    assert simulation_percent(found, dataset) < 0.999 * simulation_percent(start, dataset)
+    fit = identify(dataset, LinearClass(3))
+    again = minimise_simulation_error(regression, fit.model, stable=True)
+    assert simulation_percent(again, dataset) <= simulation_percent(fit.model, dataset) * (1 + 1e-9)
+
+
+def training_error(model: StateAffineModel, rows: Rows) -> float:
+    return SimulationError(rows).at(np.concatenate([g.coefficients.ravel() for g in model.G])).J
+
+
+def checked(model: StateAffineModel, folder: Path) -> str:
+    proof = prove_stability(model)
+    assert proof is not None
+    files.write_document(folder / "model.json", model.document())
+    files.write_document(folder / "model.proof.json", proof.document(model, "model.json"))
+    return check(folder / "model.proof.json").statement
+
+
+def test_the_last_step_of_a_state_affine_model_keeps_its_proof(tmp_path: Path) -> None:
+    """From the first certified iterate, so that there is something left to gain."""
+    stacked = problem(
+        trials=1, samples=400, noise=0.2, model_class=StateAffineClass(2, leading_degree=2)
+    )
+    first = next(certified_simulation_error(stacked))
+    model = stacked.model(first.point.theta, first.point.p)
+    proof = prove_stability(model)
+    assert proof is not None
+    found = descend_certified(stacked, model, proof)
+    assert "every input" in checked(found, tmp_path)
+    assert training_error(found, stacked.rows) < 0.999 * training_error(model, stacked.rows)
+    proof = prove_stability(found)
+    assert proof is not None
+    again = descend_certified(stacked, found, proof)
+    assert training_error(again, stacked.rows) <= training_error(found, stacked.rows)
+
+
+def test_the_last_step_on_the_heat_exchanger_keeps_the_certificate(tmp_path: Path) -> None:
+    folder = DATA / "exchanger"
+    if not folder.is_dir():
+        pytest.skip("no heat exchanger recording beside the repository")
+    flow, temperature = heat_exchanger(folder)
+    train = single("exchanger", flow[:800], temperature[:800], 1.0)
+    stacked = build_state_affine_rows(
+        train, StateAffineClass(2, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),))
+    )
+    first = next(certified_simulation_error(stacked))
+    model = stacked.model(first.point.theta, first.point.p)
+    proof = prove_stability(model)
+    assert proof is not None
+    found = descend_certified(stacked, model, proof)
+    assert "every input" in checked(found, tmp_path)
+    before, after = (simulation_percent(m, train) for m in (model, found))
+    assert after < 0.8 * before
+
+
+def test_the_last_step_refuses_classes_it_has_no_certificate_for() -> None:
+    stacked = problem(
+        trials=1, samples=400, noise=0.2, model_class=StateAffineClass(2, leading_degree=2)
+    )
+    first = next(certified_simulation_error(stacked))
+    model = stacked.model(first.point.theta, first.point.p)
+    proof = prove_stability(model)
+    assert proof is not None
+    other = problem(model_class=StateAffineClass(2, lagged_degree=2, delays=(0,)))
+    with pytest.raises(ShapeError, match="degree 1 at most"):
+        descend_certified(other, model, proof)
+
+
+def test_the_identification_error_has_no_weights() -> None:
+    stacked = problem(model_class=StateAffineClass(1))
+    weighted = replace(stacked, rows=stacked.rows.weighted(np.full(len(stacked.rows), 2.0)))
+    with pytest.raises(ShapeError, match="weights"):
+        robust_identification_error(weighted)

@@ -1,0 +1,178 @@
+"""The sphere form in a sampled basis: against Clarabel, and proved."""
+
+import numpy as np
+import pytest
+
+from examples import satellite
+from nlsid_core.errors import (
+    CertificateRejected,
+    DataError,
+    Infeasible,
+    ShapeError,
+    SolverError,
+    Undecided,
+)
+from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
+from nlsid_core.proofs import decide
+from nlsid_core.sos import (
+    Program,
+    SphereProgram,
+    SphereProof,
+    SumOfSquares,
+    solve,
+    sphere_proof,
+)
+from nlsid_core.sos import sphere as sphere_module
+from nlsid_core.sos.proofs import bound_document
+from nlsid_core.sos.rigorous import bound_holds
+
+TWICE_SOLVER = 1e-6  # of the spread: Clarabel stops at 1e-8 of quantities of size 1, not of g
+
+
+def random_quartic(n: int, seed: int) -> Polynomial:
+    rows = monomials(n, range(5))
+    rng = np.random.default_rng(seed)
+    return Polynomial(rows, rng.normal(size=len(rows)), tuple(f"z{i}" for i in range(n)))
+
+
+def oracle(g: Polynomial) -> float:
+    (m,) = variables("m")
+    sphere: Polynomial = 1 - sum((z**2 for z in variables(g.names)), constant(0.0))
+    return solve(Program(g.names, (SumOfSquares(g - m, modulo=sphere),), maximise=m)).objective
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_margin_is_clarabels(n: int, seed: int) -> None:
+    g, program = random_quartic(n, seed), SphereProgram(n)
+    values = g(program.points)
+    found = program.solve(values)
+    assert abs(found.m - oracle(g)) < TWICE_SOLVER * np.ptp(values)
+    assert found.m <= found.upper
+
+
+def test_the_number_of_points_is_the_number_of_equalities() -> None:
+    program = SphereProgram(6)
+    assert program.points.shape == (182, 6)
+    assert program.basis.shape == (27, 6)
+    assert np.linalg.norm(program.points, axis=1) == pytest.approx(1.0)
+
+
+def test_every_l_step_along_the_satellite_is_proved_by_the_kernel_and_shown_in_floats() -> None:
+    program = SphereProgram(6)
+    steps = satellite.l_steps(satellite.nominal())
+    last = None
+    for step in steps[::24]:
+        g = step.polynomial()
+        last = program.solve(step.values(program.points), tolerance=1e-5, start=last)
+        assert g(program.points) == pytest.approx(step.values(program.points), abs=1e-12)
+        proof = sphere_proof(program, last, g)
+        assert 0 < last.m - proof.bound < 1e-9
+        assert prove(g, proof.bound, proof) > 0
+        assert shown(g, proof.bound, proof) > 0
+        with pytest.raises((CertificateRejected, Infeasible)):
+            prove(g, last.upper + 1e-3, proof)
+        with pytest.raises(Undecided):
+            shown(g, last.upper + 1e-3, proof)
+
+
+def prove(g: Polynomial, bound: float, proof: SphereProof) -> float:
+    document = bound_document(
+        g,
+        bound,
+        proof.gram,
+        equalities=[proof.sphere],
+        equality_multipliers=[proof.multiplier],
+    )
+    return float(decide(document, {}).margin)
+
+
+def shown(g: Polynomial, bound: float, proof: SphereProof) -> float:
+    return bound_holds(
+        g,
+        bound,
+        proof.gram,
+        equalities=[proof.sphere],
+        equality_multipliers=[proof.multiplier],
+    )
+
+
+def test_a_warm_start_reaches_the_same_margin_in_fewer_iterations() -> None:
+    program = SphereProgram(6)
+    g = random_quartic(6, 4)(program.points)
+    start = program.solve(g, tolerance=1e-5)
+    nearby = g * 1.01 + 0.02
+    warm = program.solve(nearby, tolerance=1e-5, start=start)
+    cold = program.solve(nearby, tolerance=1e-5)
+    assert warm.iterations < cold.iterations
+    assert warm.m == pytest.approx(cold.m, abs=2e-5 * np.ptp(nearby))
+
+
+@pytest.mark.parametrize("degrees", [(1,), (2,), (4,), (0, 2, 4), (1, 2, 3, 4)])
+def test_special_shapes_of_g_are_solved(degrees: tuple[int, ...]) -> None:
+    program, rng = SphereProgram(4), np.random.default_rng(len(degrees))
+    last = None
+    for size in (1e-9, 1.0, 1e6):
+        rows = monomials(4, degrees)
+        g = Polynomial(rows, size * rng.normal(size=len(rows)), tuple("abcd"))
+        last = program.solve(g(program.points), start=last)
+        assert last.iterations > 0
+        assert last.gap < 1e-6
+        sphere_points = rng.normal(size=(5000, 4))
+        sphere_points /= np.linalg.norm(sphere_points, axis=1)[:, None]
+        assert last.m <= np.min(g(sphere_points)) + 1e-6 * size
+
+
+def test_clarabel_steps_in_when_the_interior_point_gives_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    program, g = SphereProgram(4), random_quartic(4, 7)
+    values = g(program.points)
+    expected = program.solve(values)
+
+    def gives_up(*_: object) -> None:
+        raise SolverError("on purpose")
+
+    monkeypatch.setattr(sphere_module, "_interior_point", gives_up)
+    found = program.solve(values, start=expected)
+    assert found.iterations == 0
+    assert found.m == pytest.approx(expected.m, abs=1e-6 * float(np.ptp(values)))
+    proof = sphere_proof(program, found, g)
+    assert prove(g, proof.bound, proof) > 0
+
+
+def test_a_useless_warm_start_still_solves() -> None:
+    program = SphereProgram(4)
+    start = program.solve(random_quartic(4, 0)(program.points))
+    other = -100 * random_quartic(4, 1)
+    values = other(program.points)
+    found = program.solve(values, tolerance=1e-6, start=start)
+    assert abs(found.m - oracle(other)) < 1e-5 * np.ptp(values)
+
+
+def test_fewer_monomials_suffice_where_few_states_enter_nonlinearly() -> None:
+    program = SphereProgram(5, nonlinear=(3, 4))
+    assert len(program.basis) < len(SphereProgram(5).basis)
+    rng, k = np.random.default_rng(0), len(program.basis)
+    A = rng.normal(size=(k, k))
+    g = Gram(program.basis, A + A.T, tuple("abcde")).polynomial()
+    found = program.solve(g(program.points))
+    proof = sphere_proof(program, found, g)
+    assert prove(g, proof.bound, proof) > 0
+    points = rng.normal(size=(20_000, 5))
+    assert proof.bound <= np.min(g(points / np.linalg.norm(points, axis=1)[:, None]))
+
+
+def test_a_constant_needs_no_iteration() -> None:
+    program = SphereProgram(3)
+    assert program.solve(np.full(len(program.points), 2.5)).m == 2.5
+
+
+def test_values_of_the_wrong_shape_or_not_finite_are_refused() -> None:
+    program = SphereProgram(3)
+    with pytest.raises(ShapeError, match="values"):
+        program.solve(np.zeros(3))
+    with pytest.raises(DataError, match="finite"):
+        program.solve(np.full(len(program.points), np.nan))
+    with pytest.raises(DataError, match="expected indices"):
+        SphereProgram(3, nonlinear=(5,))

@@ -1,0 +1,290 @@
+"""Funnels around trajectories: nouns, lemmas, proofs for every t, and what is refused."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.chain.problems import FunnelProblem
+from bags.commands.cli import app
+from examples import one_dimensional, pendulum
+from examples.satellite_funnel import goal_matrix, problem
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
+from nlsid_core.design.continuous.lstep import LSteps
+from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
+from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary, smallest_escape
+from nlsid_core.dynamics import (
+    Nominal,
+    PiecewisePolynomial,
+    VectorField,
+    constant_on,
+    cubic_through,
+    linear_through,
+)
+from nlsid_core.errors import CertificateRejected, DataError
+from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
+from nlsid_core.kernel.continuous_funnel import inside
+from nlsid_core.kernel.files import Rejected
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.proofs import check
+from tests.funnel_files import saved, write
+
+
+@pytest.fixture(scope="module")
+def satellite() -> FunnelDesign:
+    """The satellite's funnel with 25 knots."""
+    field, nominal, weights = problem(25)
+    return design_funnel(field, nominal, goal=goal_matrix(), **weights)
+
+
+def damped(t: Any, x: Any, u: Any) -> Any:
+    """A pendulum to third order, hanging, with torque."""
+    del t
+    return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
+
+
+def hanging(knots: int = 21) -> tuple[VectorField, Nominal]:
+    """The pendulum at rest for 2 s."""
+    field = VectorField.from_function(damped, 2, 1)
+    t = np.linspace(0, 2, knots)
+    return field, integrate_nominal(field, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+
+
+def test_a_satellite_funnel_is_proved_for_every_t(satellite: FunnelDesign, tmp_path: Path) -> None:
+    *_, proof = satellite.save(tmp_path)
+    assert check(proof).margin > 0
+    funnel, policy = (
+        ContinuousFunnel.load(tmp_path / "funnel.json"),
+        ContinuousPolicy.load(tmp_path / "policy.json"),
+    )
+    assert (funnel.t0, funnel.tf) == (0.0, 5.0)
+    assert funnel.nominal(2.5).shape == (6,)
+    assert policy(1.0, np.zeros((7, 6))).shape == (7, 3)
+    assert funnel.volume(5.0) == pytest.approx(6.883e-3, rel=1e-3)
+
+
+def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDesign) -> None:
+    parts = (satellite.model, satellite.policy, satellite.funnel)
+    rng = np.random.default_rng(3)
+    for knot in (0, 12):
+        run = simulate_boundary(*parts, starts=2000, rng=rng, knot=knot)
+        assert run.violations == 0
+        assert 0.9 < run.max_v <= 1
+    assert simulate_boundary(*parts, starts=500, rng=rng, scale=1.2).violations == 500
+    assert smallest_escape(*parts, goal_matrix(), starts=300, rng=rng) < 1.4
+
+
+def test_alternation_ends_where_the_sweep_does() -> None:
+    field, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2))
+    steps = LSteps(field)
+    start = exponential_start(steps, design.policy, design.funnel.P)
+    found = alternate_rho(steps, design.policy, start, stop=0.002)
+    assert found.volumes[0] < found.volumes[-1]
+    assert found.volumes[-1] == pytest.approx(design.funnel.volume_integral(), rel=0.01)
+
+
+@pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])
+def test_every_kind_of_gain_is_proved(gain: str) -> None:
+    field, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2), gain=gain)
+    assert np.min(design.found.proved.margins) > 0
+
+
+def test_p_grows_beyond_rho_and_is_proved() -> None:
+    field, nominal = hanging(9)
+    rho = design_funnel(field, nominal, goal=20 * np.eye(2))
+    with ThreadPoolExecutor(2) as threads:
+        P = design_funnel(field, nominal, goal=20 * np.eye(2), shape="P", executor=threads)
+    assert P.funnel.volume_integral() > rho.funnel.volume_integral()
+    assert np.min(P.found.proved.margins) > 0
+
+
+def test_only_dynamics_nominal_and_weights_are_needed() -> None:
+    field, nominal = hanging(9)
+    design = design_funnel(damped, nominal, Q=np.eye(2), R=np.eye(1))
+    assert np.min(design.found.proved.margins) > 0
+    assert design.model.document() == field.document()
+
+
+def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
+    t = np.linspace(-1, 1, 401)
+    best = one_dimensional.true_sets(t)[1]
+    for knots, ratio in ((40, 0.95), (160, 0.985)):
+        found = one_dimensional.radius(one_dimensional.designed(knots).funnel, t)
+        assert (found < best + 1e-9).all()
+        assert (found / best).mean() >= ratio
+
+
+def test_a_disturbance_shrinks_the_funnel_and_no_corner_breaks_it(tmp_path: Path) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] * w[1] + u[0] + w[0]])
+
+    bounds = [[-0.02, 0.02], [0.15, 0.25]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds)
+    plain, nominal = hanging()
+    design = design_funnel(field, nominal, goal=20 * np.eye(2))
+    calm = design_funnel(plain, nominal, goal=20 * np.eye(2))
+    assert design.funnel.volume_integral() < calm.funnel.volume_integral()
+    verdict = check(design.save(tmp_path)[-1])
+    assert any("w0 in [-0.02, 0.02]" in text for text in verdict.assumptions)
+    rng = np.random.default_rng(1)
+    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    assert run.violations == 0
+    worse = simulate_boundary(
+        replace(field, uncertain=20 * field.uncertain), design.policy, design.funnel,
+        starts=500, rng=rng,
+    )  # fmt: skip
+    assert worse.violations > 0
+
+
+def test_dynamics_that_change_at_a_knot_are_proved_piece_by_piece() -> None:
+    plain, _ = hanging()
+
+    def heavier(x: Any, u: Any) -> Any:
+        return np.array([x[1], -2 * x[0] + x[0] ** 3 / 3 - x[1] / 5 + u[0]])
+
+    second = VectorField.from_function(heavier, 2, 1)
+    field = VectorField(plain.pieces + second.pieces, 2, 1, np.array([1.0]))
+    nominal = integrate_nominal(field, lambda _: np.zeros(1), t=np.linspace(0, 2, 21), start=[0, 0])
+    assert np.min(design_funnel(field, nominal, goal=20 * np.eye(2)).found.proved.margins) > 0
+
+
+def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_valid(
+    tmp_path: Path,
+) -> None:
+    def pushed(x: Any, u: Any, w: Any) -> Any:
+        return np.array([x[1] + w[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0] + w[0] - 2 * w[2]])
+
+    bounds = [[-0.003, 0.003], [-0.002, 0.002], [-0.001, 0.001]]
+    valid: list[list[float]] = [[0, -0.2, 0.2], [2, -9, 9]]
+    field = VectorField.from_function(pushed, 2, 1, uncertain=bounds, valid=valid)
+    _, nominal = hanging()
+    design = design_funnel(field, nominal, goal=30 * np.eye(2))
+    assert design.found.proved.pieces.kappa is not None
+    assert not design.found.proved.pieces.vertex.any()
+    proof = design.save(tmp_path)[-1]
+    verdict = check(proof)
+    assert verdict.margin > 0
+    assert "u0 in [-9, 9]" in verdict.statement
+    assert "saturation" not in " ".join(verdict.assumptions)
+    for t in design.funnel.t:
+        assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.2
+    rng = np.random.default_rng(4)
+    run = simulate_boundary(field, design.policy, design.funnel, starts=2000, rng=rng)
+    assert run.violations == 0
+    forged = saved(design, tmp_path)
+    forged["vector_field.json"]["valid"] = [[0, -0.1, 0.1]]
+    with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
+        check(write(forged, tmp_path))
+    forged = saved(design, tmp_path)
+    forged["funnel.proof.json"]["proof"]["kappa"][1] = -1.0
+    with pytest.raises(CertificateRejected, match="kappa should be positive"):
+        check(write(forged, tmp_path))
+
+
+def test_a_pendulum_with_its_true_sine_stays_within_its_torque_limits() -> None:
+    found = pendulum.designed()
+    for t in found.funnel.t:
+        inputs = found.policy(float(t), found.funnel.outline(float(t), (0, 1)))
+        assert np.abs(inputs).max() <= pendulum.TORQUE
+    truth = TrueDynamics(pendulum.truth)
+    rng = np.random.default_rng(6)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=3000, rng=rng)
+    assert run.violations == 0
+
+
+# -- containment -----------------------------------------------------------------------------
+
+
+def decide_inside(
+    centre: list[float], inner: FloatArray, other: list[float], outer: FloatArray, multiplier: float
+) -> bool:
+    """What the kernel says."""
+    rational = [
+        [[Fraction(e) for e in row] for row in np.atleast_2d(part).tolist()]
+        for part in (centre, inner, other, outer)
+    ]
+    try:
+        inside(rational[0][0], rational[1], Fraction(1), rational[2][0], rational[3],
+               Fraction(multiplier), "containment")  # fmt: skip
+    except Rejected:
+        return False
+    return True
+
+
+def test_containment_is_decided_at_the_touching_ellipsoid() -> None:
+    inner, outer = np.diag([4.0, 4.0]), np.eye(2)
+    assert decide_inside([0.5, 0.0], inner, [0.0, 0.0], outer, 0.5)
+    found = ellipsoid_inside([0.49, 0.0], inner, [0, 0], outer)
+    assert found is not None
+    assert decide_inside([0.49, 0.0], inner, [0, 0], outer, found)
+    assert ellipsoid_inside([0.51, 0.0], inner, [0, 0], outer) is None
+    for multiplier in np.linspace(0, 1, 101):
+        assert not decide_inside([0.51, 0.0], inner, [0.0, 0.0], outer, multiplier)
+
+
+def test_a_funnel_may_end_in_a_goal_around_another_point() -> None:
+    field, nominal = hanging(9)
+    goal = Goal(np.array([0.05, 0.0]), 20 * np.eye(2))
+    assert np.min(design_funnel(field, nominal, goal=goal).found.proved.margins) > 0
+    with pytest.raises(DataError, match="ends outside the goal"):
+        design_funnel(field, nominal, goal=Goal(np.array([0.5, 0.0]), 20 * np.eye(2)))
+
+
+# -- nouns -----------------------------------------------------------------------------------
+
+
+def test_piecewise_polynomials_meet_their_samples() -> None:
+    t = np.array([0.0, 0.5, 2.0])
+    curve = cubic_through(t, t[:, None] ** 3, 3 * t[:, None] ** 2)
+    times = np.linspace(0, 2, 11)
+    assert curve(times)[:, 0] == pytest.approx(times**3)
+    assert curve.derivative()(times)[:, 0] == pytest.approx(3 * times**2)
+    assert linear_through(t, t**2).ends() == pytest.approx(t**2)
+    with pytest.raises(DataError, match="does not increase after knot 1"):
+        PiecewisePolynomial(np.array([0.0, 1.0, 1.0]), np.zeros((2, 2, 1)))
+
+
+def test_value_gradient_volume_and_outline_agree() -> None:
+    x = constant_on([0.0, 1.0], [[1.0, 2.0]])
+    funnel = ContinuousFunnel(x, np.array([np.diag([4.0, 1.0])] * 2), np.array([1.0, 4.0]), "", "")
+    assert funnel.volume(0.0) == pytest.approx(np.pi / 2)
+    assert funnel.volume(1.0) == pytest.approx(2 * np.pi)
+    points = funnel.outline(0.5, (0, 1))
+    assert funnel.value(0.5, points) == pytest.approx(np.ones(len(points)))
+    assert funnel.boundary(0.5, np.eye(2)).shape == (2, 2)
+    step = 1e-6
+    moved = (funnel.value(0.5, points + np.array([step, 0])) - funnel.value(0.5, points)) / step
+    assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
+    assert funnel.contains_ellipsoid(1.0, [1, 2], np.eye(2))
+    assert not funnel.inside_ellipsoid(1.0, [1, 2], np.eye(2))
+
+
+# -- command line ----------------------------------------------------------------------------
+
+
+def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> None:
+    field, nominal = hanging(9)
+    goal = Goal(np.zeros(2), 20 * np.eye(2))
+    problem_file = tmp_path / "problem.json"
+    asked = FunnelProblem(field, nominal, np.eye(2), np.eye(1), goal)
+    files.write_document(problem_file, asked.document())
+    runner = CliRunner()
+    made = runner.invoke(app, ["funnel", "--problem", str(problem_file), "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert "pieces proved" in made.output
+    assert ContinuousFunnel.load(tmp_path / "funnel.json").tf == 2.0
+    assert (tmp_path / "funnel.png").is_file()
+    checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])
+    assert checked.exit_code == 0
+    assert "PROVED funnel" in checked.output
+    neither = runner.invoke(app, ["funnel", "--out", str(tmp_path)])
+    assert neither.exit_code != 0

@@ -1,0 +1,131 @@
+"""Scores and residual tests: known answers, and what they must notice."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, apart, percent
+from nlsid_core.identification.linear import build_regression, least_squares
+from nlsid_core.identification.prediction import predict
+from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
+from nlsid_core.identification.validation import validate, without_missing
+from nlsid_core.models import DifferenceEquation, Signal
+from tests.conftest import PERIOD, TRUE_A, TRUE_B, synthetic_dataset
+
+
+def truth() -> DifferenceEquation:
+    return DifferenceEquation(
+        a=TRUE_A, b=TRUE_B, c=0.0, period=PERIOD, y=Signal("y"), u=Signal("u"), u_range=(0.0, 1.0)
+    )
+
+
+def equation_noise_dataset(seed: int, *, hidden: float = 0.0) -> Dataset:
+    """The truth driven by white input and white equation noise, perhaps an unmodelled delay."""
+    rng = np.random.default_rng(seed)
+    N = 3000
+    u, e = rng.uniform(0.0, 1.0, N), 0.01 * rng.standard_normal(N)
+    y = np.zeros(N)
+    for t in range(5, N):
+        y[t] = TRUE_A @ y[t - 2 : t][::-1] + TRUE_B @ u[t - 2 : t + 1][::-1] + e[t]
+        y[t] += hidden * u[t - 5]
+    stamps = np.linspace(0.0, PERIOD * (N - 1), N)
+    return Dataset((Trajectory(t=stamps, y=y, u=u, name="run"),))
+
+
+def test_the_truth_leaves_a_white_independent_residual() -> None:
+    verdicts = [validate(truth(), equation_noise_dataset(seed)) for seed in range(20)]
+    assert sum(v.one_step.white for v in verdicts) >= 18  # 99 % tests: 0.2 failures are expected
+    assert sum(v.independent for v in verdicts) >= 18
+    assert "is white" in str(verdicts[0])
+
+
+def test_a_missing_delay_shows_in_the_cross_correlation() -> None:
+    found = validate(truth(), equation_noise_dataset(0, hidden=0.02))
+    assert not found.independent
+    crossed = abs(found.one_step.cross_correlation[0, 0])
+    assert int(np.argmax(crossed)) - 20 == 5
+    assert max(crossed) > found.one_step.cross_band[0, 0]
+    assert "NOT independent" in str(found)
+
+
+def test_output_noise_shows_as_a_residual_that_is_not_white() -> None:
+    noisy = synthetic_dataset(0.05, trials=10, samples=400)
+    found = validate(truth(), noisy)
+    assert not found.one_step.white
+    assert max(abs(found.one_step.autocorrelation[0])) > found.one_step.band
+
+
+def test_predictions_equal_simulations_restarted_at_every_sample() -> None:
+    dataset = synthetic_dataset(0.02, trials=1, samples=80)
+    trial = dataset.trajectories[0]
+    linear = truth()
+    stacked = build_state_affine_rows(dataset, StateAffineClass(2, leading_degree=1))
+    iterate = next(iter(robust_simulation_error(stacked.rows)))
+    for model in (linear, stacked.model(iterate.theta, iterate.p)):
+        horizon = 4
+        predicted = predict(model, trial, horizon)
+        for row, last in enumerate(range(2 + horizon - 1, len(trial))):
+            rows = slice(last - horizon - 1, last + 1)
+            part = Trajectory(t=trial.t[rows], y=trial.y[rows], u=trial.u[rows])
+            if isinstance(model, DifferenceEquation):
+                restarted = model.simulate(part.u[:, 0], part.y[:2, 0])[-1]
+            else:
+                restarted = model.simulate(part.u, part.y[:2])[-1, 0]
+            assert predicted[row, 0] == pytest.approx(restarted, abs=1e-12)
+
+
+def test_errors_grow_with_the_horizon_towards_the_simulation_error() -> None:
+    dataset = synthetic_dataset(0.02, trials=4, samples=200)
+    model = least_squares(build_regression(dataset, 2))
+    found = validate(model, dataset, horizons=(1, 3, 100))
+    assert found.fit_percent == 100.0 - found.simulation_percent
+    assert found.prediction_percent[100] == pytest.approx(found.simulation_percent, rel=0.2)
+
+
+def test_missing_segments_are_skipped_with_a_count() -> None:
+    trial = synthetic_dataset(0.0, trials=1, samples=80).trajectories[0]
+    missing = np.zeros(80, dtype=bool)
+    missing[[20, 21, 25, 60]] = True
+    parts, skipped = without_missing(trial, missing, shortest=5)
+    assert [len(part) for part in parts] == [20, 34, 19]
+    assert skipped == 4 + 3  # and the stretch 22 … 24, which is too short
+    assert parts[1].t[0] == trial.t[26]
+    with pytest.raises(DataError, match="no stretch of 50"):
+        without_missing(trial, missing, shortest=50)
+
+
+def test_trials_too_short_for_the_tests_are_refused() -> None:
+    dataset = synthetic_dataset(0.0, trials=1, samples=40)
+    with pytest.raises(DataError, match="need more than"):
+        validate(truth(), dataset, lags=20)
+    with pytest.raises(DataError, match="a horizon of 0"):
+        predict(truth(), dataset.trajectories[0], 0)
+
+
+def test_a_diverging_model_scores_infinity_without_warnings() -> None:
+    wild = replace(truth(), a=np.array([40.0, 0.0]))
+    assert (
+        validate(wild, synthetic_dataset(0.0, trials=1, samples=400)).simulation_percent == np.inf
+    )
+
+
+def test_numbers_that_are_compared_read_differently_where_they_are_different() -> None:
+    just_below = float(np.nextafter(-1.0, -2.0))
+    assert apart(just_below, -1.0, 1.65) == ("-1.0000000000000002", "-1.0", "1.65")
+    assert apart(-1.00000001, -1.0) == ("-1.00000001", "-1")
+    assert apart(0.5, 0.5, 2.0) == ("0.5", "0.5", "2")
+    assert apart(math.nan, 1.0) == ("nan", "1")
+
+
+def test_an_error_beyond_all_sense_is_said_in_words() -> None:
+    assert [percent(error) for error in (2.5, 999.994, 33153.18, math.inf, math.nan)] == [
+        "2.50 %",
+        "999.99 %",
+        "diverges",
+        "diverges",
+        "diverges",
+    ]

@@ -1,0 +1,44 @@
+"""The four files of a continuous funnel, changed as a forger would."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from nlsid_core import files as documents
+from nlsid_core.design import FunnelDesign
+
+Files = dict[str, Any]
+FIELD, POLICY, FUNNEL, PROOF = (
+    "vector_field.json", "policy.json", "funnel.json", "funnel.proof.json",
+)  # fmt: skip
+ROLES = {"vector_field": FIELD, "policy": POLICY, "funnel": FUNNEL}
+
+
+def saved(design: FunnelDesign, folder: Path) -> Files:
+    """The documents of a design, by file name."""
+    return {path.name: json.loads(path.read_text()) for path in design.save(folder)}
+
+
+def copy_of(files: Files) -> Files:
+    """The same documents, to be changed."""
+    copied: Files = json.loads(json.dumps(files))
+    return copied
+
+
+def bind(files: Files) -> None:
+    """Make every digest fit the documents as they are now."""
+    field = documents.digest(files[FIELD])
+    files[POLICY]["vector_field"] = files[FUNNEL]["vector_field"] = field
+    files[FUNNEL]["policy"] = documents.digest(files[POLICY])
+    for role, name in ROLES.items():
+        files[PROOF]["claim"]["about"][role]["digest"] = documents.digest(files[name])
+
+
+def write(files: Files, folder: Path, *, rebind: bool = True) -> Path:
+    """The files as they are, or with every digest made to fit again; returns the proof's path."""
+    files = copy_of(files)
+    if rebind:
+        bind(files)
+    for name, document in files.items():
+        (folder / name).write_bytes(documents.encode(document))
+    return folder / PROOF

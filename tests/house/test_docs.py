@@ -1,0 +1,38 @@
+"""The map of the house and its glossary are true, and every page leads to them."""
+
+import re
+
+from tests.house.sources import ROOT
+
+DOCS = ROOT / "docs"
+WALK = 12  # files at most
+
+
+def test_every_walk_names_a_dozen_files_at_most_and_each_is_there() -> None:
+    walks = (DOCS / "architecture.md").read_text().split("\n## Walk ")[1:]
+    assert len(walks) == 3
+    for walk in walks:
+        named = re.findall(r"`((?:nlsid_core|bags|nlsid_ros)/[\w/]+\.py)`", walk)
+        assert 5 <= len(named) <= WALK, walk
+        assert not [name for name in named if not (ROOT / name).is_file()]
+
+
+def test_every_room_of_the_core_is_on_the_map() -> None:
+    page = (DOCS / "architecture.md").read_text()
+    rooms = [p.stem for p in (ROOT / "nlsid_core").iterdir() if p.stem[0] not in "_."]
+    assert not [room for room in rooms if room != "py" and room not in page]
+
+
+def test_every_page_leads_to_the_glossary() -> None:
+    pages = [page for page in DOCS.glob("*.md") if page.name != "glossary.md"]
+    assert not [page.name for page in pages if "glossary.md" not in page.read_text()]
+
+
+def test_every_link_of_a_page_leads_somewhere() -> None:
+    broken = [
+        f"{page.relative_to(ROOT)}: {target}"
+        for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+        for target in re.findall(r"\]\(([\w./-]+\.\w+)[#)]", page.read_text())
+        if not (page.parent / target).exists()
+    ]
+    assert not broken

@@ -1,0 +1,90 @@
+"""What every public name owes its reader, and what the project's files have to agree on."""
+
+import ast
+import re
+import tomllib
+from collections.abc import Iterator
+from xml.etree import ElementTree
+
+from tests.house.sources import PACKAGES, ROOT, ROS, Source, sources
+
+Definition = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+def public_definitions(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str, Definition]]:
+    """Public classes and functions of a module, and the public methods of those classes."""
+    for node in body:
+        if isinstance(node, Definition) and not node.name.startswith("_"):
+            yield f"{prefix}.{node.name}", node
+            if isinstance(node, ast.ClassDef):
+                yield from public_definitions(node.body, f"{prefix}.{node.name}")
+
+
+def public_names(source: Source) -> list[tuple[str, Definition]]:
+    return list(public_definitions(source.tree.body, source.name))
+
+
+def is_overload(node: Definition) -> bool:
+    """A signature for the type checker; the docstring is on the function that follows."""
+    return any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list)
+
+
+def test_everything_public_has_a_docstring() -> None:
+    silent = [source.name for source in sources(*PACKAGES) if not ast.get_docstring(source.tree)]
+    silent += [
+        name
+        for source in sources(*PACKAGES)
+        for name, node in public_names(source)
+        if not ast.get_docstring(node) and not is_overload(node)
+    ]
+    assert not silent
+
+
+def test_every_public_signature_says_what_it_takes() -> None:
+    """Each argument has a type; `**options` would hide them, and so would `*args` of any type."""
+    hidden = []
+    for source in sources(*PACKAGES):
+        for name, node in public_names(source):
+            if isinstance(node, ast.ClassDef):
+                continue
+            given = node.args
+            arguments = [a for a in given.posonlyargs + given.args if a.arg not in ("self", "cls")]
+            arguments += [*given.kwonlyargs, *([given.vararg] if given.vararg else [])]
+            anything = given.vararg and ast.unparse(given.vararg.annotation or ast.Name("Any"))
+            if (
+                given.kwarg
+                or anything in ("Any", "object")
+                or node.returns is None
+                or any(argument.annotation is None for argument in arguments)
+            ):
+                hidden.append(name)
+    assert not hidden
+
+
+def test_every_folder_of_modules_is_a_package_and_so_gets_installed() -> None:
+    folders = {source.path.parent for source in sources(*PACKAGES)}
+    assert not [str(folder) for folder in folders if not (folder / "__init__.py").is_file()]
+
+
+def test_no_test_imports_another_test() -> None:
+    assert not [
+        f"{source}:{entry.line}: {entry.module}"
+        for source in sources("tests")
+        for entry in source.imports
+        if entry.package == "tests" and any(p.startswith("test_") for p in entry.module.split("."))
+    ]
+
+
+def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
+    imported = {name for source in sources("nlsid_ros") for name in source.packages}
+    manifest = ElementTree.parse(ROOT / "package.xml").getroot()
+    named = {element.text for element in manifest.iter("exec_depend")}
+    assert {name for name in imported if ROS.fullmatch(name)} <= named
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    package = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert package.findtext("version") == version
+    headings = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert version in headings[:2], "the newest release, below Unreleased if there is one"

@@ -1,0 +1,102 @@
+"""A continuous funnel driven and watched over DDS; this test is the robot, in step with them."""
+
+import math
+import time
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from nlsid_core import files
+from nlsid_core.running.monitor import Monitor
+from nlsid_ros import qos
+from nlsid_ros.messages import stamp_ns_of
+from tests.continuous_stage import stage
+from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+
+pytestmark = ros_test
+PERIOD_NS = 50_000_000
+WIRING = {"response": "/joints:position[0]", "command": "/effort:effort[0]", "period": 0.05}
+
+
+def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    field, policy, funnel = stage()
+    commands: dict[int, float] = {}
+    margins: dict[int, float] = {}
+    said: dict[str, list[str]] = {}
+    assuming: list[str] = []
+
+    def hear_command(message: JointState) -> None:
+        commands[stamp_ns_of(message)] = message.effort[0]
+
+    def hear_margin(message: JointState) -> None:
+        margins[stamp_ns_of(message)] = message.position[list(message.name).index("margin")]
+
+    def hear_status(message: DiagnosticArray) -> None:
+        for entry in message.status:
+            said.setdefault(entry.name, []).append(entry.message)
+            assuming.extend(v.value for v in entry.values if v.key == "assuming" and v.value)
+
+    def has_said(name: str, text: str) -> bool:
+        return any(text in line for line in said.get(name, []))
+
+    with ExitStack() as stack:
+        node, spin_until = stack.enter_context(node_here("test_robot"))
+        for role, noun in (("model", field), ("policy", policy), ("funnel", funnel)):
+            latched = node.create_publisher(String, f"/funnel_publisher/{role}", qos.DOCUMENT)
+            latched.publish(String(data=files.encode(noun.document()).decode()))
+        states = node.create_publisher(JointState, "/joints", qos.STREAM)
+        node.create_subscription(JointState, "/effort", hear_command, qos.STREAM)
+        node.create_subscription(JointState, "/funnel_monitor/margin", hear_margin, qos.STREAM)
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
+        start = node.create_client(Trigger, "/tracking_controller/start")
+        patience = {"stale_after": 20.0}
+        joints = "sensor_msgs/msg/JointState"
+        types = {"response_type": joints, "command_type": joints}
+        limits = {"lowest": -20.0, "highest": 20.0, "stop_rate": 100.0}
+        watching = {"controller": "tracking_controller", "command_wait": 1.0}
+        stack.enter_context(
+            process("nlsid_ros.tracking_controller", **WIRING, **patience, **types, **limits)
+        )
+        stack.enter_context(process("nlsid_ros.funnel_monitor", **WIRING, **patience, **watching))
+        spin_until(lambda: has_said("tracking_controller", "idle") and start.service_is_ready())
+        spin_until(lambda: node.count_subscribers("/joints") >= 2)
+        spin_until(lambda: node.count_subscribers("/effort") >= 2)
+        answer = start.call_async(Trigger.Request())
+        spin_until(answer.done)
+        assert answer.result().success
+        first_ns, x, run = time.time_ns(), 0.1, []
+        for k in range(-1, 21):  # the controller's run starts with the second state it hears
+            stamp_ns = first_ns + (k + 1) * PERIOD_NS
+            message = JointState(name=["cart"], position=[x])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            states.publish(message)
+            if k == 20:
+                break
+            spin_until(lambda s=stamp_ns: s in commands)  # type: ignore[misc]
+            if k >= 0:
+                run.append((x, commands[stamp_ns]))
+                x = x + PERIOD_NS * 1e-9 * commands[stamp_ns]
+        spin_until(lambda: has_said("tracking_controller", "idle; stopped: the proof is over"))
+        judged = [first_ns + (k + 1) * PERIOD_NS for k in range(20)]
+        spin_until(lambda: set(judged) <= margins.keys())
+    monitor = Monitor(field, policy, funnel, period=0.05)
+    readings = [
+        monitor.update(k * PERIOD_NS / 1e9, np.array([x]), np.array([u]))
+        for k, (x, u) in enumerate(run)
+    ]
+    assert [margins[stamp] for stamp in judged] == [r.margin for r in readings], "bit for bit"
+    assert all(margin > 0.3 for margin in (margins[stamp] for stamp in judged))
+    assert not any(math.isnan(margins[stamp]) for stamp in judged)
+    held = "the policy is applied continuously; here each input is held for 0.05 s"
+    assert set(assuming) == {held}
