@@ -57,7 +57,9 @@ class LiveLoop:
     runs: of the policy; replayed: those the recording announces. judged: samples with a live
     verdict; expected: with one in the replay. live_equals_replay: every margin and disturbance
     heard is the replay's, bit for bit, none is missing, and every alarm's reason is one it gives.
-    push_detect_ms: from the first stamp under the push to the first that is not inside.
+    flagged_runs: with a verdict that is not inside; left_with_assumption_kept: those that left the
+    funnel first, which the proof excludes. push_detect_ms: from the first stamp under the push to
+    the first that is not inside.
     """
 
     seconds: float
@@ -67,6 +69,7 @@ class LiveLoop:
     expected: int
     live_equals_replay: bool
     flagged_runs: int
+    left_with_assumption_kept: int
     push_detect_ms: float
     alarm: str
 
@@ -187,6 +190,11 @@ def compared(
         stamp: struct.pack("dd", *pair) for stamp, pair in heard.verdicts.items()
     }
     bad = [e for e in replayed if e.reading.status is not Status.INSIDE]
+    flagged = [
+        entry
+        for before, entry in pairwise(replayed)
+        if before.reading.status is Status.INSIDE and entry in bad
+    ]
     after = [entry for entry in bad if entry.stamp_ns >= pushed_ns]
     return LiveLoop(
         seconds=seconds,
@@ -195,10 +203,8 @@ def compared(
         judged=len(heard.verdicts),
         expected=len(expected),
         live_equals_replay=same and set(heard.alarms) <= reasons,
-        flagged_runs=sum(
-            before.reading.status is Status.INSIDE and entry in bad
-            for before, entry in pairwise(replayed)
-        ),
+        flagged_runs=len(flagged),
+        left_with_assumption_kept=sum(e.reading.status is Status.OUTSIDE for e in flagged),
         push_detect_ms=(after[0].stamp_ns - pushed_ns) / 1e6 if after else math.nan,
         alarm=heard.alarms[0] if heard.alarms else "",
     )

@@ -21,6 +21,9 @@ def test_live_verdicts_on_an_identified_robot_equal_the_replay_bit_for_bit(
     assert result.runs == result.replayed >= 3
     assert result.judged == result.expected > 200
     assert result.live_equals_replay
-    assert result.flagged_runs == 1
+    # The assumption is measured on runs without ROS, so that a late command can break it here; what
+    # is proved is that no run leaves the funnel before it is broken.
+    assert 1 <= result.flagged_runs < result.runs
+    assert result.left_with_assumption_kept == 0
     assert 0 < result.push_detect_ms < 100
     assert "disturbance response" in result.alarm

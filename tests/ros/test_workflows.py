@@ -158,7 +158,8 @@ def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
             lambda: all(operator.node.count_subscribers(t) >= n for t, n in listeners.items())
         )
         operator.call("/excitation/start")
-        operator.waits(5.0)
+        operator.hears("excitation", "done")
+        operator.waits(0.5)  # what was said last is on its way to the recorder
     with Bag(trials / "trial_new") as recorded:
         assert recorded.count("/odom") > 100
         assert recorded.count("/cmd_vel") > 80
