@@ -1,5 +1,6 @@
 """The YAML configuration of one robot: which signals, which split, which model, which tube."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -90,7 +91,21 @@ class FunnelConfig(Section):
     safety_factor: float = Field(default=1.5, ge=1.0, allow_inf_nan=False)
     inlet: NonNegative = 0.0
     policy: Annotated[LqrConfig | None, BeforeValidator(_none_word)] = LqrConfig()
-    profile: tuple[Corner, ...] = Field(min_length=2, strict=False)
+    profile: Annotated[tuple[Corner, ...], Field(min_length=2, strict=False)] | None = None
+
+    @model_validator(mode="after")
+    def _profile_to_track(self) -> "FunnelConfig":
+        if self.profile is None:
+            if self.policy is not None:
+                raise ValueError(
+                    "an LQR policy tracks a profile: give `profile`, or `policy: none` for a tube "
+                    "around the motion that the received commands give"
+                )
+            return self
+        times = [time for time, _ in self.profile]
+        if any(later <= time for time, later in pairwise(times)):
+            raise ValueError(f"profile: times should increase; they are {times}")
+        return self
 
 
 class MonitorConfig(Section):
