@@ -1,7 +1,8 @@
 """Claim `tube` about a policy decided a second time, in Fractions.
 
 Written from docs/certificate_driven_tube.md alone. Definiteness is decided by LDL' (as in the
-other oracle, which shares nothing with the kernel), and `runs` plays exact runs of the observer, to hold a claim against what it says.
+other oracle, which shares nothing with the kernel), and `runs` plays exact runs of the observer, to
+hold a claim against what it says.
 """
 
 import random
