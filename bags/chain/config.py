@@ -56,13 +56,16 @@ class GridConfig(Section):
 
 
 class SplitConfig(Section):
-    """What is only used to score (test) or to choose (validation): bags by name.
+    """What the model is not fitted to, by name of the bag.
 
-    share: instead of test bags, the end of every bag of this share of it.
+    test: only scores; validation: chooses orders; calibration: scales the level of the tube (none:
+    every second training trial does). share: instead of test bags, the end of every bag of this
+    share of it.
     """
 
     test: Names = ()
     validation: Names = ()
+    calibration: Names = ()
     share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
 
     @model_validator(mode="after")

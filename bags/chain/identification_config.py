@@ -17,7 +17,7 @@ from typing import Annotated, Any, get_type_hints
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from bags.chain.sections import UNKNOWN_KEY, problems
+from bags.chain.sections import UNKNOWN_KEY, problems, unknown_key
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
@@ -136,8 +136,8 @@ def _read(section: object) -> IdentificationConfig:
     of_method = {f.name: left.pop(f.name) for f in fields(known[chosen]) if f.name in left}
     for key in left:
         keys = ["model", *_names(kind), "method", *_names(known[chosen]), *OWN]
-        details = {"key": str(key), "known": ", ".join(keys)}
-        raise _wrong((), section, "there is no such key; there are: {known}", UNKNOWN_KEY, details)
+        said = "there is no such key{meant}; there are: {known}"
+        raise _wrong((), section, said, UNKNOWN_KEY, unknown_key(str(key), keys))
     return IdentificationConfig(
         model_class, _made(known[chosen], of_method), section, **_values(OWN, own)
     )

@@ -1,6 +1,7 @@
 """Sections of YAML configurations: strict, and explained when they are wrong."""
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -34,10 +35,17 @@ class Section(BaseModel):
                 if key not in known:
                     raise PydanticCustomError(
                         UNKNOWN_KEY,
-                        "there is no such key; there are: {known}",
-                        {"key": str(key), "known": ", ".join(known)},
+                        "there is no such key{meant}; there are: {known}",
+                        unknown_key(str(key), known),
                     )
         return content
+
+
+def unknown_key(key: str, known: Sequence[str]) -> dict[str, str]:
+    """What an error of type UNKNOWN_KEY says: the key, those there are, and the nearest of them."""
+    nearest = get_close_matches(key, known, n=1)
+    meant = f"; do you mean '{nearest[0]}'" if nearest else ""
+    return {"key": key, "known": ", ".join(known), "meant": meant}
 
 
 class SignalConfig(Section):

@@ -80,6 +80,7 @@ def test_transient_and_unproved_models_are_options_of_every_section(tmp_path: Pa
     [
         ({"model": "wiener", "lags": 2},
          "identification: there is no such model; there are: linear, state_affine, block_cascade"),
+        ({"lagz": 2}, "identification.lagz: there is no such key; do you mean 'lags'; there are: "),
         ({"lags": 2, "orders": [1, 2]},
          r"identification.orders: there is no such key; there are: model, .*\(found \[1, 2\]"),
         ({"lags": 2, "method": "magic"},
