@@ -193,14 +193,16 @@ def check(
     """
     status = 0
     for path in proofs:
+        name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            typer.echo(str(kernel.check(path)))
+            said = str(kernel.check(path))
+            typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
         except kernel.Rejected as refusal:
             status = max(status, 1)
-            typer.echo(f"REJECTED {path.name}: {refusal}")
+            typer.echo(f"REJECTED {name}: {refusal}")
         except OSError as error:
             status = 2
-            typer.echo(f"NOT READ {path.name}: {error.strerror}")
+            typer.echo(f"NOT READ {name}: {error.strerror}")
     raise typer.Exit(status)
 
 
