@@ -5,9 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
-
-from bags.chain.config import Config
+from bags.chain.config import Config, FunnelConfig
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
@@ -16,9 +14,10 @@ from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import LinearTube, TubeDesign, design
+from nlsid_core.design import LinearTube, OutputTube, OutputTubeDesign, TubeDesign, design
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
+from nlsid_core.models import DifferenceEquation, StableModel
 
 Progress = Callable[[str, float], None]
 
@@ -243,17 +242,22 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
     return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
 
 
-def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:
-    """A model file in; policy.json, funnel.json, funnel.proof.json (and model.json) in `out`.
+def design_funnel_files(
+    model_path: Path, config: Config, out: Path
+) -> TubeDesign | OutputTubeDesign:
+    """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
-    The observer is chosen on training.npz beside the model, the disturbance measured on the
-    calibration trials of held_back.npz, without which every second training trial is one. Raises
-    DataError or Infeasible.
+    With a profile, a policy and a tube around its plan, policy.json too; else a tube around the
+    simulation of a model of any class. The observer is chosen on training.npz beside the model, the
+    disturbance measured on the calibration trials of held_back.npz, without which every second
+    training trial is one. Raises DataError or Infeasible.
     """
     options = config.funnel
     if options is None:
         raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
-    model = documents.load_model(model_path)
+    planned = options.profile is not None
+    load = documents.load_model if planned else documents.load_stable_model
+    model: StableModel = load(model_path)
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
     held_back = load_held_back(
         model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
@@ -263,23 +267,41 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
             f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
             "calibration trials; run `nlsid identify` with this configuration"
         )
-    weights = options.policy
-    problem = LinearTube(
-        model,
-        train,
-        profile=options.profile or _at_rest(train, options.horizon),
-        horizon=options.horizon,
-        safety_factor=options.safety_factor,
-        inlet=options.inlet,
-        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-        calibration=held_back.get("calibration"),
-    )
-    found = design(problem)
+    calibration = held_back.get("calibration")
+    found: TubeDesign | OutputTubeDesign
+    if options.profile is None:
+        found = design(
+            OutputTube(
+                model,
+                train,
+                calibration,
+                reaction_time=options.reaction_time,
+                safety_factor=options.safety_factor,
+                horizon=options.horizon,
+                box=getattr(config.identification.model_class, "box", None),
+            )
+        )
+        (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
+    else:
+        found = design(_around_plan(model, train, options, calibration))
     found.save(out)
     return found
 
 
-def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:
-    """A plan for a tube that follows received commands: the mean output, for `horizon` s."""
-    level = float(np.mean(np.concatenate([trial.y[:, 0] for trial in train])))
-    return [(0.0, level), (horizon, level)]
+def _around_plan(
+    model: StableModel, train: Dataset, options: FunnelConfig, calibration: Dataset | None
+) -> LinearTube:
+    assert isinstance(model, DifferenceEquation)
+    assert options.profile is not None
+    assert options.horizon is not None
+    weights = options.policy
+    return LinearTube(
+        model,
+        train,
+        profile=options.profile,
+        horizon=options.horizon,
+        safety_factor=options.safety_factor,
+        inlet=options.inlet,
+        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
+        calibration=calibration,
+    )
