@@ -11,30 +11,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 from math import factorial, prod
 
-from .exact import Matrix, combined, congruence, product, semidefinite, transposed
-from .files import Rejected
+from .exact import Matrix, combined, product, semidefinite, transposed
+from .files import Rejected, Terms
 from .polynomials import BITS, Polynomial, Ring
-
-
-@dataclass(frozen=True)
-class Map:
-    """Σ_i coefficients[i] y^exponents[i]."""
-
-    exponents: list[tuple[int, ...]]
-    coefficients: Matrix
-
-    def at(self, forms: Sequence[Polynomial], ring: Ring) -> list[Polynomial]:
-        """The map of y = forms."""
-        known = {(0,) * len(forms): ring.constant(1)}
-
-        def power(exponent: tuple[int, ...]) -> Polynomial:
-            if exponent not in known:
-                j = next(j for j, e in enumerate(exponent) if e)
-                lower = (*exponent[:j], exponent[j] - 1, *exponent[j + 1 :])
-                known[exponent] = ring.times(forms[j], power(lower))
-            return known[exponent]
-
-        return mapped(transposed(self.coefficients), [power(e) for e in self.exponents], ring)
 
 
 @dataclass(frozen=True)
@@ -50,14 +29,14 @@ class Sample:
     A: Matrix
 
 
-def explicit_step(f: Map, at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
     """S⁺(f(x + Tz, u - K T z) - x⁺)."""
-    moved = f.at(_state_and_input(at, T, ring), ring)
-    return mapped(at.S_next, _shifted(moved, at.x_next, ring, -1), ring)
+    moved = ring.substituted(f, _state_and_input(at, T, ring))
+    return ring.product(at.S_next, [p - c for p, c in zip(moved, at.x_next, strict=True)])
 
 
 def implicit_step(
-    a: Map, at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
+    a: Sequence[Terms], at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
 ) -> tuple[list[Polynomial], list[Polynomial]]:
     """S⁺x̄⁺ and h = v⁺ - v - period/2 (a(q, v, u) + a(q⁺, v⁺, u)), in z, then w.
 
@@ -66,26 +45,13 @@ def implicit_step(
     d, half = len(T_next), period / 2
     here = _state_and_input(at, T, ring)
     q, v, u = here[:d], here[d : 2 * d], here[2 * d :]
-    w = [ring.variable(2 * d + i) for i in range(d)]
-    rate = _shifted(mapped(T_next, w, ring), at.x_next[d:], ring)
-    speed = [ring.sum(pair) for pair in zip(v, rate, strict=True)]
-    place = [ring.sum([p, ring.scaled(s, half)]) for p, s in zip(q, speed, strict=True)]
-    pull = zip(a.at(here, ring), a.at([*place, *rate, *u], ring), strict=True)
-    h = [
-        ring.sum([r, ring.scaled(p, -1), ring.scaled(ring.sum(pair), -half)])
-        for r, p, pair in zip(rate, v, pull, strict=True)
-    ]
-    return mapped(at.S_next, _shifted([*place, *rate], at.x_next, ring, -1), ring), h
-
-
-def square(p: Sequence[Polynomial], ring: Ring) -> Polynomial:
-    """|p|²."""
-    return ring.sum([ring.times(q, q) for q in p])
-
-
-def mapped(M: Matrix, p: Sequence[Polynomial], ring: Ring) -> list[Polynomial]:
-    """M p."""
-    return [ring.sum([ring.scaled(q, c) for q, c in zip(p, row, strict=True) if c]) for row in M]
+    moved = ring.product(T_next, ring.variables[2 * d :])
+    rate = [p + c for p, c in zip(moved, at.x_next[d:], strict=True)]
+    place = [p + half * (s + r) for p, s, r in zip(q, v, rate, strict=True)]
+    pulls = ring.substituted(a, here), ring.substituted(a, [*place, *rate, *u])
+    h = [r - s - half * (b + c) for r, s, b, c in zip(rate, v, *pulls, strict=True)]
+    after = [p - c for p, c in zip([*place, *rate], at.x_next, strict=True)]
+    return ring.product(at.S_next, after), h
 
 
 def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
@@ -101,10 +67,10 @@ def prove_curvature(
     sizes: dict[int, Matrix] = {}
     for key in set().union(*(q.terms for q in p)):
         e = ring.exponents(key)
-        column = [[Fraction(q.terms.get(key, 0), q.denominator) for q in p]]
-        share = [[Fraction(prod(map(factorial, e)), factorial(sum(e)))]]
-        outer = congruence(column, share)
-        sizes[sum(e)] = combined(outer, sizes[sum(e)]) if sum(e) in sizes else outer
+        c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
+        outer = [[a * b for b in c] for a in c]
+        share = Fraction(prod(map(factorial, e)), factorial(m))
+        sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
     if max(sizes, default=0) >= least + len(gammas):
         raise Rejected("curvature: a bound for every degree is needed")
     for m, gamma in enumerate(gammas, start=least):
@@ -141,11 +107,5 @@ def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
 def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
     """x + T z and u - K T z."""
     feedback = [[-entry for entry in row] for row in product(at.K, T)]
-    z = [ring.variable(i) for i in range(len(T))]
-    return _shifted(mapped([*T, *feedback], z, ring), [*at.x, *at.u], ring)
-
-
-def _shifted(
-    p: Sequence[Polynomial], by: Sequence[Fraction], ring: Ring, sign: int = 1
-) -> list[Polynomial]:
-    return [ring.sum([q, ring.constant(sign * c)]) for q, c in zip(p, by, strict=True)]
+    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
+    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
