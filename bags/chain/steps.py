@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_training, save_training
@@ -211,7 +213,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
     problem = LinearTube(
         model,
         train,
-        profile=options.profile,
+        profile=options.profile or _at_rest(train, options.horizon),
         horizon=options.horizon,
         safety_factor=options.safety_factor,
         inlet=options.inlet,
@@ -220,3 +222,9 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
     found = design(problem)
     found.save(out)
     return found
+
+
+def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:
+    """A plan for a tube that follows received commands: the mean output, for `horizon` s."""
+    level = float(np.mean(np.concatenate([trial.y[:, 0] for trial in train])))
+    return [(0.0, level), (horizon, level)]

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bags.commands.bag_cli import bag_app
+from bags.commands.config_cli import config_app
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 app.add_typer(track_app, name="track")
 app.add_typer(bag_app)
+app.add_typer(config_app)
 out = Console()
 err = Console(stderr=True)
 

@@ -17,6 +17,8 @@ from bags.chain.training import load_training
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
+from bags.recordings.bag import Bag
+from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from bags.signals.signal import SignalPath
@@ -26,6 +28,7 @@ from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Status
 
 CONFIG = config_file("f1tenth.yaml")
+SPEED = "/odom:twist.twist.linear.x"
 TEST = ("05", "11", "16", "22", "27", "33", "38", "41")
 
 
@@ -104,6 +107,40 @@ def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_pat
     assert done.exit_code == 1
     assert done.output.startswith("REJECTED")
     assert "model.json is not the model this proof is about" in done.output
+
+
+def test_a_prediction_tube_needs_no_profile(chain: Path, tmp_path: Path) -> None:
+    path = edited(tmp_path, funnel__policy="none", funnel__profile=None)
+    found = design_funnel_files(chain / documents.MODEL, load_config(path), tmp_path / "out")
+    assert not found.policy.K.any()
+    replayed = replay(tmp_path / "out", trial("05"))
+    assert replayed.verdict == Status.INSIDE.value
+    assert len(replayed.judged) > 100
+
+
+def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
+    chain: Path, tmp_path: Path
+) -> None:
+    """The last command of a bag is thrown away: identification refuses the bag, so does replay."""
+    bag = tmp_path / "trial_05"
+    with Bag(trial("05")) as source, BagWriter(bag) as target:
+        messages = list(source.messages())
+        last = max(m.log_time_ns for m in messages) - 500_000_000
+        for message in messages:
+            if message.topic == "/cmd_vel" and message.log_time_ns > last:
+                continue
+            kind, _ = source.types_on(message.topic)
+            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
+            target.write(message.topic, kind, message.data, **times)
+    signals = {"responses": [SPEED], "excitations": ["/cmd_vel:twist.linear.x"]}
+    [whole] = read_dataset([trial("05")], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
+    [fewer] = read_dataset([bag], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
+    assert documents.load_model(chain / documents.MODEL).u.path.endswith("|hold(0.1 s)")
+    replayed = replay(chain, bag)
+    judged = len(replayed.judged) + len(documents.load_model(chain / documents.MODEL))
+    assert len(fewer) == judged < len(whole)
+    assert replayed.verdict == Status.UNKNOWN.value
+    assert "at most 0.1 s is held" in replayed.reason
 
 
 def replay(chain: Path, bag: Path) -> Replay:
@@ -258,6 +295,8 @@ def edited(tmp_path: Path, **changes: object) -> Path:
         ({"grid__period": float("nan")}, "grid.period"),
         ({"grid__perod": 0.1}, "grid.perod"),
         ({"funnel__profile": [[0.0, 0.0]]}, "funnel.profile"),
+        ({"funnel__profile": [[0.0, 0.0], [0.0, 1.0]]}, "times should increase"),
+        ({"funnel__profile": None}, "an LQR policy tracks a profile"),
         ({"funnel__safety_factor": 0.9}, "funnel.safety_factor"),
         ({"monitor__nominal": "guess"}, "monitor.nominal"),
     ],

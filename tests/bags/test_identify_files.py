@@ -278,7 +278,7 @@ def test_a_class_of_one_output_refuses_two_and_names_the_class_for_them(
 ) -> None:
     config = write_config(tmp_path / "c.yaml", {"lags": 2}, outputs=2, inputs=2)
     made = nlsid("identify", coupled, "--config", config, "--out", tmp_path / "out")
-    assert "StateAffineClass is for several" in str(made.exception)
+    assert "take state_affine or implicit, or leave out signals" in str(made.exception)
 
 
 def test_nan_and_missing_samples_are_skipped_with_a_count(tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def _other(value: Any, kind: str, rng: np.random.Generator) -> Any:
             return value
         return changed if math.isfinite(changed) else value
     if isinstance(value, float):
-        changed = value * (1.0 + 10.0 ** rng.uniform(-16, 1) * int(rng.choice([-1, 1])))
+        changed = value * (1.0 + float(10.0 ** rng.uniform(-16, 1) * rng.choice([-1, 1])))
         return changed if math.isfinite(changed) else value
     return value + int(rng.choice([-1, 1]))
 
