@@ -153,10 +153,10 @@ class Node:
             raise Rejected(f"{self.where}: {len(rows)} terms; at most {MAX_STATED} are taken")
         if any(e < 0 for row in rows for e in row):
             raise Rejected(f"{self.where}: an exponent is negative")
-        if any(sum(row) > degree for row in rows):
-            raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
         if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
             raise Rejected(f"{self.where}: monomials should be distinct, in increasing order")
+        if any(sum(row) > degree for row in rows):
+            raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
         return rows
 
     def polynomial(self, count: int, degree: int = MAX_DEGREE, order: Any = by_degree) -> Terms:
