@@ -28,7 +28,7 @@ from .positivity import expanded, positive, powers_of_two, read_squares
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
-MAX_TERMS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
+MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
 PIECE = 20_000  # of the work that a claim may take: what a piece costs at the least
 Bounds = dict[int, tuple[Fraction, Fraction]]
 Curve = list[list[list[Fraction]]]  # by interval, control point, entry
@@ -117,7 +117,7 @@ def read_field(node: Node) -> Field:
     breaks = _increasing(parts["breaks"], 0, MAX_SPANS)
     count = len(breaks) + 1
     bounds: list[Bounds] = [{} for _ in range(count)]
-    for row in parts["valid"].items(0, MAX_TERMS):
+    for row in parts["valid"].items(0, MAX_BOUNDS):
         j, low, high, *only = row.array(4 if type(row.value) is list and row.value[3:] else 3)
         if j not in range(n + m) or not all(span in range(count) for span in only):
             raise Rejected(f"{row.where} should be an entry of (x, u), low, high, and maybe a span")
@@ -125,17 +125,12 @@ def read_field(node: Node) -> Field:
             before = found.get(int(j), (low, high))
             found[int(j)] = max(low, before[0]), min(high, before[1])
     equations = [
-        [_equation(row, n, m, len(box)) for row in piece.items(n, n)]
+        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, tuple) for row in piece.items(n, n)]
         for piece in parts["pieces"].items(count, count)
     ]
+    if any(max(e[1 + n + m :], default=0) > 1 for span in equations for p in span for e, _ in p):
+        raise Rejected(f"{parts['pieces'].where}: a monomial has degree above 1 in an entry of w")
     return Field(n, m, box, breaks, bounds, parts["expansion"].text(), equations)
-
-
-def _equation(node: Node, n: int, m: int, uncertain: int) -> Terms:
-    terms = node.polynomial(1 + n + m + uncertain, MAX_DEGREE, tuple)
-    if len(terms) > MAX_TERMS or any(e > 1 for row, _ in terms for e in row[1 + n + m :]):
-        raise Rejected(f"{node.where}: at most {MAX_TERMS} monomials, of degree 1 in each w")
-    return terms
 
 
 def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
@@ -323,9 +318,8 @@ def _decide_pieces(
         mode = tuple(piece["mode"].wholes(limited)) if limited else ()
         key = piece["interval"].whole(0), piece["vertex"].whole(0), mode
         if key not in covered:
-            raise Rejected(
-                f"piece {i} is about interval {key[0]}, vertex {key[1]}, mode {mode}: none"
-            )
+            k, v, mode = key
+            raise Rejected(f"piece {i} is about interval {k}, vertex {v}, mode {mode}: none")
         order.append((key, Fraction(index, 2**level), level, index, i))
     for key, start, level, *_ in sorted(order):
         if start <= covered[key]:

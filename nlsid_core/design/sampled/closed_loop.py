@@ -17,7 +17,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import text
 from nlsid_core.kernel.files import Terms
 from nlsid_core.kernel.polynomials import Polynomial, Ring, Work
-from nlsid_core.kernel.sampled_steps import Sample
+from nlsid_core.kernel.sampled_funnel import Sample
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.sos.witness import expanded, multiplier, witness
@@ -97,7 +97,7 @@ def norm_bound(M: Sequence[Sequence[Fraction]]) -> float:
 
 
 def curvature_bounds(p: Sequence[Polynomial], ring: Ring, least: int) -> list[float]:
-    """γ_m of the parts of degree m = least, least + 1, … of p; see the kernel's `sampled_steps`."""
+    """γ_m of the parts of degree m = least, least + 1, … of p; as in the kernel."""
     columns: dict[int, list[list[float]]] = {}
     rows = [terms(q, ring) for q in p]
     for e in set().union(*rows):
