@@ -19,7 +19,6 @@ in it, the unknown v included, which is a next state. In 2.11 a box needs a cons
 straight lines join two states, and stay inside. Source: thesis (2.4)-(2.19).
 """
 
-from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -27,46 +26,21 @@ from . import text
 from .decision import Decision
 from .exact import definite
 from .files import Node, Read, Rejected, Terms, bound_files
+from .implicit_models import ImplicitModel, read_implicit_model
 from .polynomials import FREE_OF_S, MOST_WORK, Polynomial, Ring, Work, at_width
 from .positivity import WITNESS, positive_on
 from .terms import MAX_VARIABLES, along, derivative, read_symmetric
 
-EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
-MAX_STATES = 30
-MAX_INPUTS = 60  # entries of w: inputs and their delays
-RECORDED = "y u window training bags"  # of a model of recorded signals; no part of any claim
 STORAGE = {"2.10": " V", "2.11": " M", "2.12": " P", "2.13": " P", "2.19": "", "": ""}
 Vector = list[Polynomial]
 Inequality = tuple[Polynomial, Vector]  # >= 0 where each of the domain is >= 0
-
-
-@dataclass(frozen=True)
-class ImplicitModel:
-    """h in (v, x, w), ã in (x, w), and perhaps a centre in v; n states, m entries of w."""
-
-    unknowns: int
-    states: int
-    inputs: int
-    h: list[Terms]
-    shift: list[Terms]
-    centre: list[Terms]
-    monotonicity: Fraction
-
-    def separated(self) -> tuple[list[Terms], list[Terms]]:
-        """(e in x, f in (x, w)) of a model e(x⁺) = f(x, w); Rejected if it is not of that form."""
-        n = self.states
-        if self.unknowns < n or any(any(e[:n]) and any(e[n:]) for p in self.h for e, _ in p):
-            raise Rejected("the model is not e(x+) = f(x, w); this set is for such models")
-        left = [[(e[:n], c) for e, c in p if any(e[:n])] for p in self.h]
-        right = [[(e[n:], -c) for e, c in p if not any(e[:n])] for p in self.h]
-        return left, right
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
     """Rebuild the inequalities of the set from the model's numbers; each has its own witness."""
     parts = claim.members("kind about", "set delta box")
     documents, digests = bound_files(parts["about"], read, "model")
-    model = _read_model(documents["model"])
+    model = read_implicit_model(documents["model"])
     n, m = model.states, model.inputs
     kind = parts["set"].text() if "set" in parts else ""
     if kind not in STORAGE:
@@ -194,36 +168,6 @@ def _inside(values: Vector, ends: list[Any]) -> Vector:
     """(z - low)(high - z) of each value z; nothing without a box."""
     pairs = zip(values, ends, strict=True) if ends else ()
     return [(z - low) * (high - z) for z, (low, high) in pairs]
-
-
-def _read_model(node: Node) -> ImplicitModel:
-    names = "equation period states inputs monotonicity h"
-    parts = node.document("model", names, "implicit", f"shift centre {RECORDED}")
-    if parts["equation"].text() != EQUATION:
-        raise Rejected(f"{parts['equation'].where} should be {EQUATION!r}")
-    n = len([entry.text() for entry in parts["states"].items(1, MAX_STATES)])
-    m = len([entry.text() for entry in parts["inputs"].items(0, MAX_INPUTS)])
-    monotonicity = parts["monotonicity"].number()
-    if monotonicity <= 0 or parts["period"].number() <= 0:
-        raise Rejected("monotonicity and period should be positive")
-    rows = parts["h"].members("exponents coefficients")["coefficients"].array(None, None)
-    k = len(rows[0]) if rows else 0
-    if not 0 < k <= n or ("shift" in parts) != (k < n):
-        raise Rejected(f"{k} equations for {n} states; a shift gives the others")
-    h = read_stack(parts["h"], k + n + m, k)
-    shift = read_stack(parts["shift"], n + m, n - k) if "shift" in parts else []
-    centre = read_stack(parts["centre"], k, k) if "centre" in parts else []
-    return ImplicitModel(k, n, m, h, shift, centre, monotonicity)
-
-
-def read_stack(node: Node, count: int, size: int) -> list[Terms]:
-    """`size` polynomials with the same distinct `exponents`, `coefficients` a row for each."""
-    parts = node.members("exponents coefficients")
-    rows = parts["exponents"].monomials(count)
-    values = parts["coefficients"].array(len(rows), size)
-    return [
-        [(e, row[i]) for e, row in zip(rows, values, strict=True) if row[i]] for i in range(size)
-    ]
 
 
 def _read_storage(kind: str, given: dict[str, Node], n: int, *, local: bool) -> Any:

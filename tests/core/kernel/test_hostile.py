@@ -28,9 +28,9 @@ from nlsid_core.kernel.files import (
     plain,
     read_regular,
 )
+from nlsid_core.kernel.implicit_models import read_stack
 from nlsid_core.kernel.polynomials import Ring, Work
 from nlsid_core.kernel.positivity import read_squares
-from nlsid_core.kernel.stable_set import read_stack
 from nlsid_core.kernel.terms import read_names
 
 SECONDS = 20.0  # of processor time that any one refusal may take, on a slow machine
