@@ -136,7 +136,7 @@ def read_field(node: Node) -> Field:
 def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
     """The funnel: x₀ continuous, P ≻ 0 and ρ > 0 at every knot, and so in between."""
     made_for = {role: digests[role] for role in ("vector_field", "policy")}
-    parts = node.document("funnel", "t x P rho", "continuous", **made_for)
+    parts = node.document("funnel", "t x P rho", "continuous", made_for=made_for)
     t = _increasing(parts["t"], 2, MAX_KNOTS)
     K = len(t)
     x = _curve(parts["x"], K - 1, n)
@@ -155,7 +155,7 @@ def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str
     """The policy: around the funnel's own nominal, each input clipped at most once."""
     made_for = {"vector_field": digests["vector_field"]}
     parts, count = (
-        node.document("policy", "t x u K limits", "continuous", **made_for),
+        node.document("policy", "t x u K limits", "continuous", made_for=made_for),
         len(funnel.x),
     )
     if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:

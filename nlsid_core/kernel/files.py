@@ -11,7 +11,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -174,20 +174,21 @@ class Node:
         return Node(self.value["kind"], f"{self.where} kind").text()
 
     def document(
-        self, form: str, names: str, kinds: str = "", optional: str = "", **made_for: str
-    ) -> dict[str, "Node"]:
+        self, form: str, names: str, kinds: str = "", *, optional: str = "",
+        made_for: Mapping[str, str] | None = None,
+    ) -> dict[str, "Node"]:  # fmt: skip
         """The members of a document nlsid/`form`, of one of `kinds` if there are any.
 
         made_for: the digests, by role, that it has to name; Mismatch if it names another.
         """
-        required = f"format version {'kind' * bool(kinds)} {' '.join(made_for)} {names}"
+        required = f"format version {'kind' * bool(kinds)} {' '.join(made_for or ())} {names}"
         parts = self.members(required, optional)
         kind = parts["kind"].text() if kinds else ""
         found = parts["format"].text(), parts["version"].whole(0), kind
         if found not in [(f"nlsid/{form}", VERSION, known) for known in kinds.split() or [""]]:
             wanted = f"nlsid/{form}, version {VERSION} {kinds}".rstrip()
             raise Rejected(f"{self.where} should be of format {wanted}; it is of format {found}")
-        for role, made in made_for.items():
+        for role, made in (made_for or {}).items():
             if parts[role].text() != made:
                 raise Mismatch(f"the {self.where} was made for another {role}")
         return parts

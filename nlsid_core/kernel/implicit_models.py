@@ -38,7 +38,7 @@ class ImplicitModel:
 def read_implicit_model(node: Node) -> ImplicitModel:
     """The model of a file."""
     names = "equation period states inputs monotonicity h"
-    parts = node.document("model", names, "implicit", f"shift centre {RECORDED}")
+    parts = node.document("model", names, "implicit", optional=f"shift centre {RECORDED}")
     if parts["equation"].text() != EQUATION:
         raise Rejected(f"{parts['equation'].where} should be {EQUATION!r}")
     n = len([entry.text() for entry in parts["states"].items(1, MAX_STATES)])

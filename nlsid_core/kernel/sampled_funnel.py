@@ -375,7 +375,7 @@ def _variables(model: Model) -> int:
 
 
 def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matrix, list[Matrix]]:
-    parts = node.document("policy", "law period L u x K", "sampled", model=made_for)
+    parts = node.document("policy", "law period L u x K", "sampled", made_for={"model": made_for})
     if parts["period"].number() != model.period:
         raise Rejected("the policy has another sample time than the model")
     n, p = model.states, len(model.signals) - model.states
@@ -389,7 +389,7 @@ def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matri
 def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) -> Funnel:
     names = "set assumption tube inlet half_widths S A" + " roots" * model.trapezoidal
     made_for = {role: digests[role] for role in ("model", "policy")}
-    parts, n = node.document("funnel", names, "sampled", **made_for), model.states
+    parts, n = node.document("funnel", names, "sampled", made_for=made_for), model.states
     radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
     roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
     if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
