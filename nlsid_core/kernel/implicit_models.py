@@ -24,6 +24,7 @@ EXPECTED = {
 VERSION = 2
 MAX_STATES = 30
 MAX_INPUTS = 60  # entries of w: inputs and their delays
+MEMBERS = "format version kind equation period states inputs monotonicity h shift centre"
 RECORDED = "y u window training bags"  # of a model of recorded signals; no part of any claim
 
 
