@@ -1,7 +1,7 @@
 """The YAML configuration of one robot: which signals, which split, which model, which tube."""
 
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -83,6 +83,13 @@ class SplitConfig(Section):
     test: Annotated[Names, Key("bags that only score the models", example=["trial_05"])] = ()
     validation: Annotated[
         Names, Key("bags by which orders, knots and bases are chosen", example=["trial_06"])
+    ] = ()
+    calibration: Annotated[
+        Names,
+        Key(
+            "bags that scale the level of the tube; without any, every second training trial does",
+            example=["trial_07"],
+        ),
     ] = ()
     share: Annotated[
         Annotated[float, Field(gt=0.0, lt=1.0)] | None,
@@ -304,8 +311,9 @@ def _time_refusals(config: Config) -> Iterator[str]:
             f"funnel.horizon: {config.funnel.horizon:g} s is not one sample of {period:g} s; give "
             "the length of a run"
         )
-    if twice := set(config.split.test) & set(config.split.validation):
-        yield f"split: '{min(twice)}' is named for test and for validation"
+    for use, other in combinations(("test", "validation", "calibration"), 2):
+        if twice := set(getattr(config.split, use)) & set(getattr(config.split, other)):
+            yield f"split: '{min(twice)}' is named for {use} and for {other}"
 
 
 def _model_refusals(config: Config) -> Iterator[str]:

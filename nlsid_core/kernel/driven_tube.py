@@ -10,8 +10,11 @@ most `level` while V(x̄_0) <= inlet and E <= budget. What the stored nominal de
 by is added to √level. Source: docs/certificate_driven_tube.md.
 """
 
+import re
+from bisect import bisect_left
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import accumulate
 
 from . import text
 from .decision import Decision
@@ -20,7 +23,19 @@ from .files import Mismatch, Node, Read, Rejected, bound_files
 from .increments import Linear, Model, Signal, read_model
 
 MAX_SAMPLES = 10**6
+LONGEST = 10**12  # samples of a recording
+MAX_TRIALS = 10**5  # that one assumption was measured on, or one tube designed on
+WINDOW = re.compile(r"([0-9]{1,12}):([0-9]{1,12})\]")
 MAX_NOMINAL = 10**7  # samples of the nominal times the square of the states: a minute
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A trial: the digest of its recording, and which samples of it: [0, LONGEST) is all."""
+
+    recording: str
+    first: int = 0
+    end: int = LONGEST
 
 
 @dataclass(frozen=True)
@@ -28,7 +43,8 @@ class Tube:
     """The numbers of a policy file and a funnel file; N nominal samples, n states, p outputs.
 
     x: (N, n), u: (N, 1), K: (1, n), L: (n, p). P: (n, n), R: (p, p), tau, half_widths: (p,).
-    trials: how many distinct ones the assumption was measured on.
+    measured_on, designed_on, fitted_to: what calibrated the assumption, designed the tube, made the
+    model.
     """
 
     x: Matrix
@@ -47,7 +63,9 @@ class Tube:
     samples: int
     measured: Fraction
     safety_factor: Fraction
-    trials: int
+    measured_on: list[Recorded]
+    designed_on: list[Recorded]
+    fitted_to: list[Recorded]
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -58,7 +76,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     linear = model.linear
     if linear is None:
         raise Rejected("a tube is decided for a model of kind difference_equation")
-    tube = _read(documents["policy"], documents["funnel"], model, digests)
+    fitted_to = _recorded(documents["model"].member("bags"))
+    tube = _read(documents["policy"], documents["funnel"], model, digests, fitted_to)
     slack = proof.members("slack")["slack"].number()
     if not 0 < slack < 1:
         raise Rejected("slack should be between 0 and 1")
@@ -110,8 +129,13 @@ def _check_assumption(tube: Tube, linear: Linear) -> None:
         tube.budget,
         "the budget is below safety_factor^2 x measured",
     )
-    if not tube.trials:
+    if not tube.measured_on:
         raise Rejected("the assumption was measured on no trial")
+    if _shared(tube.measured_on, tube.designed_on):
+        raise Rejected(
+            "a trial that the assumption was measured on also designed the tube: the largest of "
+            "such trials says nothing of the next one"
+        )
     low, high = linear.input_range
     if any(not low <= entry <= high for (entry,) in tube.u):
         raise Rejected("a nominal input is outside the model's input range")
@@ -180,15 +204,56 @@ def _assumptions(model: Model, tube: Tube) -> tuple[str, ...]:
             f"E <= {budget} after each of {tube.samples} samples, E+ = {text.exact(tube.rho)} E + "
             f"{energy} from 0"
         )
-    trials = "1 distinct trial" if tube.trials == 1 else f"{tube.trials} distinct trials"
+    count = len(set(tube.measured_on))
+    windows = any(trial.end < LONGEST for trial in tube.measured_on)
+    kind = "window" if windows else "trial"
+    trials = f"{count} distinct {kind}" + "s" * (count > 1)
     return (
         start,
-        f"innovation energy: {bound} (largest of {trials} {text.above(tube.measured)}, safety "
-        f"factor {text.below(tube.safety_factor)} in amplitude)",
+        f"innovation energy: {bound} (largest of {trials}, each taken whole, "
+        f"{text.above(tube.measured)}, safety factor {text.below(tube.safety_factor)} in "
+        "amplitude; "
+        f"{_rank_bound(tube, count, windows=windows)})",
     )
 
 
-def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> Tube:
+def _rank_bound(tube: Tube, count: int, *, windows: bool) -> str:
+    """How often a next trial exceeds the largest of those measured, if that can be said.
+
+    The largest of m + 1 exchangeable numbers is the last with probability at most 1/(m + 1). The
+    numbers are exchangeable only if the model and the tube were fixed before they were seen.
+    """
+    none = "no probability is stated of a next trial, as"
+    if windows:
+        return f"{none} windows of one recording are hardly exchangeable"
+    if seen := _shared(tube.measured_on, tube.fitted_to):
+        return f"{none} the model was fitted to {seen} of them"
+    return (
+        "a next trial that is exchangeable with them exceeds their largest with probability at "
+        f"most 1/{count + 1}"
+    )
+
+
+def _shared(trials: list[Recorded], others: list[Recorded]) -> int:
+    """How many distinct trials have samples that others have."""
+    spans: dict[str, list[tuple[int, int]]] = {}
+    for other in others:
+        spans.setdefault(other.recording, []).append((other.first, other.end))
+    reached = {
+        recording: ([first for first, _ in found], list(accumulate((e for _, e in found), max)))
+        for recording, found in ((key, sorted(value)) for key, value in spans.items())
+    }
+    count = 0
+    for trial in set(trials):
+        firsts, ends = reached.get(trial.recording, ([], []))
+        begun = bisect_left(firsts, trial.end)  # those that begin before the trial ends
+        count += begun > 0 and ends[begun - 1] > trial.first
+    return count
+
+
+def _read(
+    policy: Node, funnel: Node, model: Model, digests: dict[str, str], fitted_to: list[Recorded]
+) -> Tube:
     n, p = model.states, len(model.H)
     plan = _opened(policy, "nlsid/policy", "period K L u x", "policy", ("model",), digests)
     if plan["period"].number() != model.period:
@@ -200,10 +265,8 @@ def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> 
         raise Rejected(f"{len(u)} samples of {n} states take too long to decide")
     names = "rho P R level inlet tau half_widths assumption"
     parts = _opened(funnel, "nlsid/funnel", names, "funnel", ("model", "policy"), digests)
-    given = parts["assumption"].members("kind budget samples measured safety_factor measured_on")
-    trials = [trial.members("name digest") for trial in given["measured_on"].items()]
-    for trial in trials:
-        trial["name"].text()
+    names = "kind budget samples measured safety_factor measured_on designed_on"
+    given = parts["assumption"].members(names)
     tau = parts["tau"].array(p)
     if min(tau) <= 0:
         raise Rejected("tau should be positive")
@@ -215,8 +278,26 @@ def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> 
         assumption=given["kind"].text(), budget=given["budget"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES), measured=given["measured"].number(),
         safety_factor=given["safety_factor"].number(),
-        trials=len({trial["digest"].text() for trial in trials}),
+        measured_on=_recorded(given["measured_on"]), designed_on=_recorded(given["designed_on"]),
+        fitted_to=fitted_to,
     )  # fmt: skip
+
+
+def _recorded(trials: Node) -> list[Recorded]:
+    """A list of {name, digest}; a digest may end in [first:end], samples of the recording."""
+    found = []
+    for trial in trials.items(0, MAX_TRIALS):
+        parts = trial.members("name digest")
+        parts["name"].text()
+        recording, cut, samples = parts["digest"].text().partition("[")
+        if not cut:
+            found.append(Recorded(recording))
+            continue
+        window = WINDOW.fullmatch(samples)
+        if window is None or not int(window[1]) < int(window[2]) < LONGEST:
+            raise Rejected(f"{trial.where}: a window should be [first:end] with first < end")
+        found.append(Recorded(recording, int(window[1]), int(window[2])))
+    return found
 
 
 def _opened(

@@ -69,6 +69,12 @@ class Node:
                 raise Rejected(f"{self.where}: unknown member {plain(name)!r}")
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
 
+    def member(self, name: str) -> "Node":
+        """One member of an object that may have others."""
+        if type(self.value) is not dict or name not in self.value:
+            raise Rejected(f"{self.where}: '{name}' is missing")
+        return Node(self.value[name], f"{self.where} {name}")
+
     def items(self, least: int = 0, most: int = 10**6) -> list["Node"]:
         """A list of `least` to `most` entries."""
         if type(self.value) is not list or not least <= len(self.value) <= most:
