@@ -58,6 +58,42 @@ def nlsid(
 
 
 @app.command()
+def init(
+    bags: BagsArgument,
+    out_file: Annotated[
+        Path, typer.Option("--out", help="The YAML to write; must not be there yet.")
+    ],
+    response: Annotated[
+        list[str] | None, typer.Option("--response", "-y", help="What answers; repeat.")
+    ] = None,
+    excitation: Annotated[
+        list[str] | None, typer.Option("--excitation", "-u", help="What drives it; repeat.")
+    ] = None,
+    definitions: Annotated[
+        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
+    ] = None,
+    robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
+    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+) -> None:
+    """Write a first configuration from bags: signals, clock, period, gaps, split, lags, horizon.
+
+    It is tried on the bags, every key says why, and what later steps will meet is said first.
+    """
+    from bags.commands.init import run_init
+
+    run_init(
+        out,
+        bags,
+        out_file,
+        responses=response or (),
+        excitations=excitation or (),
+        definitions=definitions or (),
+        robot=robot,
+        yes=yes,
+    )
+
+
+@app.command()
 def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
     from bags.chain.config import load_config

@@ -110,8 +110,8 @@ def comparison_table(compared: Compared) -> Table:
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
-    for name in ("residual", "stability"):
-        table.add_column(name)
+    table.add_column("residual")
+    table.add_column("stable, rate a sample (time constant)")
     table.add_column("time", justify="right")
     label = ""
     for row in compared.rows:
@@ -137,8 +137,7 @@ def stability(candidate: Candidate[Model]) -> str:
     """Proved with its rate, or not, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    rate = stated_rate(candidate.proof).removesuffix(" a sample")  # the table is narrow
-    return f"[green]proved[/green], {rate}"
+    return f"[green]proved[/green], {stated_rate(candidate.proof, candidate.model.period)}"
 
 
 def funnel_table(design: TubeDesign) -> Table:

@@ -13,7 +13,7 @@ from bags.monitoring.replay import Replay
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, percent
-from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
@@ -193,7 +193,8 @@ def _stability(chosen: Candidate[Model]) -> str:
         clip = chosen.model.on_out_of_range == "clip"
         inputs += " (others are clipped to it)" if clip else " (others are refused)"
     if chosen.proof.rate < 1.0:
-        approach = f"approach each other at {chosen.proof.rate:.4f} a sample or faster"
+        rate = stated_rate(chosen.proof, chosen.model.period)
+        approach = f"approach each other at the rate {rate} a sample or faster"
     else:
         approach = "differ by a square summable sequence; no rate is claimed"
         if isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
