@@ -64,16 +64,21 @@ def energies(design: TubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray
     return np.cumsum(e**2)[: design.funnel.assumption.samples]
 
 
+def first_bad(design: TubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
+    """The first judged sample after which the energy or the command is beyond what is assumed."""
+    n, (low, high) = len(design.model), design.model.u_range
+    spent = energies(design, trial, y)
+    u = trial.u[n : n + len(spent), 0]
+    beyond = (spent > design.funnel.assumption.budget) | (u < low) | (u > high)
+    return int(np.flatnonzero(beyond)[0]) if beyond.any() else None
+
+
 @pytest.mark.parametrize("factor", [0.6, 0.8])
 def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
     design: TubeDesign, found: Catching, held_back: Dataset, factor: float
 ) -> None:
-    budget, delays = design.funnel.assumption.budget, []
-    for trial in held_back:
-        spent = energies(design, trial, factor * trial.y)
-        above = np.flatnonzero(spent > budget)
-        if len(above):
-            delays.append(PERIOD * above[0])
+    bad = [first_bad(design, trial, factor * trial.y) for trial in held_back]
+    delays = [PERIOD * k for k in bad if k is not None]
     caught = row(found, f"sensor x {factor}").funnel
     assert caught.count == len(delays) > 0
     assert caught.outside + caught.violated == caught.count
@@ -86,8 +91,9 @@ def test_untouched_trials_are_false_alarms_and_others_have_no_more(
     untouched = row(found, UNTOUCHED)
     assert untouched.fault == found.rows[0].fault
     budget = design.funnel.assumption.budget
-    exceeded = sum(energies(design, trial, trial.y)[-1] > budget for trial in held_back)
-    assert untouched.funnel.count == exceeded == 1, "three trials calibrated it: at most 1/4"
+    assert all(energies(design, trial, trial.y)[-1] <= budget for trial in held_back)
+    exceeded = sum(first_bad(design, trial, trial.y) is not None for trial in held_back)
+    assert untouched.funnel.violated == exceeded == 1, "a command beyond the fitted range"
     assert all(other.count <= exceeded for other in untouched.others.values())
     assert found.trials == 10
     assert [row.fault for row in found.rows] == [UNTOUCHED, *(name for name, _ in SABOTAGES)]
