@@ -5,19 +5,27 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+
 from bags.chain.config import Config, FunnelConfig
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
+from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
+from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import LinearTube, OutputTube, OutputTubeDesign, TubeDesign, design
+from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import DifferenceEquation, StableModel
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
 
 Progress = Callable[[str, float], None]
 
@@ -258,6 +266,61 @@ def design_funnel_files(
     planned = options.profile is not None
     load = documents.load_model if planned else documents.load_stable_model
     model: StableModel = load(model_path)
+    trials, _ = _trials_beside(model_path, config, model)
+    found: TubeDesign | OutputTubeDesign
+    if planned:
+        found = design(_around_plan(model, trials, options))
+    else:
+        found = design(
+            OutputTube(
+                model,
+                trials.design,
+                trials.calibration,
+                reaction_time=options.reaction_time,
+                safety_factor=options.safety_factor,
+                horizon=options.horizon,
+                box=getattr(config.identification.model_class, "box", None),
+            )
+        )
+        (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
+    found.save(out)
+    return found
+
+
+def what_a_funnel_catches(
+    model_path: Path, config: Config, design: TubeDesign | OutputTubeDesign
+) -> Catching | None:
+    """What a designed funnel catches in the test trials beside its model; None if there are none.
+
+    The trials are held against the model driven by the recorded commands. Raises DataError.
+    """
+    model = design.model
+    trials, test = _trials_beside(model_path, config, model)
+    if test is None:
+        return None
+    y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
+    if isinstance(design.funnel, TubeFunnel):
+        factor = design.funnel.tubes[0].safety_factor
+    else:
+        factor = design.funnel.assumption.safety_factor
+    return what_it_catches(
+        Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
+        model,
+        design.funnel.half_widths.tolist(),
+        held_back=test,
+        calibration=trials.calibration,
+        ranges=np.ptp(y, axis=0),
+        factor=factor,
+    )
+
+
+def _trials_beside(
+    model_path: Path, config: Config, model: StableModel
+) -> tuple[CalibrationTrials, Dataset | None]:
+    """The trials that design and scale the tube of a model, and the test trials if they are kept.
+
+    Raises DataError if those that the configuration names are not there.
+    """
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
     held_back = load_held_back(
         model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
@@ -267,29 +330,16 @@ def design_funnel_files(
             f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
             "calibration trials; run `nlsid identify` with this configuration"
         )
-    calibration = held_back.get("calibration")
-    found: TubeDesign | OutputTubeDesign
-    if options.profile is None:
-        found = design(
-            OutputTube(
-                model,
-                train,
-                calibration,
-                reaction_time=options.reaction_time,
-                safety_factor=options.safety_factor,
-                horizon=options.horizon,
-                box=getattr(config.identification.model_class, "box", None),
-            )
-        )
-        (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
-    else:
-        found = design(_around_plan(model, train, options, calibration))
-    found.save(out)
-    return found
+    assert config.funnel is not None
+    least = least_window(model, train)
+    if config.funnel.profile is not None and isinstance(model, DifferenceEquation):
+        least = round((config.funnel.horizon or 0.0) / model.period) + len(model)
+    trials = calibration_trials(train, held_back.get("calibration"), least=least)
+    return trials, held_back.get("test")
 
 
 def _around_plan(
-    model: StableModel, train: Dataset, options: FunnelConfig, calibration: Dataset | None
+    model: StableModel, trials: CalibrationTrials, options: FunnelConfig
 ) -> LinearTube:
     assert isinstance(model, DifferenceEquation)
     assert options.profile is not None
@@ -297,11 +347,11 @@ def _around_plan(
     weights = options.policy
     return LinearTube(
         model,
-        train,
+        trials.design,
         profile=options.profile,
         horizon=options.horizon,
         safety_factor=options.safety_factor,
         inlet=options.inlet,
         lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-        calibration=calibration,
+        calibration=trials.calibration,
     )

@@ -58,6 +58,42 @@ def nlsid(
 
 
 @app.command()
+def init(
+    bags: BagsArgument,
+    out_file: Annotated[
+        Path, typer.Option("--out", help="The YAML to write; must not be there yet.")
+    ],
+    response: Annotated[
+        list[str] | None, typer.Option("--response", "-y", help="What answers; repeat.")
+    ] = None,
+    excitation: Annotated[
+        list[str] | None, typer.Option("--excitation", "-u", help="What drives it; repeat.")
+    ] = None,
+    definitions: Annotated[
+        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
+    ] = None,
+    robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
+    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+) -> None:
+    """Write a first configuration from bags: signals, clock, period, gaps, split, lags, horizon.
+
+    It is tried on the bags, every key says why, and what later steps will meet is said first.
+    """
+    from bags.commands.init import run_init
+
+    run_init(
+        out,
+        bags,
+        out_file,
+        responses=response or (),
+        excitations=excitation or (),
+        definitions=definitions or (),
+        robot=robot,
+        yes=yes,
+    )
+
+
+@app.command()
 def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
     """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
     from bags.chain.config import load_config
@@ -142,19 +178,30 @@ def funnel(
         Path | None,
         typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
     ] = None,
+    require: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
+        ),
+    ] = None,
 ) -> None:
     """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
     Around the simulation of an identified model of any class, or a plan of a linear one (--model,
-    --config with a profile), or a trajectory of given dynamics (--problem).
+    --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
+    it says what it catches: faults put into the test trials, through the monitor.
     """
     from bags.chain.config import load_config
-    from bags.chain.steps import design_funnel_files
+    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
+    from bags.designs import documents
+    from bags.pictures.report import write_catching
 
     if problem is not None:
-        if model is not None or config is not None:
-            raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
+        if not (model is None and config is None and require is None):
+            raise typer.BadParameter(
+                "--problem stands alone; it takes no --model, no --config and no --require"
+            )
         _funnel_around_trajectory(problem, out_dir)
         return
     if model is None or config is None:
@@ -163,10 +210,23 @@ def funnel(
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, out_dir)
+        progress("sabotaging the test trials", 0.7)
+        catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
     out.print(show.funnel_table(design))
-    for name in design.documents():
-        out.print(f"wrote {out_dir / name}", soft_wrap=True)
+    if catching is None:
+        out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
+        if require is not None:
+            raise typer.Exit(2)
+    else:
+        show.say_catching(out, catching, require)
+    for path in (
+        *(out_dir / name for name in design.documents()),
+        *([] if catching is None else write_catching(out_dir, catching)),
+    ):
+        out.print(f"wrote {path}", soft_wrap=True)
+    if catching is not None and require is not None and not catching.widest.share <= require:
+        raise typer.Exit(1)
 
 
 @app.command()

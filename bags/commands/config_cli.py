@@ -34,12 +34,14 @@ def check(
     from nlsid_core.errors import DataError
 
     try:
+        folders: list[Path] = []
+        wrong: list[str] = []
         if tracking:
             load_tracking_config(file)
-            wrong = []
         else:
             settings = load_config(file)
-            wrong = misfits(settings, expand_bags(bags)) if bags else []
+            folders = expand_bags(bags or [])
+            wrong = misfits(settings, folders) if folders else []
     except DataError as error:
         typer.echo(str(error))
         raise typer.Exit(1) from error
@@ -47,4 +49,4 @@ def check(
         typer.echo(line)
     if wrong:
         raise typer.Exit(1)
-    typer.echo(f"{file}: nothing is wrong" + (f" for {len(bags)} bags" if bags else ""))
+    typer.echo(f"{file}: nothing is wrong" + (f", {len(folders)} bags fit" if folders else ""))

@@ -69,7 +69,7 @@ def design_output_tube(
     """
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    trials = calibration_trials(train, calibration, least=LEAST_WINDOW * (settling + REACTION))
+    trials = calibration_trials(train, calibration, least=least_window(model, train))
     train = trials.design
     y_box, u_box = _box(model, stepper, train, box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
@@ -104,6 +104,11 @@ def design_output_tube(
         return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
     except CertificateRejected as refusal:
         raise Infeasible(f"no proved tube: {refusal}") from refusal
+
+
+def least_window(model: StableModel, train: Dataset) -> int:
+    """Samples of a window of a single recording, on which a tube is designed or measured."""
+    return LEAST_WINDOW * (_settling(model, Stepper(model), train) + REACTION)
 
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:

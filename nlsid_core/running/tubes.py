@@ -208,9 +208,17 @@ class TubeRun:
             self._begin()
             return self._unknown(t, y, f"the model's state is not finite at t = {t:g} s")
         measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
-        away = deviation.tolist()
+        away, innovations = deviation.tolist(), e.tolist()
         return [
-            self._reading(i, t, sizes, spent.tolist(), nominal, measured, away)
+            self._reading(
+                i,
+                t,
+                sizes,
+                spent.tolist(),
+                nominal,
+                measured,
+                away + innovations[self._owner.index(i)],
+            )
             for i in range(len(self._funnels))
         ]
 
@@ -224,7 +232,10 @@ class TubeRun:
         measured: tuple[float, ...],
         away: list[float],
     ) -> Reading:
-        """Of funnel i: the narrowest margin and the most that is used over the tubes that last."""
+        """Of funnel i: the narrowest margin and the most that is used over the tubes that last.
+
+        away: the output error, then the innovation of the funnel's first observer.
+        """
         lasting = [
             j for j, owner in enumerate(self._owner)
             if owner == i and (self._samples[j] is None or self._k <= (self._samples[j] or 0))

@@ -16,7 +16,10 @@ DOWNWARD = {
     "nlsid_ros": {"nlsid_core", "bags", "nlsid_ros"},
 }
 # The rooms of bags, each standing on those before it.
-ROOMS = ("recordings", "signals", "tools", "designs", "monitoring", "pictures", "chain", "commands")
+ROOMS = (
+    "recordings", "signals", "tools", "designs", "monitoring", "pictures", "chain", "setup",
+    "commands",
+)  # fmt: skip
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {
     "search": {"identification", "design", "sos", "conic"},
