@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -12,6 +13,7 @@ from bags.chain.choosing import Compared
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
+from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
@@ -155,6 +157,73 @@ def funnel_table(design: TubeDesign) -> Table:
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
     return table
+
+
+def catching_table(catching: Catching) -> Table:
+    """What the funnel and other detectors catch of every sabotage, and how soon."""
+    detectors = list(catching.rows[0].others)
+    table = Table(
+        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        caption=CATCHING_CAPTION,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,  # 79 columns in all
+    )
+    table.add_column("fault", no_wrap=True)
+    for name in ("outside", "violated", "unknown", "after", *detectors):
+        table.add_column(name, justify="right")
+    for row in catching.rows:
+        if row.refused:  # the reason is said below the table
+            table.add_row(row.fault, *["-"] * (4 + len(detectors)))
+            continue
+        funnel = row.funnel
+        counts = [str(funnel.outside), str(funnel.violated), str(funnel.unjudged)]
+        others = [_soon(row.others[name]) for name in detectors]
+        least = max((other.count for other in row.others.values()), default=0)
+        style = "dark_orange3" if least > funnel.count else ""
+        table.add_row(row.fault, *counts, _after(funnel), *others, style=style)
+    return table
+
+
+CATCHING_CAPTION = (
+    "outside and violated (what is assumed) are both caught; unknown: not judged to the end. "
+    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
+    "(untouched). Coloured: one of them catches more."
+)
+
+
+def _after(caught: Caught) -> str:
+    return "-" if math.isnan(caught.after) else f"{caught.after:.2f} s"
+
+
+def _soon(caught: Caught) -> str:
+    return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
+
+
+def say_catching(console: Console, catching: Catching, require: float | None) -> None:
+    """The widths, the table, and what is to be known of a tube that is too wide."""
+    for line in width_lines(catching):
+        console.print(line, soft_wrap=True, highlight=False)
+    console.print(catching_table(catching))
+    for row in catching.rows:
+        if row.refused:
+            console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    wide = catching.warnings(WIDE if require is None else require)
+    for line in wide:
+        word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
+        said = f"{word}{line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def width_lines(catching: Catching) -> list[str]:
+    """Every output's half-width beside its range."""
+    return [
+        f"half-width of {width.name}: {width.said}, {width.share:.2f} of its range, "
+        f"{width.range:.3g} {width.unit}"
+        for width in catching.widths
+    ]
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:
