@@ -47,10 +47,11 @@ def say_identified(console: Console, result: Identified) -> None:
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
-    table.add_column("method")
+    table.collapse_padding = True
+    table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
-    table.add_column(STABILITY, min_width=17)
+    table.add_column(STABILITY)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,

@@ -29,14 +29,14 @@ class Proof(Protocol):
 
 
 def stated_rate(proof: Proof, period: float) -> str:
-    """The rate a sample with its time constant at `period` (s), rounded up: `0.9500 (0.488 s)`."""
+    """The rate a sample, rounded up, and its time constant at `period` (s): `0.9500 (0.49 s)`."""
     if proof.rate >= 1.0:
         return "proved, no rate"
     digits = 4 if proof.rate <= 0.999 else 7
     rate = max(math.ceil(proof.rate * 10**digits), 1) / 10**digits
     if rate >= 1.0:
-        return f"{proof.rate!r} ({-period / math.log(proof.rate):.3g} s)"
-    return f"{rate:.{digits}f} ({-period / math.log(rate):.3g} s)"
+        return f"{proof.rate!r} ({-period / math.log(proof.rate):.2g} s)"
+    return f"{rate:.{digits}f} ({-period / math.log(rate):.2g} s)"
 
 
 @dataclass(frozen=True, eq=False)
