@@ -341,6 +341,32 @@ def monitor(
 
 
 @app.command()
+def tolerances(
+    folder: Annotated[Path, typer.Argument(help="Folder of a design: funnel.json, its proof, ...")],
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; default the design's.")
+    ] = None,
+) -> None:
+    """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
+
+    Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
+    of Autoware's validators for speeds and distances, and a table of all signals.
+    """
+    from bags.designs import tolerances as proved
+
+    found = proved.tolerances(folder)
+    target = folder if out_dir is None else out_dir
+    target.mkdir(parents=True, exist_ok=True)
+    out.print(str(found), soft_wrap=True, markup=False, highlight=False)
+    written = found.write(target)
+    for path in written:
+        out.print(f"wrote {path}", soft_wrap=True)
+    for name, units in ((proved.CONTROLLER, proved.POSITIONS), (proved.VALIDATOR, ("m/s", "m"))):
+        if target / name not in written:
+            out.print(f"no {name}: no signal is in {' or '.join(units)}", soft_wrap=True)
+
+
+@app.command()
 def live(
     workflow: Annotated[str, typer.Argument(help="monitor, closed_loop or identify.")],
     arguments: Annotated[

@@ -32,6 +32,7 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
+STABILITY = "proved rate a sample (time constant)"
 
 
 def say_identified(console: Console, result: Identified) -> None:
@@ -48,10 +49,11 @@ def say_identified(console: Console, result: Identified) -> None:
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
+    table.collapse_padding = True
     table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,
@@ -87,7 +89,7 @@ def selection_table(selection: Selection[Model]) -> Table:
     table.add_column("model class")
     for name in ("validation", "training", "test"):
         table.add_column(name, justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY, min_width=17)
     for entry in selection.tried:
         style = "bold" if entry.model_class is selection.best else ""
         label = describe(entry.model_class)
@@ -106,14 +108,14 @@ def comparison_table(compared: Compared) -> Table:
     title = [f"{len(compared.trials.test)} test trials {left_out}"]
     if len(labels) == 1:
         title = [*labels, *title]
-    table = Table(title=": ".join(title), title_justify="left")
-    table.add_column("method" if len(labels) == 1 else "model class, method")
-    table.add_column("simulation", justify="right")
+    table = Table(title=": ".join(title), title_justify="left", collapse_padding=True)
+    table.add_column("method" if len(labels) == 1 else "model class, method", min_width=13)
+    table.add_column("free run", justify="right")
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
     table.add_column("residual")
-    table.add_column("stable, rate a sample (time constant)")
+    table.add_column(STABILITY, min_width=9)
     table.add_column("time", justify="right")
     label = ""
     for row in compared.rows:
@@ -125,7 +127,7 @@ def comparison_table(compared: Compared) -> Table:
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            row.candidate.method.title,
+            row.candidate.method.name,
             percent(scores.simulation_percent),
             *(percent(scores.prediction_percent[k]) for k in horizons),
             ", ".join(flaws) or "white, independent",
@@ -136,10 +138,10 @@ def comparison_table(compared: Compared) -> Table:
 
 
 def stability(candidate: Candidate[Model]) -> str:
-    """Proved with its rate, or not, in colour."""
+    """The proved rate, or that none is, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    return f"[green]proved[/green], {stated_rate(candidate.proof, candidate.model.period)}"
+    return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
 def funnel_table(design: TubeDesign | OutputTubeDesign) -> Table:
