@@ -207,10 +207,10 @@ def _assumptions(model: Model, tube: Tube) -> tuple[str, ...]:
     count = len(set(tube.measured_on))
     windows = any(trial.end < LONGEST for trial in tube.measured_on)
     kind = "window" if windows else "trial"
-    trials = f"{count} distinct {kind}" + "s" * (count > 1)
+    trials = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
     return (
         start,
-        f"innovation energy: {bound} (largest of {trials}, each taken whole, "
+        f"innovation energy: {bound} (largest of {trials} taken whole, "
         f"{text.above(tube.measured)}, safety factor {text.below(tube.safety_factor)} in "
         "amplitude; "
         f"{_rank_bound(tube, count, windows=windows)})",
