@@ -3,7 +3,6 @@
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
-import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
@@ -43,7 +42,9 @@ OutOption = Annotated[
 
 def _say_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"nlsid {importlib.metadata.version('nlsid')}")
+        from importlib.metadata import version
+
+        typer.echo(f"nlsid {version('nlsid')}")
         raise typer.Exit
 
 
