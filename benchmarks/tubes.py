@@ -38,11 +38,6 @@ from nlsid_core.identification import (
     StateAffineClass,
     identify,
 )
-    ImplicitClass,
-    LinearClass,
-    StateAffineClass,
-    identify,
-)
 from nlsid_core.identification.prediction import simulate_trial
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
