@@ -1,10 +1,11 @@
 """Tubes around the simulation of identified models: how wide, how fast, and what they catch.
 
-python -m benchmarks.tubes --data DIR [--json]
+python -m benchmarks.tubes [--json]
 
-A model is identified on part of the recordings; of the rest half scale the tube and half are
-judged, untouched and sabotaged. Widths are per amplitude (half the range), at safety factor 1;
-published are those of TUBES, section 12, which scaled on all of its trials.
+Models of the shipped F1TENTH recordings: half of the training trials identify a model and design
+its tube, the other half scale it, and the test trials are judged, untouched and sabotaged. Widths
+are per amplitude (half the range), at safety factor 1; published are those of TUBES, section 12,
+which scaled on all of its trials.
 """
 
 import os
@@ -16,7 +17,6 @@ import json
 import statistics
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,15 +27,11 @@ from bags.chain.steps import read_trials
 from bags.monitoring.catching import what_it_catches
 from bags.samples import f1tenth
 from benchmarks.machine import describe
-from benchmarks.recorded import heat_exchanger, single
-from nlsid_core.data.calibration import windows
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.tube import design_output_tube, energy, innovations
 from nlsid_core.identification import (
-    CertifiedRse,
     ImplicitClass,
     LinearClass,
-    StateAffineClass,
     identify,
 )
 from nlsid_core.identification.prediction import simulate_trial
@@ -46,20 +42,15 @@ FACTOR = 1.5
 PUBLISHED = {
     "f1tenth_linear": {"response": 0.470, "fading": 0.606, "energy": 0.727},
     "f1tenth_implicit": {"response": 0.968, "fading": 1.19, "energy": 1.28},
-    "exchanger": {"response": 0.280, "fading": 0.428, "energy": 1.00},
 }
 CHECKS = 5  # repetitions; the median is reported
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Trials to identify on, to scale on, and to judge; horizon: s of the energy beside it.
-
-    method: of identification, None for the class's own.
-    """
+    """Trials to identify on, to scale on, and to judge; horizon: s of the energy beside it."""
 
     model_class: Any
-    method: Any
     train: Dataset
     calibration: Dataset
     judged: Dataset
@@ -75,22 +66,12 @@ def f1tenth_case(model_class: Any) -> Case:
     )
     recorded = trials.train.trajectories
     train, calibration = Dataset(recorded[::2]), Dataset(recorded[1::2])
-    return Case(model_class, None, train, calibration, trials.test, 114 * config.grid.period)
-
-
-def exchanger_case(data: Path) -> Case:
-    """Flow to temperature: the first 1500 samples train, windows of 250 of the rest do the rest."""
-    flow, temperature = heat_exchanger(data / "exchanger")
-    whole = single("exchanger", flow, temperature, 1.0)
-    parts = windows(whole, 250)
-    model_class = StateAffineClass(2, leading_degree=2, right_degree=3, input_range=((0.1, 0.7),))
-    train, calibration, judged = Dataset(parts[:6]), Dataset(parts[6::2]), Dataset(parts[7::2])
-    return Case(model_class, CertifiedRse(), train, calibration, judged, 250.0)
+    return Case(model_class, train, calibration, trials.test, 114 * config.grid.period)
 
 
 def measure(case: Case) -> dict[str, float | int]:
     """The promised keys of one case."""
-    model = identify(case.train, case.model_class, method=case.method).model
+    model = identify(case.train, case.model_class).model
     started = time.perf_counter()
     made = design_output_tube(
         model, case.train, case.calibration, safety_factor=FACTOR, horizon=case.horizon
@@ -129,7 +110,9 @@ def measure(case: Case) -> dict[str, float | int]:
             for t, *given in zip(trial.t.tolist(), trial.y, trial.u, strict=True)
         ]
         busy, samples = busy + time.perf_counter() - started, samples + len(trial)
-        outside += sum(k and r.status is Status.OUTSIDE for k, r in zip(kept, said, strict=True))
+        outside += sum(
+            bool(k) and r.status is Status.OUTSIDE for k, r in zip(kept, said, strict=True)
+        )
     keys |= {"update_us": 1e6 * busy / samples, "outside_with_assumption_kept": outside}
     caught = what_it_catches(
         monitor, model, fading.half_widths.tolist(), held_back=case.judged,
@@ -152,13 +135,11 @@ def measure(case: Case) -> dict[str, float | int]:
 def main() -> None:
     """Print the table, and with --json one JSON object as the last line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True, help="folder with exchanger/")
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     arguments = parser.parse_args()
     cases = {
         "f1tenth_linear": f1tenth_case(LinearClass(4)),
         "f1tenth_implicit": f1tenth_case(ImplicitClass(4)),
-        "exchanger": exchanger_case(arguments.data),
     }
     print(f"tubes around the simulation of identified models, {describe()}\n")
     keys: dict[str, float | int] = {}
