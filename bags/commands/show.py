@@ -194,8 +194,9 @@ def _driven_tube(design: TubeDesign) -> Table:
 def catching_table(catching: Catching) -> Table:
     """What the funnel and other detectors catch of every sabotage, and how soon."""
     detectors = list(catching.rows[0].others)
+    plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        title=f"caught of {catching.trials} held-back trial{plural}, and how soon (median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
