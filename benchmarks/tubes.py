@@ -116,7 +116,7 @@ def measure(case: Case) -> dict[str, float | int]:
     keys |= {"update_us": 1e6 * busy / samples, "outside_with_assumption_kept": outside}
     caught = what_it_catches(
         monitor, model, fading.half_widths.tolist(), held_back=case.judged,
-        calibration=case.calibration, ranges=np.ptp(y, axis=0), factor=FACTOR,
+        calibration=case.calibration, ranges=np.ptp(y, axis=0), factor=FACTOR, remedy="",
     )  # fmt: skip
     untouched, *faults = caught.rows
     after = [row.funnel.after for row in faults if np.isfinite(row.funnel.after)]
