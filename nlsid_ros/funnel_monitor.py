@@ -36,7 +36,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription, declare_wiring
+from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import stamp_ns_of
@@ -70,6 +70,7 @@ class FunnelMonitor(ManagedNode):
             declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
         self._wiring = declare_wiring(self)
+        self._expected = declare_expected(self)
         number = partial(declare_number, self, tunable=True)
         number("stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0))
         number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
@@ -99,7 +100,7 @@ class FunnelMonitor(ManagedNode):
         self._waiting: dict[str, SignalPath | SignalVector] = {}
         self._watch = None
         self._run: Run | None = None
-        waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel")
+        waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for a design")
         self._said: tuple[Reading, State] = waiting, State.UNKNOWN
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
@@ -107,8 +108,13 @@ class FunnelMonitor(ManagedNode):
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._funnel = FunnelSubscription(
-            self, self._source, self._on_funnel, self._on_refusal, wiring=self._wiring
+        self._funnel = DesignSubscription(
+            self,
+            self._source,
+            self._on_design,
+            self._on_news,
+            wiring=self._wiring,
+            expected=self._expected,
         )
         if self._controller:
             self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
@@ -127,24 +133,30 @@ class FunnelMonitor(ManagedNode):
         )
         self._release.cancel()
 
-    def _on_funnel(self, design: AnyDesign) -> None:
-        """A funnel came, or another one: watch its signals from scratch."""
+    def stop(self) -> None:
+        """Call off a check that is on."""
+        self._funnel.close()
+
+    def _on_design(self, design: AnyDesign, digest: str) -> None:
+        """A proved design came, or another one: watch its signals from scratch."""
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
         signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
-        self._watch = watch
+        self._watch, self._digest = watch, digest
         self._waiting = signals
         self._deadlines.clear()
         self._tell(f"no {design.name} yet")
         self.get_logger().info(f"watching {design.response} and {design.command}")
         self._begin()
 
-    def _on_refusal(self, reason: str) -> None:
-        self._watch = None
-        self.get_logger().error(reason)
-        self._tell(reason)
+    def _on_news(self) -> None:
+        """A check began, or a design was used again or refused: what is in use stays in use."""
+        if self._watch is None:
+            self._tell(self._funnel.state)
+        else:
+            self._diagnostics.publish(self._status_message())
 
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0."""
@@ -159,8 +171,8 @@ class FunnelMonitor(ManagedNode):
         """Begin the announced run if it is of the funnel at hand."""
         if self._watch is None or self._run is None:
             return
-        if self._run.funnel != self._funnel.digest:
-            self._tell("the controller tracks another funnel than the one published")
+        if self._run.funnel != self._digest:
+            self._tell("the controller tracks another funnel than the one in use here")
             return
         self._publish(self._watch.begin(self._run.start_ns))
 
@@ -306,16 +318,20 @@ class FunnelMonitor(ManagedNode):
             "judged": str(self._judged),
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
+            "design": self._funnel.state,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
-        text = state.value + (f": {reading.reason}" if reading.reason else "")
+        level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
+        if self._funnel.refusal:
+            level = DiagnosticStatus.ERROR
+            text += f"; {self._funnel.refusal}" if watch else ""
         stamp = self.get_clock().now().to_msg()
-        return status(stamp, name_of(self), LEVELS[state], text, values)
+        return status(stamp, name_of(self), level, text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""
         answer.success = self._watch is not None
-        answer.message = "new run" if answer.success else "there is no funnel yet"
+        answer.message = "new run" if answer.success else "there is no design yet"
         if self._watch is not None:
             self._watch.restart()
             self._run = None

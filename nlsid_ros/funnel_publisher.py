@@ -1,12 +1,11 @@
-"""Node `funnel_publisher`: checks a funnel's proof, then publishes the funnel, latched.
+"""Node `funnel_publisher`: checks a funnel's proof, then publishes the design, latched.
 
-Publishes ~/funnel, ~/model and ~/policy (std_msgs/String, transient local): the JSON documents as
-they were proved; ~/tube (visualization_msgs/MarkerArray) and ~/nominal
+Publishes ~/design (std_msgs/String, transient local): the files of model, policy, funnel and proof
+as one bundle, which whoever uses it has decided again; ~/tube (visualization_msgs/MarkerArray) and ~/nominal
 (trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses what is
 not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
-import json
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -20,9 +19,8 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
+from bags.designs.bundle import Bundle
 from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved, load_proved
-from nlsid_core.arrays import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
@@ -57,9 +55,7 @@ class FunnelPublisher(ManagedNode):
         self._latched = {
             name: self.create_publisher(kind, f"~/{name}", qos.DOCUMENT)
             for name, kind in (
-                ("model", String),
-                ("policy", String),
-                ("funnel", String),
+                ("design", String),
                 ("tube", MarkerArray),
                 ("nominal", JointTrajectory),
             )
@@ -95,22 +91,23 @@ class FunnelPublisher(ManagedNode):
         with suppress(NlsidError, OSError):  # said by _load
             self._publish(self._load(self._path))
 
-    def _load(self, path: Path) -> Proved[AnyDesign]:
+    def _load(self, path: Path) -> tuple[Bundle, AnyDesign, str]:
+        """What to publish, what it is, and what is proved of it."""
         try:
-            return load_proved(path)
+            bundle = Bundle.load(path)
+            return bundle, bundle.design(), str(bundle.decided())
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
 
-    def _publish(self, proved: Proved[AnyDesign]) -> None:
-        for name in ("model", "policy", "funnel"):
-            document: Json = getattr(proved.design, name).document()
-            self._latched[name].publish(String(data=json.dumps(document)))
-        self._latched["tube"].publish(tube_markers(proved.design, self._frame))
-        self._latched["nominal"].publish(nominal_trajectory(proved.design))
-        self._say(DiagnosticStatus.OK, str(proved.verdict))
-        self.get_logger().info(str(proved.verdict))
+    def _publish(self, proved: tuple[Bundle, AnyDesign, str]) -> None:
+        bundle, design, verdict = proved
+        self._latched["design"].publish(String(data=bundle.text()))
+        self._latched["tube"].publish(tube_markers(design, self._frame))
+        self._latched["nominal"].publish(nominal_trajectory(design))
+        self._say(DiagnosticStatus.OK, verdict)
+        self.get_logger().info(verdict)
 
     def _say(self, level: bytes, message: str) -> None:
         now = self.get_clock().now().to_msg()

@@ -33,7 +33,7 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription, declare_wiring
+from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
@@ -70,6 +70,7 @@ class TrackingController(ManagedNode):
         number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
         number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
         self._wiring = declare_wiring(self)
+        self._expected = declare_expected(self)
         self._controller: Controller | None = None
         self._stopping = ""
         self.tune(self.tunable())
@@ -93,13 +94,18 @@ class TrackingController(ManagedNode):
         self._first_ns: int | None = None
         self._due_ns = 0
         self._stopping = ""
-        self._text = "waiting for the funnel"
+        self._text = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self._funnel = FunnelSubscription(
-            self, self._source, self._on_funnel, self._tell, wiring=self._wiring
+        self._funnel = DesignSubscription(
+            self,
+            self._source,
+            self._on_design,
+            self._report,
+            wiring=self._wiring,
+            expected=self._expected,
         )
         self._due = self.create_timer(1.0, self._on_due)
         self._due.cancel()
@@ -112,6 +118,7 @@ class TrackingController(ManagedNode):
 
     def stop(self) -> None:
         """Ramp down before going, in real time."""
+        self._funnel.close()
         if self._controller is None and not self._stopping:
             return
         assert self._design is not None
@@ -122,17 +129,16 @@ class TrackingController(ManagedNode):
             time.sleep(period)
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
-    def _on_funnel(self, design: AnyDesign) -> None:
-        """Take a funnel, but never in the middle of a run: stop that first."""
-        if self._controller is not None or self._stopping:
-            self._halt("the funnel was replaced")
+    def _on_design(self, design: AnyDesign, digest: str) -> None:
+        """Take a design, but never in the middle of a run: stop that first."""
         response, command = design.response, design.command
         response.check(self._response_type, standard_types())
+        message = SignalMessage(command, self._command_type)
+        if self._controller is not None or self._stopping:
+            self._halt("the design was replaced")
         if self._design is None:
-            self._command = SignalMessage(command, self._command_type)
-            self._commands = self.create_publisher(
-                self._command.kind, self._command.path.topic, qos.STREAM
-            )
+            self._command = message
+            self._commands = self.create_publisher(message.kind, message.path.topic, qos.STREAM)
             self.create_subscription(
                 message_class(self._response_type),
                 response.topic,
@@ -140,9 +146,8 @@ class TrackingController(ManagedNode):
                 qos.SENSOR,
             )
         elif (response, command) != (self._design.response, self._design.command):
-            self._tell("the new funnel is about other signals; deactivate and activate again")
-            return
-        self._design = design
+            raise DataError("it is about other signals; deactivate and activate again")
+        self._design, self._digest = design, digest
         self._tell("idle")
         if self._start_at_once:
             self._begin()
@@ -150,7 +155,9 @@ class TrackingController(ManagedNode):
     def _begin(self) -> str:
         """Begin a run; why not, empty if it began."""
         if self._design is None:
-            return "there is no funnel yet"
+            return f"there is no design yet: {self._funnel.state}"
+        if self._funnel.refusal or self._funnel.state == CHECKING:
+            return self._funnel.state
         if self._controller is not None or self._stopping:
             return "a run is on"
         try:
@@ -183,7 +190,7 @@ class TrackingController(ManagedNode):
                 self._halt(controller.ended)
                 return
             if waiting and controller.k >= 1:
-                announced = Run(stamp_ns, self._funnel.digest).document()
+                announced = Run(stamp_ns, self._digest).document()
                 self._announce.publish(String(data=files.encode(announced).decode()))
                 self._tell("tracking")
         self._stale.reset()
@@ -248,16 +255,21 @@ class TrackingController(ManagedNode):
         self._report()
 
     def _report(self) -> None:
-        level = DiagnosticStatus.OK
+        level, text = DiagnosticStatus.OK, self._text
         if self._stopping or "stopped" in self._text:
             level = DiagnosticStatus.WARN
+        if self._design is None or self._funnel.refusal:
+            text = "; ".join(part for part in (self._text, self._funnel.state) if part)
+        if self._funnel.refusal:
+            level = DiagnosticStatus.ERROR
         values = {
             "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",
-            "funnel": self._funnel.digest if hasattr(self, "_funnel") else "",
+            "funnel": self._funnel.digest,
+            "design": self._funnel.state,
         }
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, self._text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -146,6 +146,8 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
     The funnel's kind decides. Raises DocumentError if one is not what it should be,
     CertificateMismatch if they do not belong together.
     """
+    if documents.keys() != {"model", "policy", "funnel"}:
+        raise DocumentError(f"{', '.join(documents)}: a design is a model, a policy and a funnel")
     funnel, policy = read_funnel(documents["funnel"]), read_policy(documents["policy"])
     readers: dict[type[AnyFunnel], tuple[type[AnyPolicy], Any]] = {
         LinearFunnel: (LinearPolicy, DifferenceEquation.from_document),

@@ -24,6 +24,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
+from bags.designs.bundle import Bundle
 from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.interfaces import example_nodes
@@ -199,7 +200,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
     heard: list[str] = []
 
     def hear(message: String) -> None:
-        heard.append(files.digest(files.parse_document(message.data)))
+        heard.append(Bundle.parse(message.data).digest)
 
     names = (documents.MODEL, documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF)
     for place in ("good", "forged"):
@@ -214,7 +215,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_publisher", funnel=funnel) as publisher,
     ):
-        node.create_subscription(String, "/funnel_publisher/funnel", hear, qos.DOCUMENT)
+        node.create_subscription(String, "/funnel_publisher/design", hear, qos.DOCUMENT)
         spin_until(lambda: len(heard) == 1)
         good, bad = (str(tmp_path / place / documents.FUNNEL) for place in ("good", "forged"))
         assert "not the funnel this proof is about" in set_parameter(
@@ -229,7 +230,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
 @pytest.mark.parametrize("name", ["funnel_publisher", "funnel_monitor", "tracking_controller"])
 def test_a_node_goes_through_its_lifecycle_again_and_again(funnel: Path, name: str) -> None:
     own = {
-        "funnel_publisher": "/funnel_publisher/funnel",
+        "funnel_publisher": "/funnel_publisher/design",
         "funnel_monitor": "/funnel_monitor/margin",
         "tracking_controller": "/tracking_controller/run",
     }[name]
