@@ -6,8 +6,8 @@ Latency is from the sending of a sample, whose stamp is on an exact grid, to its
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
 the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
-the priority that a robot gives them. The monitor runs on a funnel made for timing: its horizon is as long as
-the run.
+the priority that a robot gives them. The monitor runs on a funnel made for timing:
+its horizon is as long as the run.
 """
 
 import os

@@ -118,7 +118,7 @@ class Check:
     def __init__(self, text: str) -> None:
         self.text = text
         self._ends = time.monotonic() + MAX_TIME
-        self._answer = tempfile.TemporaryFile()
+        self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - until close
         with tempfile.TemporaryFile() as question:
             question.write(text.encode("utf-8", "replace"))
             question.seek(0)

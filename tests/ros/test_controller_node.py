@@ -143,7 +143,7 @@ def test_a_state_that_is_no_number_stops_it(stage: Callable[..., Stage]) -> None
 
 
 def test_another_design_in_mid_run_stops_it_and_the_same_one_again_does_not(
-    stage: Callable[..., Stage], funnel: Path, tmp_path: Path
+    stage: Callable[..., Stage], tmp_path: Path
 ) -> None:
     robot = stage(folder=tmp_path)
     robot.track()
