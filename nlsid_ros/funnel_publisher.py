@@ -2,8 +2,8 @@
 
 Publishes ~/design (std_msgs/String, transient local): the files of model, policy, funnel and proof
 as one bundle, which whoever uses it has decided again; ~/tube (visualization_msgs/MarkerArray) and
-~/nominal (trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses what is
-not proved: one error on /diagnostics, and exit status 1 if it is the first.
+~/nominal (trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses
+what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
 import sys
