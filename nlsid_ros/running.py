@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -17,6 +19,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,6 +28,7 @@ from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
+CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
@@ -53,6 +57,9 @@ class ManagedNode(LifecycleNode):
         self.autostart = bool(
             declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
         )
+        self._started_itself = False
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self.failure: Exception | None = None
         self._running = False
         self._made_before: set[object] = set()
@@ -75,6 +82,35 @@ class ManagedNode(LifecycleNode):
     def tunable(self) -> dict[str, Any]:
         """The tunable parameters' values."""
         return {d.name: self.get_parameter(d.name).value for d in self.declared if d.tunable}
+
+    def start_itself(self) -> None:
+        """Configure and activate without a manager; raises what made it fail."""
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS and self.failure is not None:
+                raise self.failure
+        self._started_itself = True
+
+    def _on_change_state(
+        self, request: ChangeState.Request, answer: ChangeState.Response
+    ) -> ChangeState.Response:
+        """As rclpy does it, which ends the process where the state has no such transition.
+
+        A manager brings up what it believes unconfigured; a node that started itself goes back
+        there once, so that both can be used.
+        """
+        label = request.transition.label
+        wanted = label == "configure" if label else request.transition.id == CONFIGURE
+        if wanted and self._started_itself:
+            self._started_itself = False
+            self.trigger_deactivate()
+            self.trigger_cleanup()
+        try:
+            done: ChangeState.Response = self._change_state(request, answer)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(f"transition refused: {error}")
+            answer.success = False
+            return answer
+        return done
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: unconfigured to inactive."""
@@ -166,9 +202,7 @@ def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
     try:
         node = make()
         if node.autostart:
-            for transition in (node.trigger_configure, node.trigger_activate):
-                if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
-                    raise node.failure
+            node.start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         _spin_until_signalled(node, woken)
