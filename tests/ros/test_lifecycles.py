@@ -75,7 +75,11 @@ def test_a_node_goes_through_its_lifecycle_twice(name: str, tmp_path: Path) -> N
                 assert source.ending is None
 
 
-ALL = {**NODES, "funnel_monitor": {}, "tracking_controller": {"highest": 0.4}}
+ALL: dict[str, dict[str, object]] = {
+    **NODES,
+    "funnel_monitor": {},
+    "tracking_controller": {"highest": 0.4},
+}
 ALL["plant"] = {"kind": "pendulum"}
 
 
@@ -91,7 +95,10 @@ def asked(
 
 def settings_of(name: str, folder: Path) -> dict[str, object]:
     """What it needs to start."""
-    own = {"trajectory_recorder": {"bag": folder / "run"}, "model_identifier": {"out": folder}}
+    own: dict[str, dict[str, object]] = {
+        "trajectory_recorder": {"bag": folder / "run"},
+        "model_identifier": {"out": folder},
+    }
     return {**ALL[name], **own.get(name, {})}
 
 
