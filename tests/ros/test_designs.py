@@ -31,7 +31,7 @@ def robot(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Robot]:
     use_domain_of_this_run(monkeypatch)
     with ExitStack() as stack:
         node, spin_until = stack.enter_context(node_here("test_robot"))
-        stack.enter_context(process(MONITOR, stale_after=5.0))
+        stack.enter_context(process(MONITOR, stale_after=5.0, allow_old_stamps=True))
         stack.enter_context(process(CONTROLLER, highest=0.4, stale_after=5.0))
         robot = Robot(node, spin_until, funnel.parent)
         robot.ready()

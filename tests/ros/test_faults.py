@@ -31,7 +31,7 @@ def robot(funnel: Path) -> Iterator[Robot]:
         use_domain_of_this_run(patch)
         with (
             node_here("test_robot") as (node, spin_until),
-            process(MONITOR, stale_after=0.5) as monitor,
+            process(MONITOR, stale_after=0.5, allow_old_stamps=True) as monitor,
         ):
             yield Robot(node, spin_until, funnel.parent)
             stop(monitor)
@@ -100,7 +100,7 @@ def test_a_second_publisher_between_the_samples_is_not_mistaken_for_the_robot(
 
 
 def test_two_monitors_say_the_same(robot: Robot) -> None:
-    with process(MONITOR, __node="second_monitor") as second:
+    with process(MONITOR, __node="second_monitor", allow_old_stamps=True) as second:
         robot.ready(monitors=2)
         robot.spin_until(lambda: robot.has_said(" yet", "second_monitor"))
         robot.restart()
@@ -175,7 +175,7 @@ def test_an_array_of_another_length_is_named_and_ends_the_run(
     design = timing_funnel(1.0)
     with (
         node_here("test_joints") as (node, spin_until),
-        process(MONITOR, source="/benchmark", stale_after=5.0) as monitor,
+        process(MONITOR, source="/benchmark", stale_after=5.0, allow_old_stamps=True) as monitor,
     ):
         latched = node.create_publisher(String, "/benchmark/design", qos.DOCUMENT)
         latched.publish(String(data=bundle_of(design).text()))
