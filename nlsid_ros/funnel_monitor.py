@@ -250,8 +250,7 @@ class FunnelMonitor(ManagedNode):
             self._publish(watch.excitation(stamp_ns, value))
             return
         if not logged and (reason := self._distrust(stamp_ns, message)):
-            watch.response(stamp_ns, value)
-            self._publish(watch.missing(reason))
+            self._publish(watch.refuse(stamp_ns, reason))
             return
         self._heard_ns = self._patience.now().nanoseconds
         if self._stale.is_canceled():

@@ -120,6 +120,11 @@ class Watch:
         reading = self.monitor.missing(t, reason)
         return [Stamped(self._newest_ns, reading, self._alarm.update(reading))]
 
+    def refuse(self, stamp_ns: int, reason: str) -> list[Stamped]:
+        """A response that is not to be judged: unknown from here on."""
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        return self.missing(reason)
+
     def _judge(self, samples: Sequence[Sample]) -> list[Stamped]:
         judged = []
         for sample in samples:
