@@ -31,7 +31,7 @@ from bags.signals.recording import Recording
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.polling import Polled, Received
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
@@ -297,7 +297,7 @@ class TrajectoryRecorder(ManagedNode):
         if recording is not None and recording.ended:
             level, text = DiagnosticStatus.ERROR, recording.ended
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, NAME, level, text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def _answering(
