@@ -64,11 +64,11 @@ def run(name: str, starts: int) -> tuple[FunnelDesign, dict[str, Any]]:
         "process_seconds": used,
         "check_seconds": check_seconds,
         "proof_mb": megabytes,
-        "pieces": len(design.proved.pieces),
+        "pieces": len(design.found.proved.pieces),
         "modes": len(design.policy.modes()),
         "margin": float(verdict.margin),
         "proved": True,  # `check` raises otherwise
-        "remainder_covered": encloses(design.field, example.truth, rng),
+        "remainder_covered": encloses(design.model, example.truth, rng),
         "assumptions": list(verdict.assumptions),
         "half_widths_at_start": np.sqrt(np.diag(np.linalg.inv(design.funnel.shape(0.0)))).tolist(),
         "starts": sum(found.starts for found in runs),

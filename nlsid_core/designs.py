@@ -12,8 +12,9 @@ from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.linear import LinearPolicy
@@ -26,9 +27,9 @@ POLICY = "policy.json"
 FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
 
-D = TypeVar("D", bound=DifferenceEquation | MeasuredState | VectorField)
-P = TypeVar("P", bound=LinearPolicy | SampledPolicy | ContinuousPolicy)
-F = TypeVar("F", bound=LinearFunnel | SampledFunnel | ContinuousFunnel)
+D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
+P = TypeVar("P", bound=LinearPolicy | SampledPolicy | ContinuousPolicy | None)
+F = TypeVar("F", bound=LinearFunnel | SampledFunnel | ContinuousFunnel | TubeFunnel)
 S = TypeVar("S")
 
 
@@ -36,7 +37,8 @@ S = TypeVar("S")
 class Design(Generic[D, P, F, S]):
     """What a robot runs and is held against, and the verdict of the kernel about it.
 
-    model: of the robot, or its vector field in continuous time. claim: its kind, and what it states
+    model: of the robot, or its vector field in continuous time. policy: None where the funnel is
+    around the model itself, whatever drives it. claim: its kind, and what it states
     beside these files; proof: the witnesses. found: what the search leaves beside them; nothing of
     a design that was read from files.
     """
@@ -67,7 +69,7 @@ class Design(Generic[D, P, F, S]):
         return proofs.decide(documents[PROOF], documents)
 
     def documents(self) -> dict[str, Json]:
-        """The content of its four files by name, the proof last."""
+        """The content of its files by name, the proof last."""
         documents = _documents(self.model, self.policy, self.funnel)
         return documents | {PROOF: _proof_document(documents, self.claim, self.proof)}
 
@@ -96,13 +98,13 @@ def load_design(folder: Path | str) -> AnyDesign:
     document = _read(path, verdict.digests["proof"])
     about = document["claim"]["about"]
     dynamics = "vector_field" if "vector_field" in about else "model"
-    if set(about) != {dynamics, "policy", "funnel"}:
+    if set(about) not in ({dynamics, "policy", "funnel"}, {"model", "funnel"}):
         raise DocumentError(f"{path} is about {', '.join(about)}, not about one funnel")
-    nouns: list[Any] = []
-    for role in (dynamics, "policy", "funnel"):
+    nouns: dict[str, Any] = {"policy": None}
+    for role in about:
         file = path.with_name(about[role]["file"])
-        nouns.append(read(_read(file, verdict.digests[role]), source=str(file)))
-    model, policy, funnel = nouns
+        nouns[role] = read(_read(file, verdict.digests[role]), source=str(file))
+    model, policy, funnel = nouns[dynamics], nouns["policy"], nouns["funnel"]
     claim = {key: part for key, part in document["claim"].items() if key != "about"}
     return Design(model, policy, funnel, claim, document["proof"], verdict, None)
 
@@ -118,7 +120,10 @@ def _read(path: Path, digest: str) -> Json:
 def _documents(model: Any, policy: Any, funnel: Any) -> dict[str, Json]:
     """The documents by file name."""
     name = VECTOR_FIELD if isinstance(model, VectorField) else MODEL
-    return {name: model.document(), POLICY: policy.document(), FUNNEL: funnel.document()}
+    documents: dict[str, Json] = {name: model.document()}
+    if policy is not None:
+        documents[POLICY] = policy.document()
+    return documents | {FUNNEL: funnel.document()}
 
 
 def _proof_document(documents: dict[str, Json], claim: Json, proof: Json) -> Json:

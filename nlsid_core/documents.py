@@ -12,6 +12,7 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import (
     BlockCascade,
     DifferenceEquation,
@@ -27,7 +28,7 @@ from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 
 Noun: TypeAlias = (
-    ContinuousFunnel | SampledFunnel | LinearFunnel
+    ContinuousFunnel | SampledFunnel | LinearFunnel | TubeFunnel
     | ContinuousPolicy | SampledPolicy | LinearPolicy | VectorField
     | BlockCascade | DifferenceEquation | ImplicitModel | MonotoneEquation | StateAffineModel
     | StateModel | TrapezoidalModel
@@ -41,6 +42,7 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
         ("nlsid/vector_field", None): VectorField.from_document,
         ("nlsid/funnel", "linear"): LinearFunnel.from_document,
         ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
+        ("nlsid/funnel", "tube"): TubeFunnel.from_document,
         ("nlsid/policy", "linear"): LinearPolicy.from_document,
         ("nlsid/policy", "sampled"): SampledPolicy.from_document,
         ("nlsid/model", "block_cascade"): BlockCascade.from_document,

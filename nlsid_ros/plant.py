@@ -20,6 +20,7 @@ from std_srvs.srv import Trigger
 from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
 from bags.designs.documents import load_model
+from bags.signals.expressions import Expression
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core.arrays import FloatArray
@@ -77,7 +78,8 @@ class PlantNode(ManagedNode):
         command: SignalPath | SignalVector
         if self._kind == "model":
             model = load_model(Path(self._model))
-            response, command = SignalPath.parse(model.y.path), SignalPath.parse(model.u.path)
+            response = Expression.parse(model.y.path).path
+            command = Expression.parse(model.u.path).path
             inputs, spread = 1, [self._noise]
         else:
             inputs = len(self._plant.measure(np.zeros(1))) // 2

@@ -1,5 +1,7 @@
 """The YAML configuration of one robot: which signals, which split, which model, which tube."""
 
+from collections.abc import Iterator
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -8,6 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from bags.chain.identification_config import Identification
 from bags.chain.sections import (
     Corner,
+    Key,
     Names,
     NonNegative,
     Positive,
@@ -15,7 +18,13 @@ from bags.chain.sections import (
     SignalConfig,
     read_yaml,
 )
+from bags.signals.expressions import Expression
+from bags.signals.sampling import Sampler, sampled_path
+from nlsid_core.errors import BagError, DataError
+from nlsid_core.identification import BlockCascadeClass, LinearClass
 from nlsid_core.running.comparison import Centre
+
+ONE_BY_ONE = (LinearClass, BlockCascadeClass)  # classes of one response and one excitation
 
 
 def _listed(value: object) -> object:
@@ -34,36 +43,58 @@ Values = Annotated[tuple[object, ...], Field(min_length=1, strict=False)]
 class SignalsConfig(Section):
     """The responses that are modelled and the excitations that drive them: one, or a list."""
 
-    response: Signals
-    excitation: Signals
+    response: Annotated[Signals, Key("what is measured and modelled")]
+    excitation: Annotated[Signals, Key("what drives the robot")]
 
 
 class GridConfig(Section):
-    """period: s between samples. max_gap: s without a response that is still filled in.
+    """How the numbers in messages become samples (`bags.signals.sampling`)."""
 
-    resample: `none`, responses are samples as they come, a period apart; `last` or `linear`, they
-    are put on a grid of the period, the latest value or one on the line between two values at most
-    max_gap apart (`bags.signals.sampling`). hold: s for which a command is held (default: max_gap).
-    split_gaps: cut a trial where a signal is missing for longer, or is NaN, and count what is
-    skipped, instead of refusing it.
-    """
-
-    period: Positive
-    max_gap: Positive
-    resample: Literal["none", "last", "linear"] = "none"
-    hold: Positive | None = None
-    split_gaps: bool = False
+    period: Annotated[Positive, Key("between samples", unit="s", example=0.025)]
+    max_gap: Annotated[
+        Positive,
+        Key("without a response that is still filled in or resampled over", unit="s", example=0.1),
+    ]
+    resample: Annotated[
+        Literal["none", "last", "linear"],
+        Key(
+            "`none`: responses are samples as they come, a period apart; `last` or `linear`: they "
+            "are put on a grid of the period, the latest value or one on the line between two",
+            example="linear",
+        ),
+    ] = "none"
+    hold: Annotated[
+        Positive | None,
+        Key("for which a command is held (null: as long as max_gap)", unit="s", example=0.5),
+    ] = None
+    split_gaps: Annotated[
+        bool,
+        Key(
+            "cut a trial where a signal is missing for longer, or is NaN, and count what is "
+            "skipped, instead of refusing it",
+            example=True,
+        ),
+    ] = False
 
 
 class SplitConfig(Section):
-    """What is only used to score (test) or to choose (validation): bags by name.
+    """What the model is not fitted to: bags by name."""
 
-    share: instead of test bags, the end of every bag of this share of it.
-    """
-
-    test: Names = ()
-    validation: Names = ()
-    share: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    test: Annotated[Names, Key("bags that only score the models", example=["trial_05"])] = ()
+    validation: Annotated[
+        Names, Key("bags by which orders, knots and bases are chosen", example=["trial_06"])
+    ] = ()
+    calibration: Annotated[
+        Names,
+        Key(
+            "bags that scale the level of the tube; without any, every second training trial does",
+            example=["trial_07"],
+        ),
+    ] = ()
+    share: Annotated[
+        Annotated[float, Field(gt=0.0, lt=1.0)] | None,
+        Key("instead of test bags, the end of every bag of this share of it", example=0.2),
+    ] = None
 
     @model_validator(mode="after")
     def _one_of_them(self) -> "SplitConfig":
@@ -75,8 +106,8 @@ class SplitConfig(Section):
 class LqrConfig(Section):
     """Weights of the output's error and of the input's deviation."""
 
-    output_weight: Positive = 1.0
-    input_weight: Positive = 1.0
+    output_weight: Annotated[Positive, Key("of the output's squared error", example=1.0)] = 1.0
+    input_weight: Annotated[Positive, Key("of the input's squared deviation", example=1.0)] = 1.0
 
 
 def _none_word(value: object) -> object:
@@ -84,21 +115,68 @@ def _none_word(value: object) -> object:
 
 
 class FunnelConfig(Section):
-    """The tube: see `nlsid_core.funnels.design_tube`. policy: None is K = 0."""
+    """The tube that `nlsid funnel` designs."""
 
-    horizon: Positive
-    safety_factor: float = Field(default=1.5, ge=1.0, allow_inf_nan=False)
-    inlet: NonNegative = 0.0
-    policy: Annotated[LqrConfig | None, BeforeValidator(_none_word)] = LqrConfig()
-    profile: tuple[Corner, ...] = Field(min_length=2, strict=False)
+    horizon: Annotated[
+        Positive, Key("how long the disturbance budget has to last", unit="s", example=2.9)
+    ]
+    safety_factor: Annotated[
+        float,
+        Field(ge=1.0, allow_inf_nan=False),
+        Key("on the disturbance's amplitude, over the largest that was measured", example=1.5),
+    ] = 1.5
+    inlet: Annotated[
+        NonNegative,
+        Key("allowed initial error", unit="the response's unit", example=0.02),
+    ] = 0.0
+    policy: Annotated[
+        LqrConfig | None,
+        BeforeValidator(_none_word),
+        Key("weights of an LQR, or `none` for a prediction tube", example="none"),
+    ] = LqrConfig()
+    profile: Annotated[
+        Annotated[tuple[Corner, ...], Field(min_length=2, strict=False)] | None,
+        Key(
+            "corners [time, output] that the LQR policy tracks; `policy: none` needs none",
+            unit="[s, the response's unit]",
+            example=[[0.0, 0.0], [2.9, 0.35]],
+        ),
+    ] = None
+
+    @model_validator(mode="after")
+    def _profile_to_track(self) -> "FunnelConfig":
+        if self.profile is None:
+            if self.policy is not None:
+                raise ValueError(
+                    "an LQR policy tracks a profile: give `profile`, or `policy: none` for a tube "
+                    "around the motion that the received commands give"
+                )
+            return self
+        times = [time for time, _ in self.profile]
+        if any(later <= time for time, later in pairwise(times)):
+            raise ValueError(f"profile: times should increase; they are {times}")
+        return self
 
 
 class MonitorConfig(Section):
-    """nominal: what the tube is around; stale_after, command_wait: s, for the live monitor."""
+    """What the monitor compares with, and how long it waits."""
 
-    nominal: Literal["command", "profile"] = "command"
-    stale_after: Positive = 0.1
-    command_wait: NonNegative = 0.02
+    nominal: Annotated[
+        Literal["command", "profile"],
+        Key(
+            "what the tube is around: the model driven by the received commands, or the policy's "
+            "plan",
+            example="command",
+        ),
+    ] = "command"
+    stale_after: Annotated[
+        Positive,
+        Key("without a response after which the state is unknown", unit="s", example=0.1),
+    ] = 0.1
+    command_wait: Annotated[
+        NonNegative,
+        Key("for which a response waits for a command with its stamp", unit="s", example=0.02),
+    ] = 0.02
 
     @property
     def nominal_source(self) -> Centre:
@@ -107,35 +185,162 @@ class MonitorConfig(Section):
 
 
 class Config(Section):
-    """One robot's configuration file.
+    """One robot's configuration file."""
 
-    clock: the stamps of the signals, `header` or, where some have none, `log`: the times at which
-    they were logged. definitions: .msg files or packages' folders that define types which the bags
-    do not, seen from the configuration. select: values of the identification's options for
-    `nlsid select` to try. compare: what `nlsid compare` scores (default: the identification).
-    funnel: for `nlsid funnel`.
-    """
-
-    robot: str
-    signals: SignalsConfig
-    clock: Clock = "header"
-    definitions: Files = ()
-    grid: GridConfig
-    split: SplitConfig = SplitConfig()
-    identification: Identification
-    select: dict[str, Values] | None = None
-    compare: Annotated[tuple[Identification, ...], Field(strict=False)] = ()
-    funnel: FunnelConfig | None = None
-    monitor: MonitorConfig = MonitorConfig()
+    robot: Annotated[str, Key("what people call it", example="F1TENTH car, speed")]
+    signals: Annotated[SignalsConfig, Key("which numbers are modelled, and which drive them")]
+    clock: Annotated[
+        Clock,
+        Key(
+            "the signals' stamps: their messages' `header`, or, where some have none, `log`, the "
+            "times of logging, live of arrival",
+            example="log",
+        ),
+    ] = "header"
+    definitions: Annotated[
+        Files,
+        Key(
+            ".msg files or packages' folders that define types which the bags do not, seen from "
+            "the configuration",
+            example=["my_msgs/msg/Command.msg"],
+        ),
+    ] = ()
+    grid: Annotated[GridConfig, Key("how the numbers in messages become samples")]
+    split: Annotated[SplitConfig, Key("what the model is not fitted to")] = SplitConfig()
+    identification: Annotated[
+        Identification, Key("the class of models and the method", example={"lags": 4})
+    ]
+    select: Annotated[
+        dict[str, Values] | None,
+        Key(
+            "values of the identification's options for `nlsid select` to try",
+            example={"lags": [1, 2, 3, 4]},
+        ),
+    ] = None
+    compare: Annotated[
+        tuple[Identification, ...],
+        Field(strict=False),
+        Key(
+            "sections like `identification` that `nlsid compare` scores (default: that one)",
+            example=[{"lags": 2}, {"model": "monotone", "lags": 2}],
+        ),
+    ] = ()
+    funnel: Annotated[FunnelConfig | None, Key("the tube, for `nlsid funnel`")] = None
+    monitor: Annotated[MonitorConfig, Key("how a robot is held against it")] = MonitorConfig()
 
 
 def load_config(path: Path | str) -> Config:
     """Read and check a configuration; DataError lists every wrong key with where it stands.
 
-    OS errors pass through.
+    What no later step could use is refused too (`refusals`). OS errors pass through.
     """
     config = read_yaml(path, Config)
     folder = Path(path).parent
+    if found := refusals(config):
+        said = "\n".join(f"  {what}" for what in found)
+        raise DataError(f"{path}: a later step could not use it:\n{said}")
     return config.model_copy(
         update={"definitions": tuple(folder / given for given in config.definitions)}
     )
+
+
+def refusals(config: Config) -> list[str]:
+    """What a step after this one would refuse, each with the key, the reason and what to do."""
+    return [*_signal_refusals(config), *_time_refusals(config), *_model_refusals(config)]
+
+
+def signal_texts(config: Config) -> tuple[list[str], list[str]]:
+    """Responses and excitations as the steps read them, with clock, holding and resampling."""
+    grid, clock = config.grid, config.clock
+    return (
+        [
+            sampled_path(
+                s.path, clock=clock, resample=grid.resample, max_gap=grid.max_gap, response=True
+            )
+            for s in config.signals.response
+        ],
+        [
+            sampled_path(s.path, clock=clock, hold=grid.hold or grid.max_gap, response=False)
+            for s in config.signals.excitation
+        ],
+    )
+
+
+def _signal_refusals(config: Config) -> Iterator[str]:
+    named = {"response": config.signals.response, "excitation": config.signals.excitation}
+    seen: dict[str, str] = {}
+    sound = True
+    for role, signals in named.items():
+        for place, signal in enumerate(signals):
+            where = f"signals.{role}" + (f".{place}" if len(signals) > 1 else "")
+            for what, text in (("path", signal.path), ("name", signal.name)):
+                if text in seen:
+                    yield f"{where}.{what}: '{text}' is that of {seen[text]} too"
+                seen[text] = where
+            try:
+                several = Expression.parse(signal.path).path.every
+            except BagError as error:
+                sound = False
+                yield f"{where}.path: {error}"
+                continue
+            if several:
+                sound = False
+                yield f"{where}.path: {signal.path} is several signals; name one element for each"
+    if sound:
+        try:
+            Sampler(*signal_texts(config), period=config.grid.period)
+        except BagError as error:
+            yield f"signals: {error}"
+
+
+def _time_refusals(config: Config) -> Iterator[str]:
+    period, max_gap = config.grid.period, config.grid.max_gap
+    if max_gap < period:
+        yield (
+            f"grid.max_gap: {max_gap:g} s is shorter than the period, {period:g} s, so that every "
+            "sample would be in a gap; give at least 1.5 periods"
+        )
+    if config.monitor.stale_after <= period:
+        yield (
+            f"monitor.stale_after: {config.monitor.stale_after:g} s is not longer than the period, "
+            f"{period:g} s, so that the live monitor would call every response stale; give at "
+            "least 2 periods"
+        )
+    if config.funnel is not None and round(config.funnel.horizon / period) < 1:
+        yield (
+            f"funnel.horizon: {config.funnel.horizon:g} s is not one sample of {period:g} s; give "
+            "the length of a run"
+        )
+    for use, other in combinations(("test", "validation", "calibration"), 2):
+        if twice := set(getattr(config.split, use)) & set(getattr(config.split, other)):
+            yield f"split: '{min(twice)}' is named for {use} and for {other}"
+
+
+def _model_refusals(config: Config) -> Iterator[str]:
+    counts = len(config.signals.response), len(config.signals.excitation)
+    said = f"{counts[0]} responses and {counts[1]} excitations"
+    kind = type(config.identification.model_class)
+    if kind in ONE_BY_ONE and counts != (1, 1):
+        yield (
+            f"identification.model: a {kind.__name__} has one response and one excitation, not "
+            f"{said}; take state_affine or implicit, or leave out signals"
+        )
+    elif config.funnel is not None and (kind is not LinearClass or counts != (1, 1)):
+        yield (
+            "funnel: a tube is designed for `model: linear` with one response and one excitation, "
+            f"not for a {kind.__name__} with {said}; leave out the section `funnel`, or use "
+            "`nlsid track` for a measured state"
+        )
+    if kind is BlockCascadeClass and not config.split.validation:
+        yield "split.validation: a block_cascade chooses its knots on validation trials; name bags"
+    for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):
+        given = getattr(config.identification.model_class, key, None)
+        if given is not None and len(given) not in options:
+            yield (
+                f"identification.{key}: {len(given)} pairs [low, high] for {said}; it needs "
+                f"{options[0]}"
+            )
+    try:
+        config.identification.each(config.select or {})
+    except DataError as error:
+        yield str(error)

@@ -18,6 +18,7 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from bags.chain.sections import UNKNOWN_KEY, problems
+from bags.recordings.names import did_you_mean
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
@@ -113,54 +114,67 @@ class IdentificationConfig:
 
 
 def _read(section: object) -> IdentificationConfig:
-    """The section as the dataclasses that it names; ValidationError says what is wrong where."""
+    """The section as the dataclasses that it names; ValidationError says all that is wrong."""
     if isinstance(section, IdentificationConfig):
         return section
     if not isinstance(section, dict):
-        raise _wrong((), section, "should be keys and values, such as `lags: 4`")
+        raise _error(_wrong((), section, "should be keys and values, such as `lags: 4`"))
     left = dict(section)
     name = left.pop("model", "linear")
     kind = CLASSES.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise _wrong((), section, f"there is no such model; there are: {', '.join(CLASSES)}")
-    own = {key: left.pop(key) for key in OWN if key in left}
+        near = did_you_mean(str(name), CLASSES)
+        what = f"there is no such model; there are: {', '.join(CLASSES)}{near}"
+        raise _error(_wrong((), section, what))
+    wrong: list[InitErrorDetails] = []
+    own = _values(OWN, {key: left.pop(key) for key in OWN if key in left}, wrong)
     method_name = left.pop("method", None)
-    of_class = {f.name: left.pop(f.name) for f in fields(kind) if f.name in left}
-    model_class = _made(kind, of_class)
-    known = {method.name: method for method in methods_of(model_class)}
+    model_class = _made(kind, {k: left.pop(k) for k in _names(kind) if k in left}, wrong)
+    known = {
+        m.name: m for m in (METHODS.values() if model_class is None else methods_of(model_class))
+    }
     chosen = next(iter(known)) if method_name is None else method_name
-    if chosen not in METHODS:
-        raise _wrong(("method",), chosen, f"should be {_listed(known)}")
-    if chosen not in known:
-        raise _wrong(("method",), chosen, f"is not for this model class: {_listed(known)}")
-    of_method = {f.name: left.pop(f.name) for f in fields(known[chosen]) if f.name in left}
+    if not isinstance(chosen, str) or chosen not in known:
+        what = "is not for this model class:" if chosen in [*METHODS] else "should be"
+        wrong.append(_wrong(("method",), chosen, f"{what} {_listed(known)}"))
+        raise _error(*wrong)
+    method_kind = known[chosen]
+    method = _made(method_kind, {k: left.pop(k) for k in _names(method_kind) if k in left}, wrong)
+    if model_class is None and method_name is None:  # then the method, and its keys, are not known
+        left = {k: v for k, v in left.items() if not any(k in _names(m) for m in METHODS.values())}
+    keys = ", ".join(["model", *_names(kind), "method", *_names(method_kind), *OWN])
     for key in left:
-        keys = ["model", *_names(kind), "method", *_names(known[chosen]), *OWN]
-        details = {"key": str(key), "known": ", ".join(keys)}
-        raise _wrong((), section, "there is no such key; there are: {known}", UNKNOWN_KEY, details)
-    return IdentificationConfig(
-        model_class, _made(known[chosen], of_method), section, **_values(OWN, own)
-    )
+        details = {"key": str(key), "known": keys}
+        wrong.append(_wrong((), section, "there is no such key", UNKNOWN_KEY, details))
+    if wrong or model_class is None or method is None:
+        raise _error(*wrong)
+    return IdentificationConfig(model_class, method, section, **own)
 
 
 Identification = Annotated[IdentificationConfig, PlainValidator(_read)]
 
 
-def _made(kind: Any, given: dict[str, object]) -> Any:
-    """An instance with these options, each of the type that its field declares."""
+def _made(kind: Any, given: dict[str, object], wrong: list[InitErrorDetails]) -> Any:
+    """An instance with these options, each of the type that its field declares; None if wrong."""
+    before = len(wrong)
     hints = {key: hint for key, hint in get_type_hints(kind).items() if key in given}
-    required = [f.name for f in fields(kind) if f.default is MISSING and f.name not in given]
-    if required:
-        raise _wrong((required[0],), given, "Field required")
+    missing = [f.name for f in fields(kind) if f.default is MISSING and f.name not in given]
+    wrong.extend(_wrong((key,), given, "Field required") for key in missing)
+    values = _values(hints, given, wrong)
+    if len(wrong) > before:
+        return None
     try:
-        return kind(**_values(hints, given))
+        return kind(**values)
     except OptionError as error:
-        raise _wrong((error.key,), given[error.key], f"should be {error.allowed}") from error
+        wrong.append(_wrong((error.key,), given.get(error.key), f"should be {error.allowed}"))
     except DataError as error:
-        raise _wrong((), given, str(error)) from error
+        wrong.append(_wrong((), given, str(error)))
+    return None
 
 
-def _values(hints: Mapping[str, Any], given: Mapping[str, object]) -> dict[str, Any]:
+def _values(
+    hints: Mapping[str, Any], given: Mapping[str, object], wrong: list[InitErrorDetails]
+) -> dict[str, Any]:
     """The values as the types say; a list is a tuple, and nothing else is converted."""
     values = {}
     for key, value in given.items():
@@ -172,7 +186,7 @@ def _values(hints: Mapping[str, Any], given: Mapping[str, object]) -> dict[str, 
         except ValidationError as error:
             first = error.errors()[0]
             where = [part for part in first["loc"] if isinstance(part, int)]
-            raise _wrong((key, *where), value, first["msg"]) from error
+            wrong.append(_wrong((key, *where), value, first["msg"]))
     return values
 
 
@@ -194,7 +208,10 @@ def _wrong(
     message: str,
     kind: str = "wrong_option",
     details: dict[str, Any] | None = None,
-) -> ValidationError:
+) -> InitErrorDetails:
     error = PydanticCustomError(kind, message, details)
-    line = InitErrorDetails(type=error, loc=where, input=found)
-    return ValidationError.from_exception_data("identification", [line])
+    return InitErrorDetails(type=error, loc=where, input=found)
+
+
+def _error(*wrong: InitErrorDetails) -> ValidationError:
+    return ValidationError.from_exception_data("identification", list(wrong))

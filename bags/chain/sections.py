@@ -1,18 +1,33 @@
 """Sections of YAML configurations: strict, and explained when they are wrong."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
+from bags.recordings.names import did_you_mean
 from nlsid_core.errors import DataError
 from nlsid_core.models import Signal
 
 MAX_CONFIG_BYTES = 2**20  # a configuration is a page of text
 UNKNOWN_KEY = "unknown_key"
+
+
+@dataclass(frozen=True)
+class Key:
+    """What a key is for, its unit, and a value it may have: for docs/configuration.md and people.
+
+    A section's keys carry one each, in their `Annotated` types.
+    """
+
+    text: str
+    unit: str = ""
+    example: object = None
+
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -25,27 +40,20 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unknown_keys(cls, content: Any) -> Any:
-        if isinstance(content, dict):
-            known = list(cls.model_fields)
-            for key in content:
-                if key not in known:
-                    raise PydanticCustomError(
-                        UNKNOWN_KEY,
-                        "there is no such key; there are: {known}",
-                        {"key": str(key), "known": ", ".join(known)},
-                    )
-        return content
-
 
 class SignalConfig(Section):
-    """A signal: its name and unit for people, and `topic:field.path[index]`."""
+    """A signal, for people and where it is found."""
 
-    name: str
-    unit: str = ""
-    path: str
+    name: Annotated[str, Key("what people call it", example="speed")]
+    unit: Annotated[str, Key("what its numbers are in, for people", example="m/s")] = ""
+    path: Annotated[
+        str,
+        Key(
+            "`topic:field.path[index]`, or `[name=elbow]`, and what is done to it, `|unwrap`, "
+            "`|derivative(0.2 s)`",
+            example="/odom:twist.twist.linear.x",
+        ),
+    ]
 
     def signal(self) -> Signal:
         """The same as the core's noun."""
@@ -72,21 +80,65 @@ def read_yaml(path: Path | str, kind: type[AnySection]) -> AnySection:
     try:
         return kind.model_validate(content)
     except ValidationError as error:
-        raise DataError(f"{path}: not a valid configuration:\n{problems(error)}") from error
+        raise DataError(f"{path}: not a valid configuration:\n{problems(error, kind)}") from error
 
 
-def problems(error: ValidationError, *, prefix: Sequence[str] = ()) -> str:
-    """A line for each wrong key: where it stands, what is allowed there, what was found."""
-    return "\n".join(f"  {_problem(details, prefix)}" for details in error.errors())
+def problems(
+    error: ValidationError, kind: type[Section] | None = None, *, prefix: Sequence[str] = ()
+) -> str:
+    """A line for each wrong key: where it stands, what is allowed there, what was found.
+
+    kind: the section that the error is about, whose keys and units are then said.
+    """
+    return "\n".join(f"  {_problem(details, kind, prefix)}" for details in error.errors())
 
 
-def _problem(details: ErrorDetails, prefix: Sequence[str]) -> str:
+def sections_in(annotation: Any) -> list[type[Section]]:
+    """The sections that a value of this type may be, in lists and unions too."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [found for part in get_args(annotation) for found in sections_in(part)]
+
+
+def _problem(details: ErrorDetails, kind: type[Section] | None, prefix: Sequence[str]) -> str:
     where = [str(part) for part in (*prefix, *details["loc"])]
-    found = details["input"]
+    found, message = details["input"], details["msg"].removeprefix("Value error, ")
     if details["type"] == UNKNOWN_KEY:
-        key = details["ctx"]["key"]
+        key, known = details["ctx"]["key"], details["ctx"]["known"]
         where.append(key)
-        found = found[key]
-    message = details["msg"].removeprefix("Value error, ")
+        found, message = found[key], _no_such_key(key, known.split(", "))
+    elif details["type"] == "extra_forbidden":
+        section, _ = _stands_in(kind, details["loc"])
+        message = _no_such_key(where[-1], section.model_fields if section else ())
+    else:
+        section, key = _stands_in(kind, details["loc"])
+        if section is not None and (unit := _unit(section, key)):
+            message = f"{message}, in {unit}"
     said = f"{'.'.join(where)}: {message}"
     return said if message == "Field required" else f"{said} (found {found!r:.60})"
+
+
+def _no_such_key(key: str, known: Iterable[str]) -> str:
+    known = list(known)
+    return f"there is no such key; there are: {', '.join(known)}{did_you_mean(key, known)}"
+
+
+def _stands_in(
+    kind: type[Section] | None, where: Sequence[str | int]
+) -> tuple[type[Section] | None, str]:
+    """The section in which the last key of `where` stands, and the key; None if it is in none."""
+    section, key = kind, ""
+    for name in (part for part in where if isinstance(part, str)):
+        if key and section is not None:
+            inside = sections_in(section.model_fields[key].annotation)
+            section = inside[0] if inside else None
+        if section is None or (name not in section.model_fields and name != where[-1]):
+            return None, name
+        key = name
+    return section, key
+
+
+def _unit(section: type[Section], key: str) -> str:
+    field = section.model_fields.get(key)
+    found = [entry for entry in (field.metadata if field else ()) if isinstance(entry, Key)]
+    return found[0].unit if found else ""

@@ -1,12 +1,15 @@
 """The chain's offline steps: each takes files, returns what it made, and writes it whole or not."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
+
+import numpy as np
 
 from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
-from bags.chain.training import load_training, save_training
+from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
@@ -30,6 +33,7 @@ class Trials:
     train: Dataset
     test: Dataset
     validation: Dataset | None = None
+    calibration: Dataset | None = None
     skipped: int = 0
     absent: tuple[str, ...] = ()
 
@@ -56,7 +60,7 @@ class Identified:
 def identify_bags(
     bags: Sequence[Path], config: Config, out: Path, *, progress: Progress
 ) -> Identified:
-    """Bags in; model.json, model.proof.json, training.npz and report.html in `out`.
+    """Bags in; model.json, model.proof.json, training.npz, held_back.npz and report.html in `out`.
 
     Raises DataError (BagError for bags) before anything is written.
     """
@@ -80,7 +84,14 @@ def write_identified(
     )
     model: Model = replace(fit.model, training=save_training(training, trials.train))
     files.write_document(path, model.document())
-    written = [path, training]
+    held_back = out / documents.HELD_BACK
+    parts = {"test": trials.test, "calibration": trials.calibration}
+    save_held_back(
+        held_back,
+        {use: data for use, data in parts.items() if data is not None},
+        model=files.digest(model.document()),
+    )
+    written = [path, training, held_back]
     if fit.chosen.proof is None:
         proof.unlink(missing_ok=True)
     else:
@@ -91,7 +102,7 @@ def write_identified(
         written.append(out / documents.REPORT)
         write_report(
             written[-1], fit, trials.train, trials.test,
-            validation=trials.validation, robot=config.robot,
+            validation=trials.validation, calibration=trials.calibration, robot=config.robot,
         )  # fmt: skip
     progress("done", 1.0)
     return Identified(fit, trials, tuple(written))
@@ -120,10 +131,20 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
     )
     labelled = _labelled(dataset, responses, excitations)
     if config.split.share is not None:
-        trials = cut(labelled, config.split.share, validation=config.split.validation)
+        trials = cut(
+            labelled,
+            config.split.share,
+            validation=config.split.validation,
+            calibration=config.split.calibration,
+        )
     else:
-        trials = split(labelled, test=config.split.test, validation=config.split.validation)
-    named = (*config.split.test, *config.split.validation)
+        trials = split(
+            labelled,
+            test=config.split.test,
+            validation=config.split.validation,
+            calibration=config.split.calibration,
+        )
+    named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
     return replace(trials, skipped=skipped_samples(dataset), absent=absent)
 
@@ -139,42 +160,48 @@ def _labelled(
     return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
-def split(dataset: Dataset, *, test: Sequence[str], validation: Sequence[str] = ()) -> Trials:
-    """The trials by name of their bag; DataError if a name is for both, or a part is empty."""
-    if twice := set(test) & set(validation):
-        raise DataError(f"split: '{min(twice)}' is named for test and for validation")
-    chosen = {
-        "test": _of_bags(dataset, test),
-        "validation": _of_bags(dataset, validation),
-    }
+def split(
+    dataset: Dataset,
+    *,
+    test: Sequence[str],
+    validation: Sequence[str] = (),
+    calibration: Sequence[str] = (),
+) -> Trials:
+    """The trials by name of their bag; DataError if a name is for two uses, or a part is empty."""
+    chosen = _held_out(
+        dataset, {"test": test, "validation": validation, "calibration": calibration}
+    )
     present = ", ".join(dataset.names)
     if not chosen["test"]:
         raise DataError(
             "none of the bags is a test trial, so no model can be scored; split.test names "
             f"{', '.join(test) or 'nothing'}, the bags are {present}"
         )
-    if validation and not chosen["validation"]:
-        raise DataError(
-            f"none of the bags is a validation trial; split.validation names "
-            f"{', '.join(validation)}, the bags are {present}"
-        )
-    held_out = [*chosen["test"], *chosen["validation"]]
-    if len(chosen["test"]) == len(dataset):
-        raise DataError("all of the bags are test trials; give some to train on")
+    held_out = [name for names in chosen.values() for name in names]
     if len(held_out) == len(dataset):
-        raise DataError("all of the bags are test or validation trials; give some to train on")
+        uses = [use for use, names in chosen.items() if names]
+        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     return Trials(
         dataset.without(held_out),
         dataset.select(chosen["test"]),
-        dataset.select(chosen["validation"]) if chosen["validation"] else None,
+        _selected(dataset, chosen["validation"]),
+        _selected(dataset, chosen["calibration"]),
     )
 
 
-def cut(dataset: Dataset, share: float, *, validation: Sequence[str] = ()) -> Trials:
-    """Test trials are the `share` at the end of every trial that is not for validation."""
-    held_out = _of_bags(dataset, validation)
+def cut(
+    dataset: Dataset,
+    share: float,
+    *,
+    validation: Sequence[str] = (),
+    calibration: Sequence[str] = (),
+) -> Trials:
+    """Test trials are the `share` at the end of every trial that is not named for another use."""
+    chosen = _held_out(dataset, {"validation": validation, "calibration": calibration})
+    held_out = [name for names in chosen.values() for name in names]
     if len(held_out) == len(dataset):
-        raise DataError("all of the bags are validation trials; give some to train on")
+        uses = [use for use, names in chosen.items() if names]
+        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
     for trial in dataset.without(held_out):
         count = round(share * len(trial.t))
@@ -188,8 +215,27 @@ def cut(dataset: Dataset, share: float, *, validation: Sequence[str] = ()) -> Tr
     return Trials(
         Dataset(tuple(parts[0])),
         Dataset(tuple(parts[1])),
-        dataset.select(held_out) if held_out else None,
+        _selected(dataset, chosen["validation"]),
+        _selected(dataset, chosen["calibration"]),
     )
+
+
+def _held_out(dataset: Dataset, named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """The trials of each use; DataError if a name is for two, or if nothing is for validation."""
+    for (use, names), (other, others) in combinations(named.items(), 2):
+        if twice := set(names) & set(others):
+            raise DataError(f"split: '{min(twice)}' is named for {use} and for {other}")
+    chosen = {use: _of_bags(dataset, names) for use, names in named.items()}
+    if named["validation"] and not chosen["validation"]:
+        raise DataError(
+            "none of the bags is a validation trial; split.validation names "
+            f"{', '.join(named['validation'])}, the bags are {', '.join(dataset.names)}"
+        )
+    return chosen
+
+
+def _selected(dataset: Dataset, names: Sequence[str]) -> Dataset | None:
+    return dataset.select(names) if names else None
 
 
 def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
@@ -200,23 +246,40 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
 def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:
     """A model file in; policy.json, funnel.json, funnel.proof.json (and model.json) in `out`.
 
-    The disturbance is measured on training.npz beside the model. Raises DataError or Infeasible.
+    The observer is chosen on training.npz beside the model, the disturbance measured on the
+    calibration trials of held_back.npz, without which every second training trial is one. Raises
+    DataError or Infeasible.
     """
     options = config.funnel
     if options is None:
         raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
     model = documents.load_model(model_path)
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
+    held_back = load_held_back(
+        model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
+    )
+    if config.split.calibration and "calibration" not in held_back:
+        raise DataError(
+            f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
+            "calibration trials; run `nlsid identify` with this configuration"
+        )
     weights = options.policy
     problem = LinearTube(
         model,
         train,
-        profile=options.profile,
+        profile=options.profile or _at_rest(train, options.horizon),
         horizon=options.horizon,
         safety_factor=options.safety_factor,
         inlet=options.inlet,
         lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
+        calibration=held_back.get("calibration"),
     )
     found = design(problem)
     found.save(out)
     return found
+
+
+def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:
+    """A plan for a tube that follows received commands: the mean output, for `horizon` s."""
+    level = float(np.mean(np.concatenate([trial.y[:, 0] for trial in train])))
+    return [(0.0, level), (horizon, level)]

@@ -6,48 +6,75 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from bags.chain.config import Clock, GridConfig
-from bags.chain.sections import NonNegative, Positive, Section, SignalConfig, read_yaml
+from bags.chain.sections import Key, NonNegative, Positive, Section, SignalConfig, read_yaml
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1, strict=False)]
 
 
 class StateSignals(Section):
-    """The measured state (positions, then rates) and the inputs."""
+    """The measured state and the inputs."""
 
-    states: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
-    inputs: Annotated[tuple[SignalConfig, ...], Field(min_length=1, strict=False)]
+    states: Annotated[
+        tuple[SignalConfig, ...],
+        Field(min_length=1, strict=False),
+        Key("what is measured: positions, then rates"),
+    ]
+    inputs: Annotated[
+        tuple[SignalConfig, ...], Field(min_length=1, strict=False), Key("what drives the robot")
+    ]
 
 
 class StateIdentification(Section):
-    """validation: bags that choose the degrees. refuse_above: % of error in free run.
+    """Which model of the measured state."""
 
-    degrees: classes to try, the highest power of each state and input (default: a few).
-    biased_without_repeats: least squares where no excitation was repeated. implicit: a trapezoidal
-    step of a mechanism instead of an explicit map.
-    """
-
-    validation: Annotated[tuple[str, ...], Field(min_length=1, strict=False)]
-    refuse_above: Positive = 25.0
+    validation: Annotated[
+        tuple[str, ...],
+        Field(min_length=1, strict=False),
+        Key("bags that choose the degrees", example=["arm_4_0"]),
+    ]
+    refuse_above: Annotated[
+        Positive, Key("of error in free run, above which the model is refused", "%", 25.0)
+    ] = 25.0
     degrees: Annotated[
-        tuple[Annotated[tuple[int, ...], Field(strict=False)], ...] | None, Field(strict=False)
+        tuple[Annotated[tuple[int, ...], Field(strict=False)], ...] | None,
+        Field(strict=False),
+        Key(
+            "classes to try, the highest power of each state and input (null: a few)",
+            example=[[1, 1, 1], [3, 1, 1]],
+        ),
     ] = None
-    biased_without_repeats: bool = False
-    implicit: bool = False
+    biased_without_repeats: Annotated[
+        bool, Key("least squares where no excitation was repeated; noise biases it", example=True)
+    ] = False
+    implicit: Annotated[
+        bool, Key("a trapezoidal step of a mechanism instead of an explicit map", example=True)
+    ] = False
 
 
 class MotionConfig(Section):
-    """From `start` to `goal` (states) in `duration` s, or near given `samples`.
+    """The motion to follow: from `start` to `goal` in `duration`, or near given `samples`."""
 
-    samples: a CSV file, headed by the states' names in their order, one row a period; a relative
-    path is seen from the configuration. Weights are relative to the box of the data.
-    """
-
-    start: Numbers | None = None
-    goal: Numbers | None = None
-    duration: Positive | None = None
-    samples: Path | None = Field(default=None, strict=False)
-    state_weight: Positive = 1.0
-    input_weight: Positive = 0.3
+    start: Annotated[
+        Numbers | None, Key("states at the start", "the states' units", [0.0, 0.0])
+    ] = None
+    goal: Annotated[Numbers | None, Key("states at the end", "the states' units", [0.2, 0.0])] = (
+        None
+    )
+    duration: Annotated[Positive | None, Key("of the motion", "s", 1.0)] = None
+    samples: Annotated[
+        Annotated[Path, Field(strict=False)] | None,
+        Key(
+            "instead, a CSV file headed by the states' names in their order, one row a period, "
+            "seen from the configuration",
+            example="motion.csv",
+        ),
+    ] = None
+    state_weight: Annotated[
+        Positive, Key("of the states' squared error, relative to the box of the data", "", 1.0)
+    ] = 1.0
+    input_weight: Annotated[
+        Positive, Key("of the inputs' square, relative to the box of the data", "", 0.3)
+    ] = 0.3
 
     @model_validator(mode="after")
     def _one_of_two(self) -> "MotionConfig":
@@ -60,40 +87,52 @@ class MotionConfig(Section):
 
 
 class DisturbanceConfig(Section):
-    """form of the assumption, rate if it is fading; safety_factor over the largest run."""
+    """What is assumed of the disturbance."""
 
-    form: Literal["response", "peak", "energy", "fading"] = "response"
-    safety_factor: float = Field(default=1.3, ge=1.0, allow_inf_nan=False)
-    rate: float = Field(default=1.0, gt=0.0, le=1.0)
+    form: Annotated[
+        Literal["response", "peak", "energy", "fading"],
+        Key("of the assumption", example="fading"),
+    ] = "response"
+    safety_factor: Annotated[
+        float,
+        Field(ge=1.0, allow_inf_nan=False),
+        Key("over the largest of the commissioning runs", example=1.2),
+    ] = 1.3
+    rate: Annotated[
+        float, Field(gt=0.0, le=1.0), Key("by which a fading assumption forgets a sample", "", 0.9)
+    ] = 1.0
 
 
 class SimulationConfig(Section):
-    """A robot of `bags.chain.plants` to record: peak torques in N·m, seconds of each excitation.
+    """A robot of `bags.chain.plants` to record instead of a real one."""
 
-    runs: of the policy, to commission it, from starts up to `spread` of what the data box allows.
-    """
-
-    robot: str
-    peak: Numbers
-    groups: int = Field(default=4, ge=1, le=100)
-    repeats: int = Field(default=4, ge=2, le=100)
-    seconds: Positive = 60.0
-    runs: int = Field(default=30, ge=1, le=10_000)
-    spread: NonNegative = 0.5
-    seed: int = Field(default=0, ge=0)
+    robot: Annotated[str, Key("which", example="arm")]
+    peak: Annotated[Numbers, Key("largest torques", "N·m", [4.6, 2.3])]
+    groups: Annotated[int, Field(ge=1, le=100), Key("different excitations", "", 4)] = 4
+    repeats: Annotated[int, Field(ge=2, le=100), Key("of each excitation", "", 4)] = 4
+    seconds: Annotated[Positive, Key("of each excitation", "s", 60.0)] = 60.0
+    runs: Annotated[int, Field(ge=1, le=10_000), Key("of the policy, to commission it", "", 30)] = (
+        30
+    )
+    spread: Annotated[
+        NonNegative, Key("of the runs' starts, of what the box of the data allows", "", 0.5)
+    ] = 0.5
+    seed: Annotated[int, Field(ge=0), Key("of what is random", "", 0)] = 0
 
 
 class TrackingConfig(Section):
     """One robot's configuration file for `nlsid track`."""
 
-    robot: str
-    signals: StateSignals
-    clock: Clock = "header"
-    grid: GridConfig
-    identification: StateIdentification
-    motion: MotionConfig
-    disturbance: DisturbanceConfig = DisturbanceConfig()
-    simulation: SimulationConfig | None = None
+    robot: Annotated[str, Key("what people call it", example="arm")]
+    signals: Annotated[StateSignals, Key("the measured state and the inputs")]
+    clock: Annotated[Clock, Key("as for `nlsid identify`", example="log")] = "header"
+    grid: Annotated[GridConfig, Key("as for `nlsid identify`")]
+    identification: Annotated[StateIdentification, Key("which model of the measured state")]
+    motion: Annotated[MotionConfig, Key("the motion to follow")]
+    disturbance: Annotated[DisturbanceConfig, Key("what is assumed of the disturbance")] = (
+        DisturbanceConfig()
+    )
+    simulation: Annotated[SimulationConfig | None, Key("only for a robot that is simulated")] = None
 
 
 def load_tracking_config(path: Path | str) -> TrackingConfig:

@@ -198,7 +198,10 @@ def check(
 
 @bag_app.command("recover")
 def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
-    """Make a whole bag of an unfinished or damaged one, verify it, and say what was lost."""
+    """Make a whole bag of an unfinished or damaged one, verify it, and say what was lost.
+
+    Status 1 if something was.
+    """
     from bags.tools.recover import recover
 
     with _progress("recovering") as progress:
@@ -213,6 +216,8 @@ def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
         soft_wrap=True,
         markup=False,
     )
+    if found.lost:
+        raise typer.Exit(1)
 
 
 @bag_app.command("export")

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bags.commands.bag_cli import bag_app
+from bags.commands.config_cli import config_app
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 app.add_typer(track_app, name="track")
 app.add_typer(bag_app)
+app.add_typer(config_app)
 out = Console()
 err = Console(stderr=True)
 
@@ -53,6 +55,42 @@ def nlsid(
     ] = False,
 ) -> None:
     """From a recorded bag to a proved model, a proved tracking tube and a monitor."""
+
+
+@app.command()
+def init(
+    bags: BagsArgument,
+    out_file: Annotated[
+        Path, typer.Option("--out", help="The YAML to write; must not be there yet.")
+    ],
+    response: Annotated[
+        list[str] | None, typer.Option("--response", "-y", help="What answers; repeat.")
+    ] = None,
+    excitation: Annotated[
+        list[str] | None, typer.Option("--excitation", "-u", help="What drives it; repeat.")
+    ] = None,
+    definitions: Annotated[
+        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
+    ] = None,
+    robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
+    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+) -> None:
+    """Write a first configuration from bags: signals, clock, period, gaps, split, lags, horizon.
+
+    It is tried on the bags, every key says why, and what later steps will meet is said first.
+    """
+    from bags.commands.init import run_init
+
+    run_init(
+        out,
+        bags,
+        out_file,
+        responses=response or (),
+        excitations=excitation or (),
+        definitions=definitions or (),
+        robot=robot,
+        yes=yes,
+    )
 
 
 @app.command()
@@ -191,14 +229,16 @@ def check(
     """
     status = 0
     for path in proofs:
+        name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            typer.echo(str(kernel.check(path)))
+            said = str(kernel.check(path))
+            typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
         except kernel.Rejected as refusal:
             status = max(status, 1)
-            typer.echo(f"REJECTED {path.name}: {refusal}")
+            typer.echo(f"REJECTED {name}: {refusal}")
         except OSError as error:
             status = 2
-            typer.echo(f"NOT READ {path.name}: {error.strerror}")
+            typer.echo(f"NOT READ {name}: {error.strerror}")
     raise typer.Exit(status)
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,6 +18,7 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import TubeDesign
 from nlsid_core.errors import DataError, percent
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
+from nlsid_core.kernel import text
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -106,8 +108,8 @@ def comparison_table(compared: Compared) -> Table:
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
-    for name in ("residual", "stability"):
-        table.add_column(name)
+    table.add_column("residual")
+    table.add_column("stable, rate a sample (time constant)")
     table.add_column("time", justify="right")
     label = ""
     for row in compared.rows:
@@ -133,8 +135,7 @@ def stability(candidate: Candidate[Model]) -> str:
     """Proved with its rate, or not, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    rate = stated_rate(candidate.proof).removesuffix(" a sample")  # the table is narrow
-    return f"[green]proved[/green], {rate}"
+    return f"[green]proved[/green], {stated_rate(candidate.proof, candidate.model.period)}"
 
 
 def funnel_table(design: TubeDesign) -> Table:
@@ -146,18 +147,12 @@ def funnel_table(design: TubeDesign) -> Table:
     table.add_column()
     tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
     table.add_row("policy", tracking)
-    table.add_row(
-        "half-width",
-        f"{funnel.half_width:g} {unit} of {model.y.name}",
-    )
-    span = (assumption.samples - 1) * model.period
-    table.add_row("horizon", f"{assumption.samples} samples, which span {span:g} s")
-    table.add_row(
-        "assuming",
-        f"disturbance energy Σe² ≤ {assumption.budget:.4g} ({unit})²\n"
-        f"largest of {len(assumption.measured_on)} training trials {assumption.measured:.4g}, "
-        f"safety factor {assumption.safety_factor:g} in amplitude",
-    )
+    width = text.above(Fraction(funnel.half_width))
+    table.add_row("half-width", f"{width} {unit} of {model.y.name}")
+    span = text.below((assumption.samples - 1) * Fraction(model.period))
+    table.add_row("horizon", f"{assumption.samples} samples, which span {span} s")
+    for line in design.verdict.assumptions:
+        table.add_row("assuming", escape(line))
     return table
 
 

@@ -17,6 +17,7 @@ MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
 MODEL_PROOF = "model.proof.json"
 TRAINING = "training.npz"
+HELD_BACK = "held_back.npz"
 REPORT = "report.html"
 SELECTION_PLOT = "select.png"
 COMPARISON_PLOT = "compare.png"

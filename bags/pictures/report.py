@@ -10,7 +10,7 @@ from bags.monitoring.replay import Replay
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, percent
-from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
@@ -45,11 +45,15 @@ def write_report(
     test: Dataset,
     *,
     validation: Dataset | None = None,
+    calibration: Dataset | None = None,
     robot: str,
 ) -> None:
     """Write the page; needs the extra `report`."""
     files.write_atomically(
-        path, page(fit, train, test, validation=validation, robot=robot).encode()
+        path,
+        page(
+            fit, train, test, validation=validation, calibration=calibration, robot=robot
+        ).encode(),
     )
 
 
@@ -66,6 +70,7 @@ def page(
     test: Dataset,
     *,
     validation: Dataset | None = None,
+    calibration: Dataset | None = None,
     robot: str,
 ) -> str:
     """The whole HTML page as text."""
@@ -76,9 +81,11 @@ def page(
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
-    chosen_on = "" if validation is None else f"{len(validation)} validation, "
-    recordings = [(train, "training"), (validation, "validation"), (test, "test")]
-    listed = "".join(_recordings(data, use) for data, use in recordings if data is not None)
+    recordings = [(train, "training"), (validation, "validation"), (calibration, "calibration"),
+                  (test, "test")]  # fmt: skip
+    kept = [(data, use) for data, use in recordings if data is not None]
+    listed = "".join(_recordings(data, use) for data, use in kept)
+    counts = ", ".join(f"{len(data)} {use}" for data, use in kept)
     rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
@@ -91,8 +98,8 @@ def page(
 <th>stability</th></tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
 simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
-Trials: {len(train)} training, {chosen_on}{len(test)} test; test trials were only used
-for this table and the pictures below.</p>
+Trials: {counts}; test trials were only used
+for this table and the pictures below{_calibrated(calibration)}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
 {_residuals(chosen, test)}
 {_inside(fit)}
@@ -118,7 +125,8 @@ def _stability(chosen: Candidate[Model]) -> str:
         clip = chosen.model.on_out_of_range == "clip"
         inputs += " (others are clipped to it)" if clip else " (others are refused)"
     if chosen.proof.rate < 1.0:
-        approach = f"approach each other at {chosen.proof.rate:.4f} a sample or faster"
+        rate = stated_rate(chosen.proof, chosen.model.period)
+        approach = f"approach each other at the rate {rate} a sample or faster"
     else:
         approach = "differ by a square summable sequence; no rate is claimed"
         if isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
@@ -171,6 +179,10 @@ def _equation(m: Model) -> str:
     if isinstance(m, ImplicitModel):
         return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
     return f"y = G₂ f(G₁ u): {m}; {signals}"
+
+
+def _calibrated(calibration: Dataset | None) -> str:
+    return "" if calibration is None else ", calibration trials for neither: they scale the tube"
 
 
 def _left_out(chosen: Candidate[Model]) -> str:

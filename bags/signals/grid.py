@@ -68,7 +68,7 @@ def to_trajectories(
     each point of the grid, where they follow each other in a period give or take GRID_TOLERANCE,
     as the monitor takes them; a point without one, in a gap of at most `max_gap`, is filled in on
     the line between its neighbours, and counted (`filled` in the provenance). A command without a
-    limit of its own, `|hold(T s)`, is held for at most `max_gap`.
+    limit of its own, `|hold(T s)`, gets one of `max_gap`, which its path says from then on.
 
     Samples without every signal are left out at the start and the end, and logged. Between them
     they raise DataError, or with `split_gaps` end one trajectory and begin the next.
@@ -87,10 +87,7 @@ def to_trajectories(
     where = f"{label}: {responses[0].path}"
     period_ns = _period_ns(base, period, where, on_grid=on_grid)
     gap_ns = round(DEFAULT_MAX_GAP * period_ns if max_gap is None else max_gap * 1e9)
-    held = [
-        Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9)
-        for samples in excitations
-    ]
+    held = [_held_for(samples, gap_ns) for samples in excitations]
     sampler = Sampler(signals, held, period=period_ns / 1e9)
     found = list(_sampled(sampler, [*responses, *excitations]))
     complete = [k for k, sample in enumerate(found) if not sample.missing]
@@ -122,7 +119,7 @@ def to_trajectories(
                 "y_units": tuple(samples.unit for samples in responses),
                 "u_units": tuple(samples.unit for samples in excitations),
                 "y_paths": tuple(samples.path for samples in responses),
-                "u_paths": tuple(samples.path for samples in excitations),
+                "u_paths": tuple(map(str, held)),
                 "name": name if len(runs) == 1 else f"{name}.{k}",
                 "group": group if len(runs) == 1 else "",
                 "digest": digest,
@@ -131,6 +128,12 @@ def to_trajectories(
         )
         for k, run in enumerate(runs, start=1)
     ]
+
+
+def _held_for(samples: Samples, gap_ns: int) -> Expression:
+    """The excitation with a limit to how long it is held, as its text says it."""
+    signal = Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9)
+    return Expression.parse(str(signal))
 
 
 def _sampled(sampler: Sampler, signals: Sequence[Samples]) -> Iterator[Sample]:
@@ -201,7 +204,10 @@ def _trajectory(
     if filled:
         origin = json.loads(labels["provenance"] or "{}") | {"filled": filled}
         labels = labels | {"provenance": canonical(origin).decode()}
-    names = {"y_names": labels["y_paths"], "u_names": labels["u_paths"]}
+    names = {
+        "y_names": labels["y_paths"],
+        "u_names": tuple(samples.path for samples in excitations),
+    }
     return Trajectory(t=t, y=y, u=u, **names, **labels)
 
 

@@ -12,8 +12,9 @@ from nlsid_core.design.continuous.tvlqr import (
 )
 from nlsid_core.design.design import design
 from nlsid_core.design.linear import TubeDesign, design_tube
-from nlsid_core.design.problems import ContinuousTracking, LinearTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, LinearTube, OutputTube, SampledTracking
 from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
+from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
 __all__ = [
     "ContinuousTracking",
@@ -21,12 +22,15 @@ __all__ = [
     "FunnelDesign",
     "Goal",
     "LinearTube",
+    "OutputTube",
+    "OutputTubeDesign",
     "SampledTracking",
     "Tracking",
     "TubeDesign",
     "compose_funnels",
     "design",
     "design_funnel",
+    "design_output_tube",
     "design_tube",
     "discrete_tvlqr",
     "integrate_nominal",

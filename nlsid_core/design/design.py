@@ -9,12 +9,15 @@ from typing import overload
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.sweep import Progress
 from nlsid_core.design.linear import TubeDesign, design_tube
-from nlsid_core.design.problems import ContinuousTracking, LinearTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, LinearTube, OutputTube, SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
+from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
 
 @overload
 def design(problem: LinearTube) -> TubeDesign: ...
+@overload
+def design(problem: OutputTube) -> OutputTubeDesign: ...
 @overload
 def design(problem: SampledTracking, *, progress: Progress | None = None) -> TrackingDesign: ...
 @overload
@@ -25,12 +28,14 @@ def design(
     progress: Progress | None = None,
 ) -> FunnelDesign: ...
 def design(
-    problem: LinearTube | SampledTracking | ContinuousTracking,
+    problem: LinearTube | OutputTube | SampledTracking | ContinuousTracking,
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> TubeDesign | TrackingDesign | FunnelDesign:
-    """A policy and a funnel for the problem, proved; `Design.save` writes them and the proof.
+) -> TubeDesign | OutputTubeDesign | TrackingDesign | FunnelDesign:
+    """A funnel for the problem, proved, and a policy unless it needs none.
+
+    `Design.save` writes them and the proof.
 
     executor: shares work that splits. progress: called with (what was done, fraction done).
     Raises DataError on a problem that makes no sense, Infeasible if no funnel was found or proved,
@@ -39,6 +44,8 @@ def design(
     match problem:
         case LinearTube():
             return design_tube(**vars(problem))
+        case OutputTube():
+            return design_output_tube(**vars(problem))
         case SampledTracking():
             return design_state_funnel(**vars(problem), progress=progress)
         case ContinuousTracking():

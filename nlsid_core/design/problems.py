@@ -12,9 +12,9 @@ from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.options import require_at_least, require_one_of, require_positive
+from nlsid_core.options import require_at_least, require_one_of, require_positive, require_ranges
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 
@@ -26,7 +26,9 @@ Objective = Literal["volume", "reference"]
 class LinearTube:
     """Policy, observer and tube of an identified model, under a bound on the innovations' energy.
 
-    train: what the bound is measured on. profile: (s, output) corners of the nominal. horizon: s,
+    train: what the observer is chosen on. calibration: other trials, on which the bound is measured
+    (None: `calibration_split` of train); to state how often a next trial exceeds it, the model has
+    to be fitted without them. profile: (s, output) corners of the nominal. horizon: s,
     how long the energy budget lasts. safety_factor: of the disturbance's amplitude over the largest
     measured, at least 1. inlet: allowed initial error of the output, in its unit. lqr_weights: of
     output and input, positive; None is K = 0, a prediction tube.
@@ -40,6 +42,7 @@ class LinearTube:
     safety_factor: float = 1.5
     inlet: float = 0.0
     lqr_weights: tuple[float, float] | None = (1.0, 1.0)
+    calibration: Dataset | None = None
 
     def __post_init__(self) -> None:
         if len(self.profile) < 2:
@@ -49,6 +52,36 @@ class LinearTube:
         require_at_least(self, "inlet", 0.0)
         if self.lqr_weights is not None and not all(weight > 0 for weight in self.lqr_weights):
             raise OptionError("lqr_weights", self.lqr_weights, "two numbers above 0, or None")
+
+
+@dataclass(frozen=True, eq=False)
+class OutputTube:
+    """Tubes around the simulation of a stable model of any class, whatever drives it; for ever.
+
+    train: the trials that observer and storage are chosen on. calibration: others, on which the
+    level is measured (None: every second one of `train`, of a single trial windows).
+    reaction_time: s, how far ahead the forecast is to be narrow (None: ten samples). safety_factor:
+    of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
+    tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
+    output, then every input, for implicit models whose increments are known on a box only (None:
+    the range of the training trials and a tenth of it on both sides).
+    Source: TUBES, sections 2 to 6.
+    """
+
+    model: StableModel
+    train: Dataset
+    calibration: Dataset | None = None
+    reaction_time: float | None = None
+    safety_factor: float = 1.5
+    horizon: float | None = None
+    box: Sequence[tuple[float, float]] | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("reaction_time", "horizon"):
+            if getattr(self, key) is not None:
+                require_positive(self, key)
+        require_at_least(self, "safety_factor", 1.0)
+        require_ranges(self, "box")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,4 +138,4 @@ class ContinuousTracking:
         require_one_of(self, "gain", GAINS)
 
 
-Problem = LinearTube | SampledTracking | ContinuousTracking
+Problem = LinearTube | OutputTube | SampledTracking | ContinuousTracking

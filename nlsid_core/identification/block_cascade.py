@@ -57,11 +57,11 @@ class CascadeChoice:
 class BlockCascadeClass:
     """A filter, a static nonlinearity, a filter. Source: `theory-cascades-and-moments.md`.
 
-    orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models. phases
-    (each 1 to 4), intervals (of knots, ascending), smoothing: chosen on validation data; knots are
-    refined while that helps. Several phases presume an input without power near half the sampling
-    frequency; validation decides. starts: random ones, 1 to 1000, made from `seed`; start_samples:
-    of each trial, for the starts. begin: how trials begin, "measured" (in motion,
+    orders: of the two filters, each 0 to 100; (n, 0) are Wiener, (0, n) Hammerstein models.
+    phases: tried, each 1 to 4; several presume an input without power near half the sampling
+    frequency. intervals: of knots, tried, ascending, while that helps. smoothing: of the spline,
+    tried; validation data choose all three. starts: random ones, 1 to 1000. start_samples: of each
+    trial, for the starts. seed: of the starts. begin: how trials begin, "measured" (in motion,
     `BlockCascade.simulate` from the first measured outputs) or "rest" (from zero states).
     """
 

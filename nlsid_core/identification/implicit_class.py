@@ -38,8 +38,9 @@ class ImplicitClass:
     Measured states, x⁺ one sample ahead, are lags 1 and delays (1,). set: of thesis Chapter 2,
     "2.10" to "2.13", "2.19" for linear models; more than one lag needs "2.10" or "2.11".
     left_degree: of e, odd, 1 to 9; right_degree: of f in x, 1 to 5; input_degree: of f in w, 1 to
-    5, which is added, or with `coupled` multiplied to total degree right_degree. box: (low, high)
-    of every output, then every input, in their units, for stability on it (None: everywhere).
+    5. coupled: whether w is multiplied with x to total degree right_degree instead of added. box:
+    (low, high) of every output, then every input, in their units, for stability on it (None:
+    everywhere).
     storage_degree: of the storage's metric in "2.10", 0 to 4.
     Raises OptionError, or DataError for a combination that no model can satisfy.
     """

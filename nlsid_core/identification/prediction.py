@@ -15,10 +15,11 @@ from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
+    StableModel,
     StateAffineModel,
 )
 
-Model = DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation | ImplicitModel
+Model = StableModel
 # [y(t-1), y(t-2), …], each (T, n_y), and the rows t they belong to -> y(t), (T, n_y)
 Step = Callable[[list[FloatArray], slice], FloatArray]
 

@@ -122,6 +122,18 @@ def prove_stability(model: Any) -> StabilityProof | None:
         return None
 
 
+def storage_on(form: increments.Model) -> StabilityProof | None:
+    """P, N and a rate for an increment form on a box, not decided; None if the search finds none.
+
+    The leaves of its multipliers are parts of the box on which one N serves.
+    """
+    search = _Search(form, np.array(form.F, dtype=np.float64))
+    try:
+        return _by_programs(search, search.leaf(form.box))
+    except (kernel.Rejected, LinAlgError, SolverError):
+        return None
+
+
 def _is_bounded(model: StateAffineModel) -> bool:
     """One output, a leading coefficient of degree 2 at most, constant factors of the lags."""
     return (

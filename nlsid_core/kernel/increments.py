@@ -15,17 +15,21 @@ from itertools import pairwise, product
 from math import comb, prod
 
 from . import text
-from .exact import Matrix, combined, congruence, definite, transposed
+from .exact import Matrix, combined, definite, transposed
 from .exact import product as times
 from .files import Node, Rejected, label, plain
+from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
+from .terms import derivative
 
 MAX_STATES = 120
 MAX_PHASES = 8  # a cascade has 2^phases matrices
 MAX_POWER = 20  # of a variable of the window in a monomial
 MAX_WORK = 2 * 10**8  # order³ over all matrices that are decided: about a minute
+MAX_SLOPES = 10**7  # entries of all coefficients of ∂h/∂(v, x), in which a term may occur often
 MAX_SPLITS = 40  # of one box, one inside the other
 
 Box = list[tuple[Fraction, Fraction]]
+Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
 
 
 @dataclass(frozen=True)
@@ -82,38 +86,61 @@ class Model:
         return len(self.F[0]) - len(self.F)
 
 
-def decreases(model: Model, multipliers: Node | None, P: Matrix, rho: Fraction) -> None:
-    """Raise Rejected unless diag(0, ρP) - F'PF + sym(N E) ≻ 0 at every vertex E of every leaf.
+def positive(model: Model, multipliers: Node | None, forms: Sequence[tuple[str, Matrix]]) -> None:
+    """Raise Rejected unless M + sym(N [E 0]) ≻ 0 for each form (what, M), at every vertex E.
 
-    `multipliers` is a leaf {N}, N (m + n, m), or {split, parts}: the variable of the box that is
-    halved, and the multipliers of the lower and of the upper half. A leaf may state `ends` beside
-    N: bounds of the one entry of E that varies, in the place of the vertices (`_between`).
+    M is of order m + n or more. `multipliers` is a leaf {N}, N of M's order × m, a list of one for
+    each form if there are several; or {split, parts}: the variable of the box that is halved, and
+    the multipliers of the lower and of the upper half. A leaf may state `ends` beside N: bounds of
+    the one entry of E that varies, in the place of the vertices (`_between`).
     """
-    m, n = model.unknowns, model.states
-    supply = _block_diagonal([[Fraction(0)] * m for _ in range(m)], P, rho)
-    gap = combined(supply, congruence(model.F, P), -1)
-    what = "the decrease of V = x'Px at the stated rate"
+    m, size = model.unknowns, len(forms[0][1])
     if multipliers is None:
         if m:
             raise Rejected("the proof needs multipliers for this class of models")
-        definite(gap, what)
+        for what, M in forms:
+            definite(M, what)
         return
     if not m:
         raise Rejected("this class of models has no multipliers")
-    work = 0
+    work, first = 0, forms[0][0]
     for box, leaf in _leaves(multipliers, model.box, 0):
-        N = leaf["N"].array(m + n, m)
+        given = leaf["N"]
+        Ns = given.array(len(forms), size, m) if len(forms) > 1 else [given.array(size, m)]
         work += 30 * model.effort
-        if model.ray and (N[0][0] < 0 or any(row[0] for row in N[1:])):
+        if model.ray and any(N[0][0] < 0 or any(row[0] for row in N[1:]) for N in Ns):
             raise Rejected("the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0")
         if work > MAX_WORK:
-            raise Rejected(f"{what} takes too long to decide: too many coefficients")
+            raise Rejected(f"{first} takes too long to decide: too many coefficients")
         for E in model.vertices(box, leaf.get("ends")):
-            work += (m + n) ** 3
+            work += len(forms) * size**3
             if work > MAX_WORK:
-                raise Rejected(f"{what} takes too long to decide: too many matrices")
-            cross = times(N, E)
-            definite(combined(gap, combined(cross, transposed(cross))), what)
+                raise Rejected(f"{first} takes too long to decide: too many matrices")
+            wide = [row + [Fraction(0)] * (size - len(row)) for row in E]
+            for (what, M), N in zip(forms, Ns, strict=True):
+                cross = times(N, wide)
+                definite(combined(M, combined(cross, transposed(cross))), what)
+
+
+def block_diagonal(*blocks: Matrix) -> Matrix:
+    """The blocks along the diagonal of a matrix that is zero elsewhere."""
+    size, rows, start = sum(map(len, blocks)), [], 0
+    for block in blocks:
+        for row in block:
+            end = size - start - len(block)
+            rows.append([Fraction(0)] * start + list(row) + [Fraction(0)] * end)
+        start += len(block)
+    return rows
+
+
+def scaled(M: Matrix, weight: Fraction) -> Matrix:
+    """Weight M."""
+    return [[weight * entry for entry in row] for row in M]
+
+
+def zero(size: int) -> Matrix:
+    """A square matrix of zeros."""
+    return [[Fraction(0)] * size for _ in range(size)]
 
 
 def _leaves(node: Node, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
@@ -134,15 +161,23 @@ def _leaves(node: Node, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, N
         yield from _leaves(part, [*box[:i], half, *box[i + 1 :]], depth + 1)
 
 
-def read_model(node: Node) -> Model:
-    """The increment form of a model file's content."""
+def read_model(node: Node, bounds: Node | None = None) -> Model:
+    """The increment form of a model file's content.
+
+    bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form.
+    """
     if type(node.value) is not dict or type(node.value.get("kind")) is not str:
         raise Rejected(f"{node.where}: 'kind' is missing")
     kind = node.value["kind"]
-    if kind not in _READERS:
-        known = ", ".join(_READERS)
+    if kind not in (*_READERS, "implicit"):
+        known = ", ".join([*_READERS, "implicit"])
         raise Rejected(f"{node.where}: kind is {plain(kind)!r}; known: {known}")
-    model = _READERS[kind](node)
+    if kind == "implicit":
+        model = _implicit(node, bounds)
+    elif bounds is None:
+        model = _READERS[kind](node)
+    else:
+        raise Rejected(f"a model of kind {kind} needs no box: its increments are known everywhere")
     if not 0 < model.states <= MAX_STATES:
         raise Rejected(f"{node.where}: {model.states} states; 1 to {MAX_STATES} are decided")
     return model
@@ -179,6 +214,7 @@ def _state_affine(node: Node) -> Model:
     p, n_u = len(y), len(u)
     window = parts["window"].wholes(None, 2)
     G = [_polynomials(entry, len(window), p, p) for entry in parts["G"].items(2, MAX_STATES)]
+    whole = _side_by_side(G, p)
     _polynomials(parts["p"], len(window), p)
     parts["y_offset"].array(p)
     y_scale, u_scale = parts["y_scale"].array(p), parts["u_scale"].array(n_u)
@@ -187,12 +223,7 @@ def _state_affine(node: Node) -> Model:
         raise Rejected(f"{node.where}: scales should be positive and input ranges not empty")
     if any(not (0 <= i < n_u and 0 <= d < len(G)) for i, d in window):
         raise Rejected(f"{node.where} window names inputs or delays that are not there")
-    degrees = _degrees(G, len(window))
-    terms = sum(len(g) for g in G)
     box = [tuple((end - offsets[i]) / u_scale[i] for end in ranges[i]) for i, _ in window]
-    longest = [max(end.numerator.bit_length() + end.denominator.bit_length() for end in ends)
-               for ends in box]  # fmt: skip
-    bits = sum(d * long for d, long in zip(degrees, longest, strict=True))
     size = p * (len(G) - 1)
     F = [_unit(i, p + size) for i in range(size)]  # x⁺ = [ν; all but the oldest of x]
     H = [[y_scale[i] * entry for entry in _unit(i, p + size)] for i in range(p)]
@@ -200,9 +231,8 @@ def _state_affine(node: Node) -> Model:
         _period(parts), y, u, F, H,
         _inputs_in_range(parts["on_out_of_range"].text(), u, ranges),
         [(low, high) for low, high in box],
-        lambda part, ends: _bernstein(G, part) if ends is None else _between(G, part, ends),
-        effort=prod(d + 1 for d in degrees) * terms * (p * p + len(window))
-        * (1 + (bits >> 11) ** 2),
+        lambda part, ends: _bernstein(whole, part) if ends is None else _between(G, part, ends),
+        effort=_effort(whole, [(low, high) for low, high in box]),
     )  # fmt: skip
 
 
@@ -280,6 +310,99 @@ def _monotone_equation(node: Node) -> Model:
     )  # fmt: skip
 
 
+def _implicit(node: Node, bounds: Node | None) -> Model:
+    """0 = h(v, x, w), x⁺ = [v; ã(x, w)], y = v: ν = v - v̂, E = [∂h/∂v, ∂h/∂x] averaged between.
+
+    Where h is linear in v and x, E is one matrix. Where h = e(v) - (affine in x), v one number and
+    e a cubic that increases, e' is at least its least slope: a ray. Else E is in the hull of the
+    Bernstein coefficients of ∂h/∂(v, x) on a box of v, x and w, both solutions being in it.
+    """
+    given = read_implicit_model(node)
+    parts = node.members("y u window", f"{MEMBERS} training bags")
+    y, u = (tuple(_signal(s) for s in parts[key].items(0, 50)) for key in "yu")
+    window = parts["window"].wholes(given.inputs, 2)
+    p, n = given.unknowns, given.states
+    if len(y) != p or n % p or any(not (0 <= i < len(u) and d >= 0) for i, d in window):
+        raise Rejected(f"{node.where}: outputs, states and window do not fit")
+    F = [_unit(i, p + n) for i in range(p)]
+    for terms in given.shift:
+        if any(sum(e) > 1 and any(e[:n]) for e, _ in terms):
+            raise Rejected(f"{node.where}: the shift should be linear in the states")
+        row = [Fraction(0)] * (p + n)
+        for e, c in terms:
+            if any(e[:n]):
+                row[p + e.index(1)] += c
+        F.append(row)
+    E = _slopes(given)
+    constant = all(not any(e) for e, _ in E)
+    least = None if constant else _least_slope(given)
+    if bounds is None and not constant and least is None:
+        raise Rejected(f"{node.where}: the increments of this model are known on a box only")
+    box: Box = []
+    if bounds is not None:
+        if constant or least is not None:
+            raise Rejected(f"{node.where} needs no box: its increments are known everywhere")
+        ends = bounds.members("y u")
+        y_box, u_box = ends["y"].array(p, 2), ends["u"].array(len(u), 2)
+        if any(low >= high for low, high in [*y_box, *u_box]):
+            raise Rejected(f"{bounds.where}: a range is empty")
+        rows = [*y_box, *y_box * (n // p), *(u_box[i] for i, _ in window)]
+        box = [(low, high) for low, high in rows]
+    only = [least] if least is not None else [E[0][1]] if constant else []
+
+    def vertices(part: Box, ends: Node | None) -> list[Matrix]:
+        if ends is not None:
+            raise Rejected(f"{ends.where}: ends are for state-affine models")
+        return only or _bernstein(E, part)
+
+    return Model(
+        given.period, y, u, F, [_unit(i, p + n) for i in range(p)],
+        "for every input" if bounds is None else "while signals stay in the box", box,
+        vertices, ray=least is not None, effort=0 if only else _effort(E, box),
+    )  # fmt: skip
+
+
+def _slopes(model: ImplicitModel) -> Terms:
+    """∂h/∂(v, x) as a matrix polynomial in (v, x, w)."""
+    p, size = model.unknowns, model.unknowns + model.states
+    found: dict[tuple[int, ...], list[list[Fraction]]] = {}
+    if sum(map(len, model.h)) * p * size**2 > MAX_SLOPES:
+        raise Rejected("the model has too many terms for its slopes to be written out")
+    for i, row in enumerate(model.h):
+        for j in range(size):
+            for powers, c in derivative(row, j):
+                if max(powers, default=0) > MAX_POWER:
+                    raise Rejected(f"powers should be from 0 to {MAX_POWER}")
+                entry = found.setdefault(powers, [[Fraction(0)] * size for _ in range(p)])
+                entry[i][j] += c
+    if not found:
+        raise Rejected("the model's equation does not depend on its output")
+    return [(list(powers), found[powers]) for powers in sorted(found)]
+
+
+def _least_slope(model: ImplicitModel) -> Matrix | None:
+    """[min e', -a] of one equation e(v) = a'x + (terms in w), e an increasing cubic; else None."""
+    p, n = model.unknowns, model.states
+    if p != 1:
+        return None
+    E, e = [Fraction(0)] * (1 + n), [Fraction(0)] * 4
+    for powers, c in model.h[0]:
+        if not any(powers[: 1 + n]):
+            continue
+        if any(powers[1 + n :]) or (powers[0] and any(powers[1 : 1 + n])) or powers[0] > 3:
+            return None
+        if powers[0]:
+            e[powers[0]] += c
+        elif sum(powers) == 1:
+            E[powers.index(1)] += c
+        else:
+            return None
+    if e[3] <= 0:
+        return None
+    E[0] = e[1] - e[2] ** 2 / (3 * e[3])
+    return [E]
+
+
 _READERS: dict[str, Callable[[Node], Model]] = {
     "difference_equation": _difference_equation,
     "state_affine": _state_affine,
@@ -287,16 +410,37 @@ _READERS: dict[str, Callable[[Node], Model]] = {
     "monotone_equation": _monotone_equation,
 }
 
-Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
+
+def _side_by_side(G: Sequence[Terms], rows: int) -> Terms:
+    """[G_0 … G_n] as one matrix polynomial."""
+    zeros = [[Fraction(0)] * rows for _ in range(rows)]
+    found = [{tuple(powers): block for powers, block in g} for g in G]
+    return [
+        (
+            list(powers),
+            [[entry for g in found for entry in g.get(powers, zeros)[i]] for i in range(rows)],
+        )
+        for powers in sorted({powers for g in found for powers in g})
+    ]
 
 
-def _bernstein(G: list[Terms], box: Box) -> list[Matrix]:
-    """The Bernstein coefficients of [G_0 … G_n](w) on a box: their convex hull holds its values.
+def _effort(E: Terms, box: Box) -> int:
+    """How many products the Bernstein form of E takes."""
+    degrees, entries = _degrees(E, len(box)), sum(map(len, E[0][1]))
+    longest = [max(end.numerator.bit_length() + end.denominator.bit_length() for end in ends)
+               for ends in box]  # fmt: skip
+    bits = sum(d * long for d, long in zip(degrees, longest, strict=True))
+    size = len(E) * (entries + len(box))
+    return prod(d + 1 for d in degrees) * size * (1 + (bits >> 11) ** 2)
+
+
+def _bernstein(E: Terms, box: Box) -> list[Matrix]:
+    """The Bernstein coefficients of E(w) on a box: their convex hull holds its values.
 
     On [lo, hi], w^e has the coefficient Σ_j C(e, j) lo^(e-j) (hi - lo)^j C(k, j)/C(d, j) at index k
     of degree d.
     """
-    degrees = _degrees(G, len(box))
+    degrees = _degrees(E, len(box))
     tables = [
         [
             [
@@ -317,23 +461,19 @@ def _bernstein(G: list[Terms], box: Box) -> list[Matrix]:
         for d, (low, high) in zip(degrees, box, strict=True)
     ]
     found: set[tuple[tuple[Fraction, ...], ...]] = set()
-    rows = len(G[0][0][1]) if G[0] else 0
     for k in product(*(range(d + 1) for d in degrees)):
-        E: list[list[Fraction]] = [[] for _ in range(rows)]
-        for g in G:
-            value = [[Fraction(0)] * rows for _ in range(rows)]
-            for powers, coefficients in g:
-                weight = prod(
-                    (tables[i][e][k[i]] for i, e in enumerate(powers) if e), start=Fraction(1)
-                )
+        value = [[Fraction(0)] * len(row) for row in E[0][1]]
+        for powers, coefficients in E:
+            factors = (tables[i][e][k[i]] for i, e in enumerate(powers) if e)
+            weight = prod(factors, start=Fraction(1))
+            if weight:
                 value = combined(value, coefficients, weight)
-            E = [left + right for left, right in zip(E, value, strict=True)]
-        found.add(tuple(map(tuple, E)))
-    return _extreme([[list(row) for row in E] for E in sorted(found)])
+        found.add(tuple(map(tuple, value)))
+    return _extreme([[list(row) for row in value] for value in sorted(found)])
 
 
-def _degrees(G: list[Terms], variables: int) -> list[int]:
-    return [max(powers[i] for g in G for powers, _ in g) for i in range(variables)]
+def _degrees(E: Terms, variables: int) -> list[int]:
+    return [max(powers[i] for powers, _ in E) for i in range(variables)]
 
 
 def _between(G: list[Terms], box: Box, node: Node) -> list[Matrix]:
@@ -447,10 +587,3 @@ def _unit(i: int, size: int) -> list[Fraction]:
 
 def _padded(values: list[Fraction], size: int) -> list[Fraction]:
     return values + [Fraction(0)] * (size - len(values))
-
-
-def _block_diagonal(zero: Matrix, P: Matrix, rho: Fraction) -> Matrix:
-    m, n = len(zero), len(P)
-    return [row + [Fraction(0)] * n for row in zero] + [
-        [Fraction(0)] * m + [rho * entry for entry in row] for row in P
-    ]

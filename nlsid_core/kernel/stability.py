@@ -9,9 +9,9 @@ from fractions import Fraction
 
 from . import text
 from .decision import Decision
-from .exact import definite
+from .exact import combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
-from .increments import decreases, read_model
+from .increments import block_diagonal, positive, read_model, scaled, zero
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -25,7 +25,10 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     given = proof.members("P", "multipliers")
     P = given["P"].array(model.states, model.states)
     definite(P, "P")
-    decreases(model, given.get("multipliers"), P, rate**2)
+    supply = block_diagonal(zero(model.unknowns), scaled(P, rate**2))
+    gap = combined(supply, congruence(model.F, P), -1)
+    what = "the decrease of V = x'Px at the stated rate"
+    positive(model, given.get("multipliers"), [(what, gap)])
     return Decision(
         statement=(
             f"incremental stability: two solutions with the same input approach each other, in "

@@ -1,234 +1,227 @@
-"""Claim `tube`: an output stays near the model's trajectories while an assumption holds.
+"""Claim `tube`: outputs stay near the model's own simulation, for ever, while innovations fade.
 
-With x̄ = x̂ - x_k, the innovation e and the input u_k - κKx̄, 0 <= κ <= 1, the observer gives
-    x̄⁺ = (A - κBK) x̄ + L e,    o = y - y_k = (C - κDK) x̄ + e.
-Proved for κ = 0 and 1, hence (both are concave in κ) for every κ between, at each sample its own:
-    (1 - slack) diag(ρP, R) - [A - κBK, L]'P[A - κBK, L] ≻ 0,
-    diag(ρP, R) - τ_j [C_j - κD_jK, 1_j]'[C_j - κD_jK, 1_j] ≻ 0.
+The model runs twice under the same inputs: the simulation x, and the observer x̂ with L e injected
+after each step, e the innovation. With x̄ = x̂ - x and the increment form of the model,
+    E ζ = 0,    x̄⁺ = F ζ + L e,    o = y - y° = H ζ + e,    ζ = (ν, x̄).
+At every vertex E, with multipliers N:
+    diag(0, ρP, R) - [F L]'P[F L] + sym(N [E 0]) ≻ 0,
+    diag(0, ρP, R) - τ_j [H_j 1_j]'[H_j 1_j] + sym(N_j [E 0]) ≻ 0.
 With E_{k+1} = ρE_k + e_k'Re_k, E_0 = 0: V(x̄_k) <= ρ^k V(x̄_0) + E_k and τ_j o_j² <= ρV + e'Re, at
-most `level` while V(x̄_0) <= inlet and E <= budget. What the stored nominal departs from the model
-by is added to √level. Source: docs/certificate_tube.md.
+most inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel may
+hold several such tubes, each with its assumption. Source: docs/certificate_tube.md.
 """
 
 from dataclasses import dataclass
 from fractions import Fraction
 
-from . import text
+from . import driven_tube, text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Mismatch, Node, Read, Rejected, bound_files
-from .increments import Linear, Model, Signal, read_model
+from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
 
-MAX_SAMPLES = 10**6
-MAX_NOMINAL = 10**7  # samples of the nominal times the square of the states: a minute
+MAX_SAMPLES = 10**9
+MAX_TUBES = 8  # of one funnel
+MAX_TRIALS = 10_000
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What the numbers of an assumption come from: digests, how many are parts of a recording."""
+
+    designed_on: set[str]
+    measured_on: set[str]
+    windows: int
 
 
 @dataclass(frozen=True)
 class Tube:
-    """The numbers of a policy file and a funnel file; N nominal samples, n states, p outputs.
+    """One tube of a funnel file; n states, p outputs. samples: None is for ever.
 
-    x: (N, n), u: (N, 1), K: (1, n), L: (n, p). P: (n, n), R: (p, p), tau, half_widths: (p,).
-    trials: how many distinct ones the assumption was measured on.
+    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,).
     """
 
-    x: Matrix
-    u: Matrix
-    K: Matrix
+    rho: Fraction
     L: Matrix
     P: Matrix
     R: Matrix
-    rho: Fraction
-    level: Fraction
-    inlet: Fraction
     tau: list[Fraction]
     half_widths: list[Fraction]
-    assumption: str
-    budget: Fraction
-    samples: int
+    level: Fraction
+    inlet: Fraction
+    samples: int | None
     measured: Fraction
     safety_factor: Fraction
-    trials: int
+    trials: Trials
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
-    """Decide {kind, about: {model, policy, funnel}} by {slack}."""
-    parts = claim.members("kind about")
-    documents, digests = bound_files(parts["about"], read, "model policy funnel")
-    model = read_model(documents["model"])
-    linear = model.linear
-    if linear is None:
-        raise Rejected("a tube is decided for a model of kind difference_equation")
-    tube = _read(documents["policy"], documents["funnel"], model, digests)
-    slack = proof.members("slack")["slack"].number()
-    if not 0 < slack < 1:
-        raise Rejected("slack should be between 0 and 1")
-    definite(tube.P, "P")
-    definite(tube.R, "R")
-    _check_assumption(tube, linear)
-    for kappa in (0, 1):
-        _check_growth(model, linear, tube, slack, kappa)
-    for tau, width, signal in zip(tube.tau, tube.half_widths, model.y, strict=True):
-        if width <= 0:
-            raise Rejected("half-widths should be positive")
-        left = f"{signal.name} can leave the stated half-width {text.above(width)}"
-        at_most(tube.level, tau * width**2, left)
-    _check_level(model, linear, tube)
-    return Decision(_statement(model, linear, tube), slack, _assumptions(model, tube), digests)
+    """Decide {kind, about: {model, funnel}} by {multipliers}, or a tube about a policy."""
+    about = claim.members("kind about")["about"]
+    if type(about.value) is dict and "policy" in about.value:
+        return driven_tube.decide(claim, proof, read)
+    documents, digests = bound_files(about, read, "model funnel")
+    funnel = documents["funnel"].members("format version kind model settling tubes", "box")
+    if funnel["format"].text() != "nlsid/funnel" or funnel["version"].whole(0) != 2:
+        raise Rejected("the funnel should be of format nlsid/funnel, version 2")
+    if funnel["kind"].text() != "tube":
+        raise Rejected(f"the funnel's kind is {funnel['kind'].text()!r}, expected 'tube'")
+    if funnel["model"].text() != digests["model"]:
+        raise Mismatch("the funnel was made for another model")
+    model = read_model(documents["model"], funnel.get("box"))
+    tubes = [_read(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
+    given = proof.members("", "multipliers").get("multipliers")
+    trees: list[Node] | list[None] = [None] * len(tubes)
+    if given is not None:
+        trees = given.items(len(tubes), len(tubes))
+    margin = Fraction(1)
+    for tube, tree in zip(tubes, trees, strict=True):
+        definite(tube.P, "P")
+        definite(tube.R, "R")
+        positive(model, tree, _forms(model, tube))
+        for tau, width, signal in zip(tube.tau, tube.half_widths, model.y, strict=True):
+            used = (tube.level + tube.inlet) / (tau * width**2)
+            left = f"{signal.name} can leave the stated half-width {text.above(width)}"
+            at_most(used, 1, left)
+            margin = min(margin, 1 - used)
+    fitted = _fitted(documents["model"])
+    assumptions = [_start(model, tubes, funnel["settling"].whole(0, MAX_SAMPLES))]
+    if "box" in funnel:
+        assumptions.append(_inside(model, funnel["box"]))
+    for i, tube in enumerate(tubes, 1):
+        label = f"({i}) " if len(tubes) > 1 else ""
+        assumptions.append(label + _assumption(model, tube, fitted))
+    return Decision(_statement(model, tubes), margin, tuple(assumptions), digests)
 
 
-def _check_growth(model: Model, linear: Linear, tube: Tube, slack: Fraction, kappa: int) -> None:
-    """The two inequalities of the module's docstring at one κ."""
-    n, p = model.states, len(model.H)
-    mode = "the policy engaged" if kappa else "the nominal inputs played"
-    supply = [[tube.rho * entry for entry in row] + [Fraction(0)] * p for row in tube.P]
-    supply += [[Fraction(0)] * n + row for row in tube.R]
-    F = [
-        [f - kappa * b * k for f, k in zip(row, tube.K[0], strict=True)] + gain
-        for row, b, gain in zip(model.F, linear.B, tube.L, strict=True)
-    ]
-    kept = [[(1 - slack) * entry for entry in row] for row in supply]
-    what = f"the decrease of V up to the innovation's energy, {mode},"
-    definite(combined(kept, congruence(F, tube.P), -1), what)
+def _forms(model: Model, tube: Tube) -> list[tuple[str, Matrix]]:
+    """The two inequalities of the module's docstring, without the multipliers."""
+    p = len(model.H)
+    supply = block_diagonal(zero(model.unknowns), scaled(tube.P, tube.rho), tube.R)
+    F = [row + gain for row, gain in zip(model.F, tube.L, strict=True)]
+    growth = combined(supply, congruence(F, tube.P), -1)
+    forms = [("the decrease of V up to the innovation's energy", growth)]
     for j, (row, tau) in enumerate(zip(model.H, tube.tau, strict=True)):
-        output = [c - kappa * linear.D * k for c, k in zip(row, tube.K[0], strict=True)]
-        output += [Fraction(int(i == j)) for i in range(p)]
-        what = f"the bound on {model.y[j].name} by V, {mode},"
-        definite(combined(supply, congruence([output], [[tau]]), -1), what)
+        output = row + [Fraction(int(i == j)) for i in range(p)]
+        bound = combined(supply, congruence([output], [[tau]]), -1)
+        forms.append((f"the bound on {model.y[j].name} by V", bound))
+    return forms
 
 
-def _check_assumption(tube: Tube, linear: Linear) -> None:
-    if tube.assumption not in ("energy", "fading"):
-        raise Rejected(f"assumption {tube.assumption!r} is unknown; known: energy, fading")
-    if not 0 < tube.rho <= 1 or (tube.assumption == "energy") != (tube.rho == 1):
-        raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
-    if tube.samples > len(tube.u):
-        raise Rejected(f"the assumption covers {tube.samples} samples, the nominal {len(tube.u)}")
-    if min(tube.inlet, tube.budget, tube.measured) < 0 or tube.safety_factor < 1:
-        raise Rejected("inlet, budget, measured should be 0 or more, the safety factor 1 or more")
-    at_most(
-        tube.safety_factor**2 * tube.measured,
-        tube.budget,
-        "the budget is below safety_factor^2 x measured",
-    )
-    if not tube.trials:
-        raise Rejected("the assumption was measured on no trial")
-    low, high = linear.input_range
-    if any(not low <= entry <= high for (entry,) in tube.u):
-        raise Rejected("a nominal input is outside the model's input range")
-
-
-def _check_level(model: Model, linear: Linear, tube: Tube) -> None:
-    """√level >= √(inlet + budget) + Σ_k |δ_k|_P, δ_k what the nominal departs from the model by.
-
-    (Σ|δ_k|_P)² <= N Σ|δ_k|²_P =: q, and √level >= √s + √q is decided without roots: level - s - q
-    >= 0 and (level - s - q)² >= 4 s q.
-    """
-    departures = Fraction(0)
-    for x, (u,), after in zip(tube.x, tube.u, tube.x[1:], strict=False):
-        delta = [
-            [sum((f * v for f, v in zip(row, x, strict=True) if f and v), b * u + c - later)]
-            for row, b, c, later in zip(model.F, linear.B, linear.f, after, strict=True)
-        ]
-        departures += congruence(delta, tube.P)[0][0]
-    q = len(tube.u) * departures
-    s = tube.inlet + tube.budget
-    room = tube.level - s - q
-    if room < 0 or room**2 < 4 * s * q:
-        raise Rejected(
-            f"level {text.below(tube.level)} is below inlet + budget {text.above(s)} plus the "
-            f"nominal's departure from the model {text.above(text.root_above(q))}"
-        )
-
-
-def _statement(model: Model, linear: Linear, tube: Tube) -> str:
-    widths = " and ".join(
-        f"{signal.name} stays within {signal.quantity(text.above(width))}"
-        for signal, width in zip(model.y, tube.half_widths, strict=True)
-    )
-    how = "with the trajectory's inputs played (no feedback)"
-    if any(tube.K[0]):
-        low, high = linear.input_range
-        clipped = model.u[0].quantity(f"[{text.exact(low)}, {text.exact(high)}]")
-        how = (
-            "whether the trajectory's inputs are played, the policy is engaged around it, or "
-            "anything between the two acts, such as the policy's input clipped to a range that "
-            f"holds the trajectory's, as {clipped} holds the nominal's"
-        )
-    return (
-        f"tube: {widths} of every trajectory of the model that starts as assumed, the policy's "
-        f"nominal among them, for {tube.samples} samples, which span "
-        f"{text.below((tube.samples - 1) * model.period)} s, "
-        f"{how}"
-    )
-
-
-def _assumptions(model: Model, tube: Tube) -> tuple[str, ...]:
-    # One output: e is a number in its unit, and R multiplies its square.
-    single = len(model.y) == 1
-    squared = Signal("", f"({model.y[0].unit})^2" if single and model.y[0].unit else "")
-    energy = "e'Re" if not single else "e^2" if tube.R == [[1]] else f"{tube.R[0][0]} e^2"
-    start = "the observer starts at the trajectory's state"
-    if tube.inlet:
-        start = (
-            "the observer starts with V = xbar'P xbar <= "
-            f"{squared.quantity(text.below(tube.inlet))}, xbar its state minus the trajectory's"
-        )
-    budget = squared.quantity(text.below(tube.budget))
-    bound = f"sum of {energy} <= {budget} over {tube.samples} samples"
-    if tube.assumption == "fading":
-        bound = (
-            f"E <= {budget} after each of {tube.samples} samples, E+ = {text.exact(tube.rho)} E + "
-            f"{energy} from 0"
-        )
-    trials = "1 distinct trial" if tube.trials == 1 else f"{tube.trials} distinct trials"
-    return (
-        start,
-        f"innovation energy: {bound} (largest of {trials} {text.above(tube.measured)}, safety "
-        f"factor {text.below(tube.safety_factor)} in amplitude)",
-    )
-
-
-def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> Tube:
+def _read(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    plan = _opened(policy, "nlsid/policy", "period K L u x", "policy", ("model",), digests)
-    if plan["period"].number() != model.period:
-        raise Rejected("the policy's period is not the model's")
-    u = plan["u"].array(None, 1)
-    if not 0 < len(u) <= MAX_SAMPLES:
-        raise Rejected(f"the nominal should have 1 to {MAX_SAMPLES} samples")
-    if len(u) * n**2 > MAX_NOMINAL:
-        raise Rejected(f"{len(u)} samples of {n} states take too long to decide")
-    names = "rho P R level inlet tau half_widths assumption"
-    parts = _opened(funnel, "nlsid/funnel", names, "funnel", ("model", "policy"), digests)
-    given = parts["assumption"].members("kind budget samples measured safety_factor measured_on")
-    trials = [trial.members("name digest") for trial in given["measured_on"].items()]
-    for trial in trials:
-        trial["name"].text()
-    tau = parts["tau"].array(p)
-    if min(tau) <= 0:
-        raise Rejected("tau should be positive")
-    return Tube(
-        x=plan["x"].array(len(u), n), u=u, K=plan["K"].array(1, n), L=plan["L"].array(n, p),
-        P=parts["P"].array(n, n), R=parts["R"].array(p, p), rho=parts["rho"].number(),
-        level=parts["level"].number(), inlet=parts["inlet"].number(),
-        tau=tau, half_widths=parts["half_widths"].array(p),
-        assumption=given["kind"].text(), budget=given["budget"].number(),
-        samples=given["samples"].whole(1, MAX_SAMPLES), measured=given["measured"].number(),
-        safety_factor=given["safety_factor"].number(),
-        trials=len({trial["digest"].text() for trial in trials}),
+    parts = node.members("rho L P R tau half_widths level inlet assumption")
+    names = "kind measured safety_factor designed_on measured_on"
+    given = parts["assumption"].members(names, "samples")
+    kind = given["kind"].text()
+    if kind not in ("fading", "energy"):
+        raise Rejected(f"assumption {kind!r} is unknown; known: fading, energy")
+    if (kind == "energy") != ("samples" in given):
+        raise Rejected("the assumption energy is for a number of samples, fading for ever")
+    tube = Tube(
+        rho=parts["rho"].number(), L=parts["L"].array(n, p), P=parts["P"].array(n, n),
+        R=parts["R"].array(p, p), tau=parts["tau"].array(p),
+        half_widths=parts["half_widths"].array(p), level=parts["level"].number(),
+        inlet=parts["inlet"].number(),
+        samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
+        measured=given["measured"].number(), safety_factor=given["safety_factor"].number(),
+        trials=_trials(given["designed_on"], given["measured_on"]),
     )  # fmt: skip
+    if not 0 < tube.rho <= 1 or (kind == "energy") != (tube.rho == 1):
+        raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
+    if min(tube.tau) <= 0 or min(tube.half_widths) <= 0:
+        raise Rejected("tau and half-widths should be positive")
+    if min(tube.inlet, tube.measured) < 0 or tube.safety_factor < 1:
+        raise Rejected("inlet and measured should be 0 or more, the safety factor 1 or more")
+    least = tube.safety_factor**2 * tube.measured
+    at_most(least, tube.level, "the level is below safety_factor^2 x measured")
+    return tube
 
 
-def _opened(
-    node: Node, form: str, names: str, owner: str, roles: tuple[str, ...], digests: dict[str, str]
-) -> dict[str, Node]:
-    """The members of a policy or a funnel of kind linear that was made for these files."""
-    parts = node.members(f"format version kind {' '.join(roles)} {names}")
-    if parts["format"].text() != form or parts["version"].whole(0) != 2:
-        raise Rejected(f"the {owner} should be of format {form}, version 2")
-    if parts["kind"].text() != "linear":
-        raise Rejected(f"the {owner}'s kind is {parts['kind'].text()!r}, expected 'linear'")
-    for role in roles:
-        if parts[role].text() != digests[role]:
-            raise Mismatch(f"the {owner} was made for another {role}")
-    return parts
+def _trials(designed_on: Node, measured_on: Node) -> Trials:
+    """The trials by digest; none may be in both lists, and one or more is measured on."""
+    found: list[dict[str, str]] = []
+    for node in (designed_on, measured_on):
+        entries = {}
+        for trial in node.items(0, MAX_TRIALS):
+            parts = trial.members("name digest", "recording")
+            parts["name"].text()
+            digest = parts["digest"].text()
+            entries[digest] = parts["recording"].text() if "recording" in parts else digest
+        found.append(entries)
+    designed, measured = found
+    if not measured:
+        raise Rejected("the assumption was measured on no trial")
+    if set(designed) & set(measured):
+        raise Rejected("a trial that the tube was designed on cannot measure its assumption")
+    windows = sum(recording != digest for digest, recording in measured.items())
+    return Trials(set(designed), set(measured), windows)
+
+
+def _fitted(model: Node) -> set[str]:
+    """The digests of the recordings that the model was fitted on."""
+    if type(model.value) is not dict or "bags" not in model.value:
+        return set()
+    bags = Node(model.value["bags"], f"{model.where} bags")
+    return {bag.members("name digest")["digest"].text() for bag in bags.items(0, MAX_TRIALS)}
+
+
+def _statement(model: Model, tubes: list[Tube]) -> str:
+    said = []
+    for i, tube in enumerate(tubes, 1):
+        widths = " and ".join(
+            f"{signal.name} within {signal.quantity(text.above(width))}"
+            for signal, width in zip(model.y, tube.half_widths, strict=True)
+        )
+        how_long = "for ever"
+        if tube.samples is not None:
+            span = text.below((tube.samples - 1) * model.period)
+            how_long = f"for {tube.samples} samples, which span {span} s"
+        said.append(f"{f'({i}) ' if len(tubes) > 1 else ''}{widths} {how_long}")
+    return (
+        f"tube: the measured output stays near the model's simulation under the same inputs, "
+        f"{'; '.join(said)}, {model.inputs}"
+    )
+
+
+def _start(model: Model, tubes: list[Tube], settling: int) -> str:
+    span = text.above(settling * model.period)
+    start = f"after {settling} samples ({span} s) the simulation starts at the observer's state"
+    if not any(tube.inlet for tube in tubes):
+        return start
+    inlets = " and ".join(text.below(tube.inlet) for tube in tubes)
+    return f"{start}, or where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
+
+
+def _inside(model: Model, box: Node) -> str:
+    ranges = box.members("y u")
+    shown = ", ".join(
+        signal.quantity(f"{signal.name} in [{text.above(low)}, {text.below(high)}]")
+        for signals, key in ((model.y, "y"), (model.u, "u"))
+        for signal, (low, high) in zip(signals, ranges[key].array(len(signals), 2), strict=True)
+    )
+    return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
+
+
+def _assumption(model: Model, tube: Tube, fitted: set[str]) -> str:
+    # One output and R = 1: V and E carry its unit squared.
+    unit, energy = "", "e'Re"
+    if len(model.y) == 1:
+        unit = f"({model.y[0].unit})^2" if model.y[0].unit and tube.R == [[1]] else ""
+        energy = "e^2" if tube.R == [[1]] else f"{text.exact(tube.R[0][0])} e^2"
+    squared = Signal("", unit)
+    level = squared.quantity(text.below(tube.level))
+    bound = f"E <= {level} after every sample, E+ = {text.exact(tube.rho)} E + {energy} from 0"
+    if tube.samples is not None:
+        bound = f"sum of {energy} <= {level} over {tube.samples} samples"
+    m = len(tube.trials.measured_on)
+    known = len(tube.trials.measured_on & fitted)
+    said = f"{known} of which the model was fitted on, " if known else ""
+    if tube.trials.windows:
+        said += "windows of one recording, which are hardly exchangeable, "
+    return (
+        f"innovation energy: {bound} (largest of {m} distinct trial{'s' * (m > 1)}, {said}"
+        f"{text.above(tube.measured)}, safety factor {text.below(tube.safety_factor)} in "
+        "amplitude; a trial exchangeable with them exceeds their largest with probability "
+        f"1/{m + 1} at most)"
+    )

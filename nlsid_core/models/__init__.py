@@ -1,5 +1,7 @@
 """Identified models: frozen numbers, a document form, and simulation."""
 
+from typing import TypeAlias
+
 from nlsid_core.models.block_cascade import BlockCascade
 from nlsid_core.models.difference_equation import DifferenceEquation
 from nlsid_core.models.implicit import ImplicitModel
@@ -10,6 +12,11 @@ from nlsid_core.models.state_affine import StateAffineModel
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 
+# Models of recorded inputs and outputs that may be proved to forget their start.
+StableModel: TypeAlias = (
+    DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation | ImplicitModel
+)
+
 __all__ = [
     "BlockCascade",
     "DifferenceEquation",
@@ -17,6 +24,7 @@ __all__ = [
     "MonotoneEquation",
     "Signal",
     "Spline",
+    "StableModel",
     "StateAffineModel",
     "StateModel",
     "TrapezoidalModel",

@@ -30,7 +30,6 @@ from bags.designs.documents import load_proved_funnel
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
-from bags.signals.signal import SignalPath
 from nlsid_core.errors import NlsidError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
@@ -125,12 +124,11 @@ class Observer(Node):
 def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
     proved = load_proved_funnel(funnel)
-    model = proved.design.model
-    paths = [SignalPath.parse(model.y.path), SignalPath.parse(model.u.path)]
+    paths = [proved.design.response, proved.design.command]
     with Bag(bag) as source:
         topics = {path.topic: source.types_on(path.topic)[0] for path in paths}
     faulty = out / f"{bag.name}, {FAULT}"
-    write_faulty_copy(bag, faulty, model.y.path, FAULTS[FAULT])
+    write_faulty_copy(bag, faulty, str(paths[0]), FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
     with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
         with _node("funnel_monitor", {"allow_old_stamps": True}):

@@ -276,6 +276,15 @@ def test_a_bag_splits_at_the_repeats_of_its_excitation(tmp_path: Path) -> None:
         run("split", f1tenth()[0], "--out", tmp_path / "none", "--repeats", COMMAND)
 
 
+def test_a_recovery_that_lost_something_ends_with_status_1(bag: Path, tmp_path: Path) -> None:
+    file = next(bag.glob("*.mcap"))
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    output = run("recover", damaged, "--out", tmp_path / "whole", status=1)
+    assert "places were lost" in output
+    run("recover", bag, "--out", tmp_path / "copy")
+
+
 def test_custom_types_survive_cutting_and_recovery(tmp_path: Path) -> None:
     cougars = SHARED / "cougars_auv" / "SO_lastbag_mcap"
     if not cougars.is_dir():

@@ -1,6 +1,7 @@
 """The chain on the shipped F1TENTH bags, through the command line, with the promised figures."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +18,19 @@ from bags.chain.training import load_training
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
+from bags.recordings.bag import Bag
+from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from bags.signals.signal import SignalPath
+from nlsid_core import files
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Status
 
 CONFIG = config_file("f1tenth.yaml")
+SPEED = "/odom:twist.twist.linear.x"
 TEST = ("05", "11", "16", "22", "27", "33", "38", "41")
 
 
@@ -56,7 +61,10 @@ def trial(name: str) -> Path:
 
 
 def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Path) -> None:
-    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    """On the trials for which they were first measured, all but the test trials."""
+    split = config.split.model_copy(update={"calibration": ()})
+    everything = config.model_copy(update={"split": split})
+    result = identify_bags(f1tenth(), everything, tmp_path, progress=lambda _w, _f: None)
     errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     assert errors["least_squares"] == pytest.approx(11.7, abs=0.05)
     assert errors["sem"] == pytest.approx(8.5, abs=0.05)
@@ -64,6 +72,18 @@ def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Pat
     assert result.fit.chosen.proof is not None
     assert set(result.test.names) == {f"trial_{k}" for k in TEST}
     assert len(result.train) == 33
+
+
+def test_errors_without_the_calibration_trials_are_as_documented(
+    config: Config, tmp_path: Path
+) -> None:
+    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
+    assert errors["least_squares"] == pytest.approx(11.52, abs=0.05)
+    assert errors["rse_first"] == pytest.approx(12.60, abs=0.05)
+    assert errors["rse"] == pytest.approx(8.00, abs=0.05)
+    assert errors["sem"] == pytest.approx(8.00, abs=0.05)
+    assert len(result.train) == 17
 
 
 def test_test_trials_do_not_influence_the_model(
@@ -79,11 +99,68 @@ def test_test_trials_do_not_influence_the_model(
 def test_the_model_names_the_bags_it_was_fitted_to(chain: Path) -> None:
     model = documents.load_model(chain / documents.MODEL)
     names = [name for name, _ in model.bags]
-    assert len(names) == 33
+    assert len(names) == 17
     assert not {f"trial_{k}" for k in TEST} & set(names)
     assert all(digest.startswith("sha256:") for _, digest in model.bags)
     train = load_training(chain / documents.TRAINING, digest=model.training)
     assert train.names == tuple(names)
+
+
+def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
+    config: Config, chain: Path
+) -> None:
+    model = documents.load_model(chain / documents.MODEL)
+    proved = documents.load_proved_funnel(chain / documents.FUNNEL)
+    assumption = proved.design.funnel.assumption
+    assert {name for name, _ in assumption.measured_on} == set(config.split.calibration)
+    assert set(assumption.designed_on) == set(model.bags)
+    assert not {d for _, d in assumption.measured_on} & {d for _, d in model.bags}
+    assert "exceeds their largest with probability at most 1/17)" in proved.verdict.assumptions[1]
+
+
+def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
+    out, model = str(tmp_path / "again"), str(chain / documents.MODEL)
+    made = CliRunner().invoke(
+        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", out]
+    )
+    said = " ".join(made.output.replace("│", " ").split())
+    assumption = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.assumption
+    budget, measured = re.search(r"e\^2 <= (\S+) .* taken whole, (\S+), safety", said).groups()  # type: ignore[union-attr]
+    assert 0.999 * assumption.budget < float(budget) <= assumption.budget
+    assert assumption.measured <= float(measured) < 1.001 * assumption.measured
+    assert "probability at most 1/17" in said
+
+
+def test_a_model_of_another_class_is_named_as_configurations_name_it(
+    chain: Path, config: Config, tmp_path: Path
+) -> None:
+    model = json.loads((chain / documents.MODEL).read_text()) | {"kind": "implicit"}
+    files.write_document(tmp_path / documents.MODEL, model)
+    with pytest.raises(DataError, match=r"kind is 'implicit', expected .* `model: linear`"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+
+
+def test_a_tube_is_not_scaled_on_training_trials_where_calibration_trials_are_named(
+    config: Config, chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING):
+        shutil.copy(chain / name, tmp_path)
+    with pytest.raises(DataError, match=r"split\.calibration names bags, and held_back\.npz"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+
+
+def test_trials_held_back_from_another_model_are_refused(
+    config: Config, chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+        shutil.copy(chain / name, tmp_path)
+    model = json.loads((tmp_path / documents.MODEL).read_text())
+    files.write_document(tmp_path / documents.MODEL, model | {"c": 0.0})
+    with pytest.raises(DataError, match="not trials held back from this model"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+    (tmp_path / documents.HELD_BACK).write_bytes(b"PK")
+    with pytest.raises(DataError, match="not trials held back"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
 
 
 def test_check_prints_proved_for_both_proofs(chain: Path) -> None:
@@ -93,6 +170,10 @@ def test_check_prints_proved_for_both_proofs(chain: Path) -> None:
     lines = [line for line in done.output.splitlines() if not line.startswith(" ")]
     assert len(lines) == 2
     assert all(line.startswith("PROVED ") and " margin " in line for line in lines)
+    said = [line.removeprefix("PROVED ").split(": ")[0] for line in lines]
+    assert said == proofs, "of several files each is named"
+    alone = CliRunner().invoke(app, ["check", proofs[1]])
+    assert alone.output.startswith("PROVED tube: ")
 
 
 def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_path: Path) -> None:
@@ -102,8 +183,42 @@ def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_pat
     (tmp_path / documents.MODEL).write_text(text.replace('"period": 0.025', '"period": 0.026'))
     done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
     assert done.exit_code == 1
-    assert done.output.startswith("REJECTED")
+    assert done.output.startswith(f"REJECTED {tmp_path / documents.FUNNEL_PROOF}: ")
     assert "model.json is not the model this proof is about" in done.output
+
+
+def test_a_prediction_tube_needs_no_profile(chain: Path, tmp_path: Path) -> None:
+    path = edited(tmp_path, funnel__policy="none", funnel__profile=None)
+    found = design_funnel_files(chain / documents.MODEL, load_config(path), tmp_path / "out")
+    assert not found.policy.K.any()
+    replayed = replay(tmp_path / "out", trial("05"))
+    assert replayed.verdict == Status.INSIDE.value
+    assert len(replayed.judged) > 100
+
+
+def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
+    chain: Path, tmp_path: Path
+) -> None:
+    """The last command of a bag is thrown away: identification refuses the bag, so does replay."""
+    bag = tmp_path / "trial_05"
+    with Bag(trial("05")) as source, BagWriter(bag) as target:
+        messages = list(source.messages())
+        last = max(m.log_time_ns for m in messages) - 500_000_000
+        for message in messages:
+            if message.topic == "/cmd_vel" and message.log_time_ns > last:
+                continue
+            kind, _ = source.types_on(message.topic)
+            times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
+            target.write(message.topic, kind, message.data, **times)
+    signals = {"responses": [SPEED], "excitations": ["/cmd_vel:twist.linear.x"]}
+    [whole] = read_dataset([trial("05")], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
+    [fewer] = read_dataset([bag], **signals, period=0.025, max_gap=0.1)  # type: ignore[arg-type]
+    assert documents.load_model(chain / documents.MODEL).u.path.endswith("|hold(0.1 s)")
+    replayed = replay(chain, bag)
+    judged = len(replayed.judged) + len(documents.load_model(chain / documents.MODEL))
+    assert len(fewer) == judged < len(whole)
+    assert replayed.verdict == Status.UNKNOWN.value
+    assert "at most 0.1 s is held" in replayed.reason
 
 
 def replay(chain: Path, bag: Path) -> Replay:
@@ -112,7 +227,7 @@ def replay(chain: Path, bag: Path) -> Replay:
 
 
 def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
-    split = config.split.model_copy(update={"test": ("trial_05", "trial_5")})
+    split = config.split.model_copy(update={"test": ("trial_05", "trial_5"), "calibration": ()})
     bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
     given = config.model_copy(update={"split": split})
     trials = read_trials(bags, given, progress=lambda _w, _f: None)
@@ -218,7 +333,7 @@ def test_with_policy_none_the_funnel_is_a_prediction_tube(
     prediction = config.model_copy(
         update={"funnel": config.funnel.model_copy(update={"policy": None})}
     )
-    for name in (documents.MODEL, documents.TRAINING):
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
     design = design_funnel_files(tmp_path / documents.MODEL, prediction, tmp_path)
     assert not design.policy.K.any()
@@ -258,6 +373,8 @@ def edited(tmp_path: Path, **changes: object) -> Path:
         ({"grid__period": float("nan")}, "grid.period"),
         ({"grid__perod": 0.1}, "grid.perod"),
         ({"funnel__profile": [[0.0, 0.0]]}, "funnel.profile"),
+        ({"funnel__profile": [[0.0, 0.0], [0.0, 1.0]]}, "times should increase"),
+        ({"funnel__profile": None}, "an LQR policy tracks a profile"),
         ({"funnel__safety_factor": 0.9}, "funnel.safety_factor"),
         ({"monitor__nominal": "guess"}, "monitor.nominal"),
     ],

@@ -1,5 +1,6 @@
 """What the section `identification` refuses: key, value and what is allowed are named."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ from tests.identified_bags import write_config
 def test_each_section_says_a_model_class(
     tmp_path: Path, section: dict[str, Any], expected: object
 ) -> None:
-    config = load_config(write_config(tmp_path / "robot.yaml", section))
+    inputs = sum(isinstance(pair, list) for pair in section.get("input_range", ())) or 1
+    config = load_config(write_config(tmp_path / "robot.yaml", section, inputs=inputs))
     assert config.identification.model_class == expected
 
 
@@ -127,3 +129,78 @@ def test_a_wrong_entry_of_compare_is_found_by_its_number(tmp_path: Path) -> None
     path = write_config(tmp_path / "robot.yaml", {"lags": 2}, compare=[{"lags": 1}, {"lags": 0}])
     with pytest.raises(DataError, match=r"compare\.1\.lags: .*\(found 0\)"):
         load_config(path)
+
+
+def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path: Path) -> None:
+    """Two unknown keys and two wrong values in three sections, in one message."""
+    sections: dict[str, Any] = {
+        "grid": {"perod": 0.01, "period": -1.0, "max_gap": 0.05},
+        "monitor": {"stale_after": "soon", "nominl": "profile"},
+    }
+    path = write_config(tmp_path / "robot.yaml", {"lag": 4, "transient": -1}, **sections)
+    with pytest.raises(DataError) as caught:
+        load_config(path)
+    said = str(caught.value).splitlines()
+    for line in (
+        r"grid\.perod: there is no such key; there are: period, max_gap, .*; did you mean 'period'",
+        r"grid\.period: Input should be greater than 0, in s \(found -1\.0\)",
+        r"monitor\.stale_after: Input should be a valid number, in s \(found 'soon'\)",
+        r"monitor\.nominl: there is no such key; .*; did you mean 'nominal'\?",
+        r"identification\.lags: Field required",
+        r"identification\.transient: Input should be greater than or equal to 0 \(found -1\)",
+        r"identification\.lag: there is no such key; there are: model, lags, .*mean 'lags'",
+    ):
+        assert any(re.search(line, entry) for entry in said), line
+    assert len(said) == 8
+
+
+@pytest.mark.parametrize(
+    ("sections", "reason"),
+    [
+        ({"grid": {"period": 0.2, "max_gap": 0.1}}, r"grid\.max_gap: 0\.1 s is shorter"),
+        ({"grid": {"period": 0.2, "max_gap": 0.3}}, r"monitor\.stale_after: 0\.1 s is not longer"),
+        ({"funnel": {"horizon": 0.001, "policy": "none"}}, r"funnel\.horizon: .* not one sample"),
+        ({"split": {"test": ["a"], "validation": ["a"]}}, "'a' is named for test and for"),
+        ({"inputs": 2}, "identification.model: a LinearClass has one response and one excitation"),
+        ({"identification": {"model": "monotone", "lags": 2},
+          "funnel": {"horizon": 1.0, "policy": "none"}}, "funnel: a tube is designed for"),
+        ({"identification": {"model": "state_affine", "lags": 2, "input_range": [[0, 1], [0, 2]]}},
+         "input_range: 2 pairs .* needs 1"),
+        ({"select": {"lags": [1, 0]}}, r"select\.lags: .*\(found 0\)"),
+    ],
+)  # fmt: skip
+def test_what_no_later_step_could_use_is_refused_when_the_file_is_read(
+    tmp_path: Path, sections: dict[str, Any], reason: str
+) -> None:
+    given = {**sections}
+    section = given.pop("identification", {"lags": 2})
+    with pytest.raises(DataError, match="a later step could not use it") as caught:
+        load_config(write_config(tmp_path / "robot.yaml", section, **given))
+    assert re.search(reason, str(caught.value))
+
+
+def test_signals_that_cannot_be_sampled_together_are_refused_all_at_once(tmp_path: Path) -> None:
+    signals = {
+        "response": {"name": "speed", "path": "/odom:twist.twist.linear.x|derivtive(1 s)"},
+        "excitation": [
+            {"name": "speed", "path": "/cmd:effort[*]"},
+            {"name": "steering", "path": "odom"},
+        ],
+    }
+    section = {"model": "state_affine", "lags": 2}
+    with pytest.raises(DataError) as caught:
+        load_config(write_config(tmp_path / "robot.yaml", section, signals=signals))
+    for part in (
+        "signals.response.path: 'derivtive(1 s)' in",
+        "did you mean 'derivative'",
+        "signals.excitation.0.path: /cmd:effort[*] is several signals",
+        "signals.excitation.0.name: 'speed' is that of signals.response too",
+        "signals.excitation.1.path: 'odom' has no ':'",
+    ):
+        assert part in str(caught.value)
+    clocks = {
+        "response": {"name": "speed", "path": "/odom:twist.twist.linear.x"},
+        "excitation": {"name": "command", "path": "/cmd:linear.x|clock(log)"},
+    }
+    with pytest.raises(DataError, match="signals on two clocks cannot be paired"):
+        load_config(write_config(tmp_path / "robot.yaml", section, signals=clocks))

@@ -213,7 +213,7 @@ def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_
     ):
         assert part in str(caught.value)
     [trial] = read_dataset([bag], **signals, period=0.025, max_gap=0.1, clock="log")  # type: ignore[arg-type]
-    assert trial.u_paths == (f"{CMD}:linear.x|clock(log)",)
+    assert trial.u_paths == (f"{CMD}:linear.x|clock(log)|hold(0.1 s)",)
     assert len(trial) == 190
     with pytest.raises(BagError, match=r"/cmd_vel .* has no header stamp; .*`clock: log`"):
         Sampler([SPEED], [f"{CMD}:linear.x"], period=0.025).check(

@@ -93,11 +93,9 @@ def test_the_whole_chain_runs_from_one_configuration(tmp_path: Path) -> None:
     assert "PROVED funnel" in result.output
     checked = CliRunner().invoke(app, ["check", str(out / "funnel.proof.json")])
     assert checked.output.startswith("PROVED")
-    bags = [
-        "track", "monitor", str(out / "runs"), "--config", str(config),
-        "--funnel", str(out / "funnel.json"),
-    ]  # fmt: skip
-    assert CliRunner().invoke(app, bags).exit_code == 0
+    bags = ["track", "monitor", str(out / "runs"), "--funnel", str(out / "funnel.json")]
+    monitored = CliRunner().invoke(app, bags)
+    assert monitored.exit_code == 0, monitored.output
     fitted = [
         "track", "funnel", str(out / "excitations"), "--config", str(config), "--design", str(out),
     ]  # fmt: skip

@@ -4,7 +4,7 @@ Fractions, plain lists; matrices are decided by LDL' with fractions, Bernstein c
 from interpolation, and nothing is shared with the kernel or the prover.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from itertools import product
 from typing import Any
@@ -180,17 +180,26 @@ def value_at(model: Json, w: list[Fraction]) -> Rows:
 
 
 def bernstein(model: Json, box: list[tuple[Fraction, Fraction]]) -> list[Rows]:
-    """The Bernstein coefficients on the box, by interpolation at equally spaced points."""
+    """The Bernstein coefficients of [G_0 … G_n] on the box."""
     degrees = [
         max(powers[j] for G in model["G"] for powers in G["exponents"]) for j in range(len(box))
     ]
+    return interpolated(lambda w: value_at(model, w), degrees, box)
+
+
+def interpolated(
+    function: Callable[[list[Fraction]], Rows],
+    degrees: list[int],
+    box: list[tuple[Fraction, Fraction]],
+) -> list[Rows]:
+    """Bernstein coefficients of a matrix polynomial, from its values at equally spaced points."""
     values = {}
     for index in product(*(range(d + 1) for d in degrees)):
         w = [
             low + (high - low) * Fraction(k, d) if d else low
             for k, d, (low, high) in zip(index, degrees, box, strict=True)
         ]
-        values[index] = value_at(model, w)
+        values[index] = function(w)
     for axis, d in enumerate(degrees):
         matrix = [
             [

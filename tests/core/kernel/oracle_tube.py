@@ -1,136 +1,265 @@
 """Claim `tube` decided a second time, written from docs/certificate_tube.md alone, in Fractions.
 
-Definiteness is decided by LDL' (as in the other oracle, which shares nothing with the kernel), and
-`runs` plays exact runs of the observer, to hold a claim against what it says.
+Of the increment form, what docs/certificate_stability.md states comes from that page's oracle.
 """
 
-import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from fractions import Fraction
+from itertools import product
+from typing import Any
 
 from nlsid_core import files
-from tests.core.kernel.oracle_stability import Json, Rows, is_definite
+from tests.core.kernel import oracle_driven_tube
+from tests.core.kernel.oracle_stability import (
+    Json,
+    Rows,
+    between,
+    cascade,
+    exact,
+    increments,
+    interpolated,
+    is_definite,
+    vertices,
+    zeros,
+)
+
+Box = list[tuple[Fraction, Fraction]]
 
 
-def rows(values: list[list[float]]) -> Rows:
-    return [[Fraction(entry) for entry in row] for row in values]
+def matrix(values: list[list[float]], rows: int, columns: int) -> Rows:
+    found = [[exact(entry) for entry in row] for row in values]
+    if len(found) != rows or any(len(row) != columns for row in found):
+        raise ValueError("shape")
+    return found
 
 
-def parts(model: Json) -> tuple[Rows, list[Fraction], list[Fraction], Fraction, Fraction]:
-    """A, B, f, D, c."""
-    a, b = ([Fraction(entry) for entry in model[key]] for key in "ab")
-    c, n = Fraction(model["c"]), len(model["a"])
-    A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
-    return A, [b[i + 1] + a[i] * b[0] for i in range(n)], [entry * c for entry in a], b[0], c
+def outputs(model: Json, m: int, n: int) -> Rows:
+    """H."""
+    kind = model["kind"]
+    if kind == "difference_equation":
+        return [[Fraction(int(j == 0)) for j in range(n)]]
+    if kind == "block_cascade":
+        M, n1, n2, _, _ = cascade(model)
+        row = [exact(b[0]) for b in model["b2"]] + [Fraction(0)] * n
+        if n2:
+            row[M + n1] = Fraction(1)
+        return [row]
+    scales = model.get("y_scale", [1.0] * m)
+    if kind == "monotone_equation" or kind == "implicit":
+        scales = [1.0] * m
+    return [[exact(scales[j]) if i == j else Fraction(0) for i in range(m + n)] for j in range(m)]
 
 
-def closed(model: Json, policy: Json, kappa: Fraction) -> tuple[Rows, list[Fraction]]:
-    """A - κBK and C - κDK."""
-    A, B, _, D, _ = parts(model)
-    K = [Fraction(entry) for entry in policy["K"][0]]
-    n = len(A)
-    F = [[A[i][j] - kappa * B[i] * K[j] for j in range(n)] for i in range(n)]
-    return F, [Fraction(int(j == 0)) - kappa * D * K[j] for j in range(n)]
+class Implicit:
+    """The increment form of an implicit model."""
 
-
-def is_proved(documents: Json, slack: float) -> bool:
-    """Whether every obligation holds, for the documents by role."""
-    model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    P, R = rows(funnel["P"]), rows(funnel["R"])
-    n, rho, kept = len(P), Fraction(funnel["rho"]), 1 - Fraction(slack)
-    tau, width = Fraction(funnel["tau"][0]), Fraction(funnel["half_widths"][0])
-    level, inlet = Fraction(funnel["level"]), Fraction(funnel["inlet"])
-    given = funnel["assumption"]
-    budget, measured = Fraction(given["budget"]), Fraction(given["measured"])
-    factor, samples = Fraction(given["safety_factor"]), given["samples"]
-    low, high = (Fraction(end) for end in model["u_range"])
-    u, x = [Fraction(entry[0]) for entry in policy["u"]], rows(policy["x"])
-    if not (0 < kept < 1 and is_definite(P) and is_definite(R) and 0 < rho <= 1):
-        return False
-    if (given["kind"] == "energy") != (rho == 1) or tau <= 0 or width <= 0:
-        return False
-    L = [Fraction(entry[0]) for entry in policy["L"]]
-    for kappa in (Fraction(0), Fraction(1)):
-        F, output = closed(model, policy, kappa)
-        wide = [[*F[i], L[i]] for i in range(n)]
-        supply = [[rho * entry for entry in row] + [Fraction(0)] for row in P]
-        supply.append([Fraction(0)] * n + [R[0][0]])
-        size = range(n + 1)
-        columns = [[row[i] for row in wide] for i in size]
-        growth = [[kept * supply[i][j] - between(columns[i], P, columns[j]) for j in size]
-                  for i in size]  # fmt: skip
-        h = [*output, Fraction(1)]
-        bound = [[supply[i][j] - tau * h[i] * h[j] for j in size] for i in size]
-        if not (is_definite(growth) and is_definite(bound)):
-            return False
-    if level > tau * width**2 or Fraction(policy["period"]) != Fraction(model["period"]):
-        return False
-    if any(not low <= entry <= high for entry in u) or not 1 <= samples <= len(u):
-        return False
-    if min(inlet, budget, measured) < 0 or factor < 1 or budget < factor**2 * measured:
-        return False
-    if not given["measured_on"]:
-        return False
-    A, B, f, _, _ = parts(model)
-    q = Fraction(0)
-    for k in range(len(u) - 1):
-        d = [
-            sum((A[i][j] * x[k][j] for j in range(n)), B[i] * u[k] + f[i]) - x[k + 1][i]
-            for i in range(n)
+    def __init__(self, model: Json) -> None:
+        self.p = len(model["h"]["coefficients"][0])
+        self.n, self.q = len(model["states"]), len(model["inputs"])
+        assert len(model["y"]) == self.p
+        assert self.n % self.p == 0
+        assert len(model["window"]) == self.q
+        self.terms = [
+            (tuple(e), [exact(c) for c in row])
+            for e, row in zip(model["h"]["exponents"], model["h"]["coefficients"], strict=True)
         ]
-        q += len(u) * V(P, d)
-    s = inlet + budget
-    return level - s - q >= 0 and (level - s - q) ** 2 >= 4 * s * q
+        self.model = model
+
+    def F(self) -> Rows:
+        p, n = self.p, self.n
+        F = zeros(n, p + n)
+        for i in range(p):
+            F[i][i] = Fraction(1)
+        if "shift" in self.model:
+            shift = self.model["shift"]
+            for e, row in zip(shift["exponents"], shift["coefficients"], strict=True):
+                for k, c in enumerate(row):
+                    if c and any(e[:n]):
+                        assert sum(e) == 1
+                        F[p + k][p + e.index(1)] += exact(c)
+        return F
+
+    def slope(self, z: list[Fraction]) -> Rows:
+        """∂h/∂(v, x) at z = (v, x, w)."""
+        size = self.p + self.n
+        E = zeros(self.p, size)
+        for e, row in self.terms:
+            for j in range(size):
+                if e[j]:
+                    value = Fraction(e[j])
+                    for k, power in enumerate(e):
+                        value *= z[k] ** (power - int(k == j))
+                    for i in range(self.p):
+                        E[i][j] += value * row[i]
+        return E
+
+    @property
+    def known(self) -> list[tuple[tuple[int, ...], list[Fraction]]]:
+        """The terms that depend on v or x."""
+        return [(e, row) for e, row in self.terms if any(e[: self.p + self.n]) and any(row)]
+
+    def everywhere(self) -> tuple[Rows, bool] | None:
+        """E and whether there is a ray, of a model that needs no box."""
+        size = self.p + self.n
+        if all(sum(e) == 1 for e, _ in self.known):
+            return self.slope([Fraction(0)] * (size + self.q)), False
+        if self.p != 1:
+            return None
+        cubic = [Fraction(0)] * 4
+        for e, (c,) in self.known:
+            pure = sum(e) == e[0]
+            if not (sum(e) == 1 or (pure and e[0] <= 3)):
+                return None
+            if pure:
+                cubic[e[0]] += c
+        if cubic[3] <= 0:
+            return None
+        E = self.slope([Fraction(0)] * (size + self.q))
+        E[0][0] = cubic[1] - cubic[2] ** 2 / (3 * cubic[3])
+        return E, True
+
+    def box(self, given: Json) -> Box:
+        y = [(exact(low), exact(high)) for low, high in given["y"]]
+        u = [(exact(low), exact(high)) for low, high in given["u"]]
+        assert len(y) == self.p
+        assert len(u) == len(self.model["u"])
+        assert all(low < high for low, high in [*y, *u])
+        return [*y, *y * (self.n // self.p), *(u[i] for i, _ in self.model["window"])]
+
+    def hull(self, box: Box) -> list[Rows]:
+        size = self.p + self.n
+        degrees = [0] * (size + self.q)
+        for e, row in self.terms:
+            for j in range(size):
+                if e[j] and any(row):
+                    for k, power in enumerate(e):
+                        degrees[k] = max(degrees[k], power - int(k == j))
+        return interpolated(self.slope, degrees, box)
 
 
-def between(left: list[Fraction], P: Rows, right: list[Fraction]) -> Fraction:
-    """left'P right."""
-    n = range(len(P))
-    return sum((left[i] * P[i][j] * right[j] for i in n for j in n), Fraction(0))
+def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
+    """F, m, the box, whether there is a ray, and the E_i of a part of the box with its ends."""
+    if model["kind"] != "implicit":
+        assert given is None
+        F, m, box = increments(model)
+
+        def hull(part: Box, ends: Json | None) -> list[Rows] | None:
+            return vertices(model, part) if ends is None else between(model, part, ends)
+
+        return F, m, box, model["kind"] == "monotone_equation", hull
+    implicit = Implicit(model)
+    found = implicit.everywhere()
+    if found is not None:
+        assert given is None
+        E, ray = found
+        return implicit.F(), implicit.p, [], ray, lambda _, __: [E]
+    assert given is not None
+    return implicit.F(), implicit.p, implicit.box(given), False, lambda box, _: implicit.hull(box)
 
 
-def V(P: Rows, x: list[Fraction]) -> Fraction:
-    return between(x, P, x)
+def quadratic(rows: Rows, P: Rows) -> Rows:
+    """rows'P rows."""
+    size, n = len(rows[0]), len(rows)
+    PF = [[sum((P[a][b] * rows[b][j] for b in range(n)), Fraction(0)) for j in range(size)]
+          for a in range(n)]  # fmt: skip
+    return [[sum((rows[a][i] * PF[a][j] for a in range(n)), Fraction(0)) for j in range(size)]
+            for i in range(size)]  # fmt: skip
 
 
-def runs(documents: Json, rng: random.Random, samples: int) -> Iterator[tuple[Fraction, Fraction]]:
-    """(o, E) of an exact run with random start in the inlet, innovations, and κ at every sample."""
-    model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
-    P, rho = rows(funnel["P"]), Fraction(funnel["rho"])
-    n, R = len(P), Fraction(funnel["R"][0][0])
-    inlet, budget = Fraction(funnel["inlet"]), Fraction(funnel["assumption"]["budget"])
-    L = [Fraction(entry[0]) for entry in policy["L"]]
-    x = [Fraction(rng.randrange(-8, 9)) for _ in range(n)]
-    while inlet and V(P, x) > inlet:
-        x = [entry / 2 for entry in x]
-    if not inlet:
-        x = [Fraction(0)] * n
-    E = Fraction(0)
-    for _ in range(samples):
-        e = Fraction(rng.randrange(-8, 9), 4)
-        for _ in range(60):
-            if rho * E + R * e * e > budget:
-                e /= 2
-        if rho * E + R * e * e > budget:
-            e = Fraction(0)
-        E = rho * E + R * e * e
-        F, output = closed(model, policy, Fraction(rng.randrange(5), 4))
-        yield sum((h * entry for h, entry in zip(output, x, strict=True)), e), E
-        x = [sum((F[i][j] * x[j] for j in range(n)), L[i] * e) for i in range(n)]
-        x = [entry.limit_denominator(10**12) for entry in x]
+def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any) -> bool:
+    """(D) and every (O_j)."""
+    box, ray, hull = shape
+    n, p = len(F), len(H)
+    size, rho = m + n + p, exact(tube["rho"])
+    P, R = matrix(tube["P"], n, n), matrix(tube["R"], p, p)
+    L, tau = matrix(tube["L"], n, p), [exact(t) for t in tube["tau"]]
+    if not (is_definite(P) and is_definite(R) and len(tau) == p and min(tau) > 0):
+        return False
+    supply = zeros(size, size)
+    for i, j in product(range(n), range(n)):
+        supply[m + i][m + j] = rho * P[i][j]
+    for i, j in product(range(p), range(p)):
+        supply[m + n + i][m + n + j] = R[i][j]
+    moved = quadratic([F[i] + L[i] for i in range(n)], P)
+    forms = [
+        [[a - b for a, b in zip(x, y, strict=True)] for x, y in zip(supply, moved, strict=True)]
+    ]
+    for j in range(p):
+        h = H[j] + [Fraction(int(i == j)) for i in range(p)]
+        forms.append(
+            [[supply[a][b] - tau[j] * h[a] * h[b] for b in range(size)] for a in range(size)]
+        )
+    if m == 0:
+        return tree is None and all(is_definite(M) for M in forms)
+    assert tree is not None
+
+    def proved(tree: Json, box: Box) -> bool:
+        if "split" in tree:
+            assert set(tree) == {"split", "parts"}
+            i = tree["split"]
+            low, high = box[i]
+            halves = [(low, (low + high) / 2), ((low + high) / 2, high)]
+            return all(
+                proved(part, [*box[:i], half, *box[i + 1 :]])
+                for part, half in zip(tree["parts"], halves, strict=True)
+            )
+        Ns = [matrix(N, size, m) for N in tree["N"]]
+        if len(Ns) != p + 1:
+            return False
+        if ray and any(N[0][0] < 0 or any(row[0] != 0 for row in N[1:]) for N in Ns):
+            return False
+        found = hull(box, tree.get("ends"))
+        if found is None:
+            return False
+        for E, (M, N) in product(found, zip(forms, Ns, strict=True)):
+            cross, whole = zeros(size, size), zeros(size, size)
+            for i, j in product(range(size), range(m + n)):
+                cross[i][j] = sum((N[i][k] * E[k][j] for k in range(m)), Fraction(0))
+            whole = [
+                [M[i][j] + cross[i][j] + cross[j][i] for j in range(size)] for i in range(size)
+            ]
+            if not is_definite(whole):
+                return False
+        return True
+
+    return proved(tree, box)
+
+
+def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
+    """Whether every obligation holds, for the funnel's and the proof's content."""
+    F, m, box, ray, hull = form(model, funnel.get("box"))
+    H = outputs(model, m, len(F))
+    trees = proof.get("multipliers", [None] * len(funnel["tubes"]))
+    if not 1 <= len(trees) == len(funnel["tubes"]) <= 8 or ("multipliers" in proof) != (m > 0):
+        return False
+    for tube, tree in zip(funnel["tubes"], trees, strict=True):
+        given, rho = tube["assumption"], exact(tube["rho"])
+        level, inlet = exact(tube["level"]), exact(tube["inlet"])
+        measured, factor = exact(given["measured"]), exact(given["safety_factor"])
+        if not 0 < rho <= 1 or (given["kind"] == "energy") != (rho == 1):
+            return False
+        if inlet < 0 or measured < 0 or factor < 1 or level < factor**2 * measured:
+            return False
+        before, on = ({t["digest"] for t in given[k]} for k in ("designed_on", "measured_on"))
+        if not on or before & on:
+            return False
+        if not holds(F, H, m, tube, tree, (box, ray, hull)):
+            return False
+        for tau, width in zip(tube["tau"], tube["half_widths"], strict=True):
+            if not width > 0 or level + inlet > exact(tau) * exact(width) ** 2:
+                return False
+    return True
 
 
 def agrees(document: Json, about: Mapping[str, Json]) -> bool:
-    """Whether a proof document about these files proves its claim."""
+    """Whether a proof document about these files proves its claim, with or without a policy."""
     try:
         bindings = document["claim"]["about"]
-        documents = {role: about[bindings[role]["file"]] for role in ("model", "policy", "funnel")}
-        policy, funnel = documents["policy"], documents["funnel"]
-        digest = {role: files.digest(entry) for role, entry in documents.items()}
-        if policy["model"] != digest["model"] or funnel["model"] != digest["model"]:
+        if "policy" in bindings:
+            return oracle_driven_tube.agrees(document, about)
+        model, funnel = (about[bindings[role]["file"]] for role in ("model", "funnel"))
+        if funnel["model"] != files.digest(model):
             return False
-        return funnel["policy"] == digest["policy"] and is_proved(
-            documents, document["proof"]["slack"]
-        )
-    except (ArithmeticError, LookupError, TypeError, ValueError):
+        return is_proved(model, funnel, document["proof"])
+    except (ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
         return False

@@ -1,0 +1,111 @@
+"""`nlsid init`: a first configuration from bags, asked for on a terminal or said by options."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from bags.recordings.definitions import read_definitions
+from bags.recordings.folders import expand_bags
+from bags.setup.candidates import Candidate, Found, look
+from bags.setup.proposal import Proposal, choose, propose
+from bags.setup.written import yaml_text
+from nlsid_core.errors import DataError
+from nlsid_core.files import write_atomically
+
+SHOWN = 9  # candidates in a question
+
+
+def run_init(
+    console: Console,
+    bags: Sequence[Path],
+    target: Path,
+    *,
+    responses: Sequence[str],
+    excitations: Sequence[str],
+    definitions: Sequence[Path],
+    robot: str,
+    yes: bool,
+) -> Proposal:
+    """Look, ask what is not said, try it on the bags, write the YAML; DataError if `target` exists.
+
+    Without a terminal what is not said has to be accepted by `yes`.
+    """
+    if target.exists():
+        raise DataError(f"{target} exists already; give another name, or remove it")
+    folders = expand_bags(bags)
+    types = read_definitions(definitions)
+    console.print(f"looking into {len(folders)} bags", soft_wrap=True)
+    found = look(folders, definitions=types)
+    asked = not yes and not (responses and excitations)
+    if asked and not sys.stdin.isatty():
+        raise DataError(
+            "nobody is at a terminal to choose signals: name them with --response and "
+            "--excitation, or take the likeliest ones with --yes"
+        )
+    chosen_u = list(excitations)
+    chosen_y = list(responses)
+    if asked and not chosen_u:
+        chosen_u = _ask(console, "What drives the robot?", found.commands(), found, ())
+    if asked and not chosen_y:
+        chosen_y = _ask(console, "What answers?", found.responses(chosen_u), found, chosen_u)
+    chosen_y, chosen_u = choose(found, chosen_y, chosen_u)
+    proposal = propose(
+        folders,
+        found,
+        responses=chosen_y,
+        excitations=chosen_u,
+        robot=robot,
+        definitions=definitions,
+        types=types,
+    )
+    write_atomically(target, yaml_text(proposal).encode())
+    for text in (*chosen_u, *chosen_y):
+        console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
+    for wall in proposal.walls:
+        console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
+    console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
+    given = " ".join(map(str, bags))
+    steps = [f"nlsid identify {given} --config {target} --out out"]
+    if "funnel" in proposal.content:
+        steps += [
+            f"nlsid funnel --model out/model.json --config {target} --out out",
+            "nlsid check out/model.proof.json out/funnel.proof.json",
+            f"nlsid monitor --replay {given} --funnel out/funnel.json --config {target}",
+        ]
+    for step in steps:
+        console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
+    return proposal
+
+
+def _ask(
+    console: Console,
+    question: str,
+    candidates: Sequence[Candidate],
+    found: Found,
+    commands: Sequence[str],
+) -> list[str]:
+    """Numbers of a list, or a signal's own text; the first one if nothing is typed."""
+    if not candidates:
+        raise DataError("no number looks like one; name it with --response or --excitation")
+    shown = candidates[:SHOWN]
+    console.print(question, style="bold")
+    for number, candidate in enumerate(shown, start=1):
+        pairs = [
+            p
+            for p in found.pairs
+            if (p.response if commands else p.command).text == candidate.text
+            and (not commands or p.command.text in commands)
+        ]
+        told = f"; {pairs[0]}" + ("" if commands else f" by {pairs[0].response.text}")
+        console.print(f"  {number}  {candidate}{told}", soft_wrap=True, markup=False)
+    while True:
+        answer = typer.prompt("numbers, or a signal", default="1").strip()
+        parts = [part.strip() for part in answer.split(",") if part.strip()]
+        if parts and all(part.isdigit() and 1 <= int(part) <= len(shown) for part in parts):
+            return [shown[int(part) - 1].text for part in parts]
+        if ":" in answer:
+            return [answer]
+        console.print(f"1 to {len(shown)}, several with commas, or topic:field")

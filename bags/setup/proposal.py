@@ -1,0 +1,439 @@
+"""From chosen signals to a whole configuration that the later steps take: each value with a reason.
+
+What is proposed is tried: the bags are read with it as identification reads them, and what is
+refused there is changed (gaps cut out, responses resampled) or said.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.signal import welch
+
+from bags.chain.config import Config
+from bags.chain.steps import Trials, read_trials
+from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
+from bags.recordings.message_types import is_stamped, standard_types
+from bags.setup.candidates import Found
+from bags.signals.expressions import Expression
+from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.identification import LeastSquares, LinearClass, identify
+from nlsid_core.running.grid import TOLERANCE
+
+LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
+LAGS_BETTER: Final = 0.98  # of the error that more lags have to reach
+ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they come
+ROUND: Final = 0.01  # relative: a period this near a round number is that number
+FEW_GAPS: Final = 5.0  # periods: gaps up to here are filled in, longer ones cut out
+DYNAMICS: Final = 40.0  # samples in a period of the fastest motion that are enough
+TEST_EVERY: Final = 5  # bags: every fifth only scores
+SHARE: Final = 0.25  # of every bag that only scores where there are few
+POOR: Final = 50.0  # % of error in simulation, above which a model says little
+RELATED: Final = 0.3  # correlation below which command and response may be unrelated
+LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
+STALE: Final = 5.0  # periods without a response that are one too many
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A chosen signal: name and unit for people, its path, its range in the bags, and why it."""
+
+    name: str
+    unit: str
+    path: str
+    why: str
+
+
+@dataclass
+class Proposal:
+    """A configuration as nested keys (`content`), a reason for keys (`why`), and later walls."""
+
+    content: dict[str, Any]
+    why: dict[str, str] = field(default_factory=dict)
+    walls: list[str] = field(default_factory=list)
+
+    def config(self, definitions: Sequence[Path] = ()) -> Config:
+        """As the later steps read it."""
+        return Config.model_validate(self.content).model_copy(
+            update={"definitions": tuple(definitions)}
+        )
+
+
+def choose(
+    found: Found, responses: Sequence[str] = (), excitations: Sequence[str] = ()
+) -> tuple[list[str], list[str]]:
+    """The signals that were named, and for a side that was not the best that goes with the other.
+
+    Raises BagError if nothing goes with anything.
+    """
+    if responses and excitations:
+        return list(responses), list(excitations)
+    pairs = [
+        pair
+        for pair in found.pairs
+        if (not responses or _same(pair.response.text, responses[0]))
+        and (not excitations or _same(pair.command.text, excitations[0]))
+    ]
+    if not pairs:
+        raise BagError(
+            "no number looks like a command that another one follows; name them with --excitation "
+            "and --response (nlsid bag signals lists what there is)"
+        )
+    return list(responses) or [pairs[0].response.text], list(excitations) or [pairs[0].command.text]
+
+
+def propose(
+    bags: Sequence[Path],
+    found: Found,
+    *,
+    responses: Sequence[str],
+    excitations: Sequence[str],
+    robot: str,
+    definitions: Sequence[Path] = (),
+    types: Mapping[str, Definition] | None = None,
+) -> Proposal:
+    """A configuration of these signals for these bags, tried on them.
+
+    Raises BagError and DataError if the bags cannot be read as any configuration says.
+    """
+    chosen = {
+        "response": [_signal(found, text) for text in responses],
+        "excitation": [_signal(found, text) for text in excitations],
+    }
+    proposal = Proposal({"robot": robot})
+    _say_signals(proposal, chosen, found)
+    if definitions:
+        proposal.content["definitions"] = [str(path) for path in definitions]
+    with Bag(bags[0], definitions=types) as bag:
+        _say_clock(proposal, chosen, bag)
+    read = _read(bags, chosen, proposal.content["clock"], types)
+    _say_grid(proposal, read)
+    _say_split(proposal, bags)
+    linear = len(responses) == len(excitations) == 1
+    section: dict[str, Any] = {"model": "linear", "lags": 4}
+    if not linear:
+        ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
+        section = {"model": "state_affine", "lags": 2, "input_range": ranges}
+        proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
+        proposal.walls.append(
+            "several signals: a tube is designed for one response and one excitation; the model "
+            "is identified and proved, `nlsid funnel` has nothing for it"
+        )
+    proposal.content["identification"] = section
+    trials = _tried(proposal, bags, definitions)
+    if linear:
+        _say_lags(proposal, trials.train)
+        _say_funnel(proposal, trials)
+    return proposal
+
+
+@dataclass(frozen=True)
+class _Read:
+    """What the chosen signals of all bags show: the responses' steps, the commands' ages."""
+
+    period: float
+    on_grid: float
+    repeated: int
+    longest_gap: float
+    band: float
+    command_period: float
+    longest_held: float
+    u_ranges: tuple[tuple[float, float], ...]
+    topics: int
+
+
+def _same(candidate: str, named: str) -> bool:
+    return candidate == named or candidate.partition("|")[0] == named
+
+
+def _signal(found: Found, text: str) -> Signal:
+    known = next((c for c in found.candidates if c.text == text), None)
+    known = known or next((c for c in found.candidates if _same(c.text, text)), None)
+    if known is None:
+        return Signal(_name(text), "", text, "named by you")
+    unit = known.unit.partition(" or ")[0]
+    why = f"{known.low:.4g} to {known.high:.4g} {unit}".strip()
+    return Signal(_name(text), unit, text, f"{why} at {known.rate:.4g} Hz; {known.why}")
+
+
+def _name(text: str) -> str:
+    """A name for people: the joint or the last words of the path, and what is done to it."""
+    path, *operations = text.split("|")
+    topic, _, fields = path.partition(":")
+    steps = [
+        step for step in fields.split(".") if step not in ("twist", "pose", "data", "transform")
+    ]
+    words = " ".join(steps[-2:]) if steps else topic
+    words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
+    rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
+    return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
+
+
+def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], found: Found) -> None:
+    proposal.content["signals"] = {
+        role: [{"name": s.name, "unit": s.unit, "path": s.path} for s in signals]
+        for role, signals in chosen.items()
+    }
+    for signals in chosen.values():
+        for signal in signals:
+            proposal.why[signal.path] = signal.why
+    for y in chosen["response"]:
+        pairs = [p for p in found.best_for(y.path)
+                 if p.command.text in {u.path for u in chosen["excitation"]}]  # fmt: skip
+        if pairs:
+            best = pairs[0]
+            proposal.why[y.path] += f"; follows {best.command.text}: {best}"
+            if abs(best.correlation) < RELATED:
+                proposal.walls.append(
+                    f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
+                )
+            if best.response.is_position:
+                proposal.walls.append(
+                    f"{y.path} is a position: one that adds up its command for ever is in no model "
+                    "class; take |derivative(0.2 s) of it"
+                )
+
+
+def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
+    unstamped = []
+    for signals in chosen.values():
+        for signal in signals:
+            expression = Expression.parse(signal.path)
+            msgtype, types = bag.types_on(expression.path.topic)
+            expression.path.check(msgtype, types)
+            if not is_stamped(msgtype, types) and msgtype != "tf2_msgs/msg/TFMessage":
+                unstamped.append(f"{expression.path.topic} ({msgtype})")
+            if msgtype not in standard_types().fielddefs:
+                proposal.walls.append(
+                    f"{expression.path.topic} is of type {msgtype}: live, its package has to be "
+                    "installed beside the nodes"
+                )
+    proposal.content["clock"] = "log" if unstamped else "header"
+    if unstamped:
+        names = ", ".join(dict.fromkeys(unstamped))
+        proposal.why["clock"] = f"{names} has no header stamp"
+        proposal.walls.append(
+            f"{names} has no header stamp: samples are paired by the times of logging, live of "
+            "arrival, whose jitter becomes part of the model's error"
+        )
+
+
+def _read(
+    bags: Sequence[Path],
+    chosen: Mapping[str, Sequence[Signal]],
+    clock: str,
+    types: Mapping[str, Definition] | None,
+) -> _Read:
+    y_paths = [signal.path for signal in chosen["response"]]
+    u_paths = [signal.path for signal in chosen["excitation"]]
+    steps, held, bands, ranges, u_steps = [], [], [], [], []
+    repeated = 0
+    for path in bags:
+        read = read_signals(
+            path, [*y_paths, *u_paths], clock=HEADER_STAMP if clock == "header" else LOG_TIME,
+            sort=True, gaps_in=y_paths, definitions=types,
+        )  # fmt: skip
+        for name in y_paths:
+            diffs = np.diff(read[name].stamp_ns) / 1e9
+            repeated += int((diffs <= 0).sum())
+            steps.append(diffs[diffs > 0])
+            bands.append(_band(read[name]))
+        last = max(int(read[name].stamp_ns[-1]) for name in y_paths)
+        for name in u_paths:
+            stamps = read[name].stamp_ns
+            ages = np.diff(np.append(stamps[stamps < last], last)) / 1e9
+            held.append(float(ages.max(initial=0.0)))
+            u_steps.append(np.diff(stamps) / 1e9)
+        ranges.append([(read[n].values.min(), read[n].values.max()) for n in u_paths])
+    every, u_every = np.concatenate(steps), np.concatenate(u_steps)
+    if not len(every):
+        raise BagError(f"{y_paths[0]} has one sample a bag; a period needs two")
+    median = float(np.median(every))
+    near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
+    lows, highs = np.array(ranges).min(axis=0)[:, 0], np.array(ranges).max(axis=0)[:, 1]
+    return _Read(
+        period=_round(median),
+        on_grid=float(near.mean()),
+        repeated=repeated,
+        longest_gap=float(every.max()),
+        band=float(np.median([b for b in bands if b > 0] or [0.0])),
+        command_period=float(np.median(u_every)) if len(u_every) else math.inf,
+        longest_held=max(held),
+        u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
+        topics=len({name.partition(":")[0] for name in y_paths}),
+    )
+
+
+def _band(samples: Samples) -> float:
+    """Hz below which a response has 99 % of its power; 0 if it cannot be said."""
+    steps = np.diff(samples.stamp_ns) / 1e9
+    if len(samples) < 64 or not (steps > 0).any() or not np.ptp(samples.values) > 0:
+        return 0.0
+    rate = 1.0 / float(np.median(steps[steps > 0]))
+    x = samples.values - samples.values.mean()
+    f, power = welch(x, fs=rate, nperseg=min(len(x), 4096))
+    return float(f[np.searchsorted(np.cumsum(power) / power.sum(), 0.99)])
+
+
+def _round(period: float) -> float:
+    """A round rate or period if one is near: 0.025 of 0.02498."""
+    for round_one in (
+        1.0 / max(round(1.0 / period), 1),
+        float(f"{period:.1g}"),
+        float(f"{period:.2g}"),
+    ):
+        if abs(round_one / period - 1.0) <= ROUND:
+            return float(f"{round_one:.6g}")
+    return float(f"{period:.4g}")
+
+
+def _up(value: float) -> float:
+    """The next number of two digits."""
+    digits = 1 - math.floor(math.log10(value))
+    return float(f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.2g}")
+
+
+def _say_grid(proposal: Proposal, read: _Read) -> None:
+    grid: dict[str, Any] = {"period": read.period}
+    why, walls = proposal.why, proposal.walls
+    why["period"] = f"the response's median step; {100 * read.on_grid:.0f} % of steps are near it"
+    regular = read.on_grid >= ON_GRID and read.topics == 1 and not read.repeated
+    factor = 1
+    if read.band > 0:
+        factor = max(int(1.0 / (DYNAMICS * read.band) / read.period), 1)
+    if factor > 1:
+        grid["period"] = _round(factor * read.period)
+        why["period"] = (
+            f"every {factor}th of {read.period:g} s: 99 % of the response's power is below "
+            f"{read.band:.3g} Hz"
+        )
+        regular = False
+    if not regular:
+        grid["resample"] = "last" if factor > 1 and read.on_grid >= ON_GRID else "linear"
+        why["resample"] = (
+            "fewer samples than are recorded" if factor > 1
+            else "responses come from several topics" if read.topics > 1
+            else f"only {100 * read.on_grid:.0f} % of steps are near the period"
+        )  # fmt: skip
+    most = FEW_GAPS * read.period
+    grid["max_gap"] = _up(max(min(1.2 * read.longest_gap, most), 2.0 * grid["period"]))
+    why["max_gap"] = f"the longest step of a response is {read.longest_gap:.3g} s"
+    if read.longest_gap > grid["max_gap"]:
+        grid["split_gaps"] = True
+        why["split_gaps"] = "longer gaps end a trial and begin the next"
+        walls.append(
+            f"a response is missing for up to {read.longest_gap:.3g} s: trials are cut there, and "
+            "a monitor says unknown from there on"
+        )
+    if read.longest_held > grid["max_gap"]:
+        grid["hold"] = _up(1.1 * read.longest_held)
+        why["hold"] = f"one was held for {read.longest_held:.3g} s in these bags"
+        if read.longest_held > LONG_HELD * min(read.command_period, 1.0):
+            walls.append(
+                f"commands are held for up to {read.longest_held:.3g} s: a lost one is not noticed "
+                "before"
+            )
+    proposal.content["grid"] = grid
+    stale = max(0.1, _up(STALE * grid["period"]))
+    proposal.content["monitor"] = {"stale_after": stale}
+    why["stale_after"] = f"{STALE:g} periods, at least 0.1 s"
+    if read.repeated:
+        walls.append(
+            f"{read.repeated} stamps of the response repeat the one before, which identification "
+            "refuses; is the topic published twice?"
+        )
+
+
+def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
+    names = sorted(path.stem if path.is_file() else path.resolve().name for path in bags)
+    if len(names) >= TEST_EVERY:
+        proposal.content["split"] = {"test": names[TEST_EVERY - 1 :: TEST_EVERY]}
+        proposal.why["test"] = f"every {TEST_EVERY}th of {len(names)} bags, by name"
+    elif len(names) > 1:
+        proposal.content["split"] = {"test": names[-1:]}
+        proposal.why["test"] = f"the last of {len(names)} bags"
+    else:
+        proposal.content["split"] = {"share": SHARE}
+        proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
+        proposal.walls.append(
+            "one bag: the disturbance is measured on the drive that was fitted; record more"
+        )
+
+
+def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]) -> Trials:
+    """The trials as identification reads them; what it refuses is changed as it says."""
+    grid = proposal.content["grid"]
+    changes: list[tuple[str, Any, str]] = [
+        ("resample", "linear", "off a grid"),
+        ("split_gaps", True, "split_gaps"),
+        ("resample", "linear", "one stamp each sample"),
+    ]
+    while True:
+        try:
+            return read_trials(
+                bags, proposal.config(definitions), progress=lambda _what, _part: None
+            )
+        except DataError as error:
+            change = next(
+                (c for c in changes if c[2] in str(error) and grid.get(c[0]) != c[1]), None
+            )
+            if change is None:
+                raise
+            key, value, _ = change
+            grid[key] = value
+            proposal.why[key] = f"without it: {error}"[:120].rpartition(" ")[0]
+
+
+def _say_lags(proposal: Proposal, train: Dataset) -> None:
+    """The fewest lags whose simulation of a part of the training trials is about as good as any."""
+    names = train.names
+    held_back = list(names[1::3]) or list(names[:1])
+    alone = len(held_back) == len(names)
+    fitted = train if alone else train.without(held_back)
+    errors: dict[int, float] = {}
+    for lags in LAGS:
+        try:
+            fit = identify(
+                fitted, LinearClass(lags), method=LeastSquares(), test=train.select(held_back),
+                allow_unproved=True,
+            )  # fmt: skip
+        except NlsidError:
+            continue
+        errors[lags] = float(fit.errors["test"]["least_squares"])
+    known = {lags: error for lags, error in errors.items() if math.isfinite(error)}
+    section = proposal.content["identification"]
+    if not known:
+        proposal.why["lags"] = "a first guess"
+        return
+    best = min(known.values())
+    section["lags"] = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
+    said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
+    where = "on what they were fitted to" if alone else "on trials held back"
+    proposal.why["lags"] = f"least squares models simulated {where} are off by {said}"
+    if best > POOR:
+        proposal.walls.append(
+            f"no number of lags simulates {where.removeprefix('on ')} with less than {best:.3g} % "
+            "error: the tube will be wide; another pair of signals, or more of them, may say more"
+        )
+
+
+def _say_funnel(proposal: Proposal, trials: Trials) -> None:
+    lags = int(proposal.content["identification"]["lags"])
+    period = float(proposal.content["grid"]["period"])
+    samples = max(len(trial) for trial in trials.train) - lags
+    longest = max(len(trial) for trial in trials.test)
+    samples = max(min(samples, longest), 1)
+    proposal.content["funnel"] = {"horizon": float(f"{samples * period:.6g}"), "policy": "none"}
+    proposal.why["horizon"] = f"{samples} samples: the longest run that training and test have"
+    proposal.why["policy"] = "a prediction tube around what the received commands give"
+    if longest - lags > samples:
+        proposal.walls.append(
+            f"the longest test run is {longest * period:.4g} s; a tube is proved for "
+            f"{samples * period:.4g} s, and the monitor says nothing after"
+        )

@@ -1,0 +1,574 @@
+"""`design_output_tube`: a proved tube around the simulation of a stable model of any class.
+
+    E ζ = 0,   x̄⁺ = F ζ + L e,   o = H ζ + e,   E_{k+1} = ρ E_k + e_k'R e_k
+The kernel's reading of the model file gives F, H and the vertices E. Observers L are Kalman gains
+of the mean increment over a grid of noise ratios, ρ is taken from a grid above the square of the
+proved rate. Of all pairs those whose forecast a reaction time ahead is the narrowest are solved as
+semidefinite programs, on the training trials; the level is measured on other trials.
+Source: TUBES, sections 2, 4, 5 and 6; docs/certificate_tube.md.
+"""
+
+import hashlib
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from itertools import pairwise, product
+from typing import Any, TypeAlias
+
+import cvxpy
+import numpy as np
+from scipy.linalg import LinAlgError, block_diag, solve_discrete_are, solve_discrete_lyapunov
+from scipy.signal import lfilter
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.designs import Design
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.tube import Trial, Tube, TubeFunnel
+from nlsid_core.identification.stability import prove_stability, storage_on
+from nlsid_core.kernel import Rejected, increments
+from nlsid_core.kernel.files import Node, parse
+from nlsid_core.models import BlockCascade, ImplicitModel, StableModel
+from nlsid_core.running.stepping import Stepper
+
+cp: Any = cvxpy  # its functions are not seen by type checkers
+NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
+FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
+SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
+REACTION = 10  # samples: the reaction time if none is named
+SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
+LONGEST_SETTLING = 0.25  # of the shortest trial
+ROOM = 1e-6  # least eigenvalue asked for, in balanced units
+TAU_ROOM = 1e-3  # relative, given up of τ for the exact proof
+UNREACHED = 1e-4  # of the Gramian's mean: noise on states that no injection moves
+LARGEST = 1e4  # entry of a multiplier in balanced units
+ROUNDS = 6  # of cutting planes, most of the time 2-4
+CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
+BOX_ROOM = 0.1  # of a signal's range, on both sides of it
+
+OutputTubeDesign: TypeAlias = Design[Any, None, TubeFunnel, None]
+
+
+def design_output_tube(
+    model: StableModel,
+    train: Dataset,
+    calibration: Dataset | None = None,
+    *,
+    reaction_time: float | None = None,
+    safety_factor: float = 1.5,
+    horizon: float | None = None,
+    box: Sequence[tuple[float, float]] | None = None,
+) -> OutputTubeDesign:
+    """The funnel that `OutputTube` describes; its options are these.
+
+    Raises DataError on options or trials that do not fit, Infeasible if no tube is found or proved.
+    """
+    stepper = Stepper(model)
+    settling = _settling(model, stepper, train)
+    if calibration is None:
+        train, calibration = halves(train, 4 * (settling + REACTION))
+    designed_on, measured_on = _trials(train), _trials(calibration)
+    if common := {t.digest for t in designed_on} & {t.digest for t in measured_on}:
+        raise DataError(
+            f"{sum(t.digest in common for t in measured_on)} of the trials that the level is "
+            "measured on are among those that the tube is designed on; give others"
+        )
+    y_box, u_box = _box(model, stepper, train, box)
+    bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
+    form = _Form.of(model, bounds)
+    samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
+    amplitudes = np.maximum(
+        np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
+    )
+    gains = _gains(form, amplitudes)
+    e = [innovations(model, gains, trial, settling) for trial in train]
+    found = [_best(form, gains, e, amplitudes, samples, form.fading())]
+    lasting: list[int | None] = [None]
+    if horizon is not None:
+        found.append(_best(form, gains, e, amplitudes, samples, [1.0]))
+        lasting.append(max(1, round(horizon / model.period)))
+    tubes = []
+    for design, length in zip(found, lasting, strict=True):
+        tube = Tube(
+            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
+            half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
+            safety_factor=safety_factor, designed_on=designed_on, measured_on=measured_on,
+            samples=length,
+        )  # fmt: skip
+        tubes.append(scaled_to(tube, model, calibration, settling))
+    funnel = TubeFunnel(
+        tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
+        y_box=y_box, u_box=u_box,
+    )  # fmt: skip
+    trees = [design.multipliers for design in found]
+    proof: Json = {} if trees[0] is None else {"multipliers": trees}
+    try:
+        return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
+    except CertificateRejected as refusal:
+        raise Infeasible(f"no proved tube: {refusal}") from refusal
+
+
+def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
+    """The tube with its level and half-widths from these trials, rounded up."""
+    measured = max(
+        float(
+            energy(innovations(model, tube.L[None], t, settling)[:, 0], tube)[: tube.samples].max()
+        )
+        for t in calibration
+    )
+    measured = _above(max(measured, float(np.finfo(float).tiny)))
+    level = _above(tube.safety_factor**2 * measured)
+    widths = np.sqrt((level + tube.inlet) / tube.tau)
+    return replace(
+        tube, measured=measured, level=level,
+        half_widths=np.array([_rounded_up(float(width)) for width in widths]),
+    )  # fmt: skip
+
+
+def energy(e: FloatArray, tube: Tube) -> FloatArray:
+    """E_1 … E_N of innovations e (N, p)."""
+    spent = np.einsum("ti,ij,tj->t", e, tube.R, e)
+    return np.asarray(lfilter([1.0], [1.0, -tube.rho], spent))
+
+
+def innovations(
+    model: StableModel, gains: FloatArray, trial: Trajectory, settling: int
+) -> FloatArray:
+    """e(t), t = settling …, of observers with gains (B, n, p): (N - settling, B, p)."""
+    stepper = Stepper(model)
+    if len(trial) <= settling:
+        raise DataError(f"{trial.name}: {len(trial)} samples; the first {settling} start a run")
+    start = stepper.begin(trial.y[:settling], trial.u[:settling])
+    x = np.tile(start, (len(gains), 1))
+    e = np.empty((len(trial) - settling, len(gains), len(stepper.y)))
+    for k, (y, u) in enumerate(zip(trial.y[settling:], trial.u[settling:], strict=True)):
+        predicted, x = stepper.advance(x, u)
+        e[k] = y - predicted
+        x = x + np.einsum("bnp,bp->bn", gains, e[k])
+    return e
+
+
+def halves(dataset: Dataset, least: int) -> tuple[Dataset, Dataset]:
+    """Every second trial to design on, the others to measure on; of one trial, windows.
+
+    least: samples that a window should have.
+    """
+    trials = dataset.trajectories
+    if len(trials) == 1:
+        count = min(20, len(trials[0]) // max(least, 1))
+        if count < 2:
+            raise DataError(
+                f"{trials[0].name}: {len(trials[0])} samples of one trial; a tube is designed on "
+                f"one part and measured on another, of {least} samples each at least"
+            )
+        trials = _windows(trials[0], count)
+    return Dataset(trials[::2]), Dataset(trials[1::2])
+
+
+def _windows(trial: Trajectory, count: int) -> tuple[Trajectory, ...]:
+    ends = np.linspace(0, len(trial), count + 1).astype(int)
+    return tuple(
+        replace(trial, t=trial.t[a:b], y=trial.y[a:b], u=trial.u[a:b],
+                x=None if trial.x is None else trial.x[a:b], name=f"{trial.name} [{a}:{b}]")
+        for a, b in pairwise(ends)
+    )  # fmt: skip
+
+
+def _trials(dataset: Dataset) -> tuple[Trial, ...]:
+    """The trials by digest: the recording's, or of their own samples where several share one."""
+    shared = [t.digest for t in dataset]
+    found = []
+    for t in dataset:
+        alone = t.digest and shared.count(t.digest) == 1 and "[" not in t.name
+        content = b"".join(np.ascontiguousarray(part).tobytes() for part in (t.t, t.y, t.u))
+        own = "sha256:" + hashlib.sha256(content).hexdigest()
+        found.append(Trial(t.name, t.digest) if alone else Trial(t.name, own, t.digest or own))
+    return tuple(found)
+
+
+def _settling(model: StableModel, stepper: Stepper, dataset: Dataset) -> int:
+    """Samples before sample 0: the model's lags, and a cascade's first filter has to settle."""
+    least = max(stepper.lags, 1)
+    if not isinstance(model, BlockCascade) or not len(model.a1):
+        return least
+    radius = float(np.abs(model.poles[0]).max(initial=0.0))
+    wanted = int(np.ceil(np.log(SETTLED) / np.log(radius))) if 0.0 < radius < 1.0 else least
+    return max(least, min(wanted, int(LONGEST_SETTLING * min(map(len, dataset)))))
+
+
+def _box(
+    model: StableModel,
+    stepper: Stepper,
+    dataset: Dataset,
+    box: Sequence[tuple[float, float]] | None,
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """(p, 2) and (n_u, 2) ranges, of a model whose increments are known on a box only."""
+    try:
+        _read(model, None)
+    except Rejected:
+        if not isinstance(model, ImplicitModel):
+            raise
+        p = len(stepper.y)
+        if box is not None:
+            return np.array(box[:p], dtype=np.float64), np.array(box[p:], dtype=np.float64)
+        ranges = []
+        for key in ("y", "u"):
+            values = np.concatenate([getattr(trial, key) for trial in dataset])
+            low, high = values.min(axis=0), values.max(axis=0)
+            room = BOX_ROOM * (high - low) + np.finfo(float).tiny
+            ranges.append(np.column_stack([low - room, high + room]))
+        return ranges[0], ranges[1]
+    return None, None
+
+
+def _read(model: StableModel, bounds: Json | None) -> increments.Model:
+    node = None if bounds is None else parse(files.encode(bounds), "box")
+    return increments.read_model(parse(files.encode(model.document()), "model"), node)
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """The increment form in floats. tree: of a proof's multipliers, with the vertices E of each of
+    its leaves in order, (count, m, m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
+    """
+
+    F: FloatArray
+    H: FloatArray
+    tree: Json | None
+    leaves: list[FloatArray]
+    mean: FloatArray
+    A: FloatArray
+    C: FloatArray
+    ray: bool
+    rate: float
+    inputs: tuple[FloatArray, FloatArray] | None
+
+    @classmethod
+    def of(cls, model: StableModel, bounds: Json | None) -> "_Form":
+        form = _read(model, bounds)
+        proof = prove_stability(model) if bounds is None else storage_on(form)
+        if proof is None:
+            raise Infeasible(
+                "no proof that the model forgets its start, so no tube of it lasts"
+                + ("; give a smaller box" if bounds is not None else "")
+            )
+        F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
+        m = form.unknowns
+        leaves: list[FloatArray] = [
+            np.array(form.vertices(part, ends), dtype=np.float64)
+            for part, ends in _parts(proof.multipliers, form.box)
+        ]
+        mean = np.mean([E.mean(axis=0) for E in leaves], axis=0) if m else np.zeros((0, len(F)))
+        G = np.linalg.solve(mean[:, :m], mean[:, m:]) if m else mean
+        inputs = None
+        if form.linear is not None:
+            B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
+            inputs = B[:, None], D[:, None]
+        return cls(
+            F, H, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
+            H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
+        )  # fmt: skip
+
+    @property
+    def m(self) -> int:
+        """The number of ν."""
+        return int(self.F.shape[1] - len(self.F))
+
+    def fading(self) -> list[float]:
+        """ρ between rate² and 1."""
+        return [1.0 - part * (1.0 - self.rate**2) for part in FADING]
+
+
+def _parts(tree: Json | None, box: increments.Box) -> list[tuple[increments.Box, Node | None]]:
+    """The leaves' parts of the box, and what bounds E there."""
+    if tree is None:
+        return []
+    if "split" not in tree:
+        if "ends" not in tree:
+            return [(box, None)]
+        return [(box, parse(files.encode(tree["ends"]), "ends"))]
+    i = tree["split"]
+    low, high = box[i]
+    middle = (low + high) / 2
+    halved = ([*box[:i], half, *box[i + 1 :]] for half in ((low, middle), (middle, high)))
+    return [leaf for part, half in zip(tree["parts"], halved, strict=True)
+            for leaf in _parts(part, half)]  # fmt: skip
+
+
+def _with_multipliers(tree: Json, leaves: list[list[FloatArray]]) -> Json:
+    """The tree with these multipliers in its leaves, in order."""
+    if "split" in tree:
+        parts = [_with_multipliers(part, leaves) for part in tree["parts"]]
+        return {"split": tree["split"], "parts": parts}
+    ends = {"ends": tree["ends"]} if "ends" in tree else {}
+    return {"N": [N.tolist() for N in leaves.pop(0)]} | ends
+
+
+def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
+    """(B, n, p) Kalman gains of x̄⁺ = A x̄ + G d, o = C x̄ + D d + noise.
+
+    d is what enters with ν (a linear model: with the input, or with the output's equation).
+    Source: Anderson and Moore, Optimal Filtering, section 5.4: correlated noises.
+    """
+    p, m = len(form.H), form.m
+    sizes: FloatArray = np.diag(amplitudes**2)
+    noises: list[tuple[FloatArray, FloatArray, FloatArray]]
+    if m == 0:
+        assert form.inputs is not None
+        noises = [(form.A[:, :1], np.eye(1), sizes), (*form.inputs, np.eye(1))]
+    else:
+        G, D = form.F[:, :m], form.H[:, :m]
+        spread: FloatArray = np.eye(m) * float(np.mean(amplitudes)) ** 2
+        if m == p and np.linalg.matrix_rank(D) == p:
+            inverse = np.linalg.inv(D)
+            spread = inverse @ sizes @ inverse.T
+        noises = [(G, D, spread)]
+    found = []
+    for (G, D, spread), ratio in product(noises, NOISE_RATIOS):
+        Q, S = ratio * G @ spread @ G.T, ratio * G @ spread @ D.T
+        R = ratio * D @ spread @ D.T + sizes
+        try:
+            X = solve_discrete_are(form.A.T, form.C.T, Q, R, s=S)
+        except (LinAlgError, ValueError):
+            continue
+        L = np.linalg.solve(form.C @ X @ form.C.T + R, (form.A @ X @ form.C.T + S).T).T
+        if np.isfinite(L).all():
+            found.append(L)
+    if not found:
+        raise Infeasible("no observer: the Riccati equation of the mean increment has no solution")
+    return np.array(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it."""
+
+    L: FloatArray
+    rho: float
+    P: FloatArray
+    R: FloatArray
+    tau: FloatArray
+    multipliers: Json | None
+
+
+def _best(
+    form: _Form,
+    gains: FloatArray,
+    e: list[FloatArray],
+    amplitudes: FloatArray,
+    samples: int,
+    rhos: Sequence[float],
+) -> _Found:
+    """The pair (L, ρ) whose proved forecast `samples` ahead is the narrowest.
+
+    e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
+    mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
+    the most that E can be `samples` after 0.
+    """
+    ranked = []
+    for i, rho in product(range(len(gains)), rhos):
+        try:
+            W, R = _mean_gramian(form, gains[i], rho, [part[:, i] for part in e])
+        except (LinAlgError, ValueError):
+            continue
+        variance = np.diag(np.linalg.inv(R)) + np.einsum("ij,jk,ik->i", form.C, W, form.C) / rho
+        if not (np.isfinite(variance).all() and (variance > 0.0).all()):
+            continue
+        alpha = _forecast_budget([part[:, i] for part in e], R, rho, samples)
+        ranked.append((float(np.mean(np.sqrt(alpha * variance) / amplitudes)), i, rho))
+    tried: list[tuple[float, _Found]] = []
+    for _, i, rho in sorted(ranked)[:SOLVED]:
+        found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
+        if found is not None:
+            alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
+            tried.append((float(np.mean(np.sqrt(alpha / found.tau) / amplitudes)), found))
+    if not tried:
+        raise Infeasible(
+            "no storage function bounds the output by the innovations: the increments are too "
+            "different over the model's range; give a smaller range of inputs or a smaller box"
+        )
+    return min(tried, key=lambda entry: entry[0])[1]
+
+
+def _mean_gramian(
+    form: _Form, L: FloatArray, rho: float, e: list[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """W of the mean increment, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
+    p = len(form.H)
+    most = np.max([_fading_squares(part, rho).max(axis=0) for part in e], axis=0)
+    R = np.diag(1.0 / (p * np.maximum(most, np.finfo(float).tiny)))
+    noise = L @ np.linalg.inv(R) @ L.T
+    noise = noise + UNREACHED * (np.trace(noise) / len(noise) or 1.0) * np.eye(len(noise))
+    W = np.asarray(solve_discrete_lyapunov(form.A / np.sqrt(rho), noise))
+    return (W + W.T) / 2.0, R
+
+
+def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
+    """Σ ρ^i e_j(t - i)², (N, p)."""
+    return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
+
+
+def _forecast_budget(e: list[FloatArray], R: FloatArray, rho: float, samples: int) -> float:
+    """max_k Σ_{i=0..h} ρ^(h-i) |e_{k+i}|²_R over all starts k, h = `samples`."""
+    weights = rho ** np.arange(samples + 1)
+    return max(
+        float(np.convolve(np.einsum("ti,ij,tj->t", part, R, part), weights).max()) for part in e
+    )
+
+
+def _solved(
+    form: _Form, L: FloatArray, rho: float, e: list[FloatArray], amplitudes: FloatArray
+) -> _Found | None:
+    """P, R, N, τ of the least Σ 1/(τ_j a_j²), E <= 1 on the trials (one output: R = 1).
+
+    Units: x in those of the mean increment's Gramian W^(1/2); e_j, o_j of √max S_jj; ν of what it
+    moves state and output by; E with an identity in ν at its mean.
+    """
+    m, p = form.m, len(form.H)
+    try:
+        W, R0 = _mean_gramian(form, L, rho, e)
+        values, vectors = np.linalg.eigh(W)
+        root = (vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))) @ vectors.T
+        T = np.linalg.inv(root)
+    except (LinAlgError, ValueError):
+        return None
+    sizes = 1.0 / np.sqrt(np.diag(R0) * p)
+    moved = np.linalg.norm(np.vstack([T @ form.F[:, :m], form.H[:, :m] / sizes[:, None]]), axis=0)
+    nu = 1.0 / np.where(moved > 0.0, moved, 1.0)
+    S = block_diag(np.diag(nu), root)
+    F = np.hstack([T @ form.F @ S, T @ L * sizes])
+    H = np.hstack([form.H @ S / sizes[:, None], np.eye(p)])
+    D = np.linalg.inv(form.mean[:, :m] * nu) if m else np.zeros((0, 0))
+    leaves = [D @ E @ S for E in form.leaves]
+    windows = _Windows([part / sizes for part in e], rho)
+    solution = None
+    for _ in range(ROUNDS if p > 1 else 1):
+        solution = _program(F, H, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
+        if solution is None:
+            return None
+        if p == 1 or not windows.cut(solution[1]):
+            break
+    assert solution is not None
+    P, R, tau, Ns = solution
+    # E should be at most 1 on the trials; with one output R = 1, so that E has the unit of e².
+    P, R = T.T @ P @ T, R / np.outer(sizes, sizes)
+    unit = float(sizes[0] ** 2) if p == 1 else 1.0
+    outside = np.linalg.inv(block_diag(S, np.diag(sizes))).T
+    found = [[_shaped(outside @ N @ D * unit, form.ray) for N in leaf] for leaf in Ns]
+    return _Found(
+        L, rho, (P + P.T) * (unit / 2.0), np.eye(1) if p == 1 else (R + R.T) / 2.0,
+        unit * (1.0 - TAU_ROOM) * tau / sizes**2,
+        None if form.tree is None else _with_multipliers(form.tree, found),
+    )  # fmt: skip
+
+
+def _shaped(N: FloatArray, ray: bool) -> FloatArray:
+    """(T, 0 … 0)', T >= 0, where there is a ray."""
+    if ray:
+        N = N.copy()
+        N[1:, 0], N[0, 0] = 0.0, max(N[0, 0], 0.0)
+    return N
+
+
+class _Windows:
+    """S_k = Σ ρ^(k-j) e_j e_j' of every sample k, and those that bound R: tr(R S_k) <= 1."""
+
+    def __init__(self, e: list[FloatArray], rho: float) -> None:
+        outer = [np.einsum("ti,tj->tij", part, part) for part in e]
+        self._S = np.concatenate([lfilter([1.0], [1.0, -rho], part, axis=0) for part in outer])
+        p = self._S.shape[1]
+        self.chosen = [self._S[int(np.argmax(self._S[:, j, j]))] for j in range(p)]
+        self.chosen.append(self._S[int(np.argmax(np.trace(self._S, axis1=1, axis2=2)))])
+
+    def cut(self, R: FloatArray) -> bool:
+        """Take the window in which R is exceeded the most; False if it is in none."""
+        used = np.einsum("ij,kji->k", R, self._S)
+        worst = int(np.argmax(used))
+        if used[worst] <= 1.0 + CUT:
+            return False
+        self.chosen.append(self._S[worst])
+        return True
+
+
+def _program(
+    F: FloatArray,
+    H: FloatArray,
+    leaves: list[FloatArray],
+    rho: float,
+    m: int,
+    windows: list[FloatArray],
+    weights: FloatArray,
+    *,
+    ray: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, list[list[FloatArray]]] | None:
+    """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
+
+    F: (n, m + n + p) = [F L], H: (p, m + n + p) = [H I], all in balanced units.
+    """
+    n, p = len(F), len(H)
+    size = m + n + p
+    P = cp.Variable((n, n), symmetric=True)
+    tau = cp.Variable(p)
+    R: Any = np.eye(1) if p == 1 else cp.Variable((p, p), symmetric=True)
+    supply: Any = _placed(rho * P, m, size) + _placed(R, m + n, size)
+    forms = [supply - F.T @ P @ F] + [supply - tau[j] * np.outer(h, h) for j, h in enumerate(H)]
+    room = ROOM * np.eye(size)
+    constraints: list[Any] = [P >> ROOM * np.eye(n)]
+    if p > 1:
+        constraints += [R >> ROOM * np.eye(p), *(cp.trace(R @ S) <= 1.0 for S in windows)]
+    if not m:
+        constraints += [M >> room for M in forms]
+    unknown: list[list[Any]] = []
+    for vertices in leaves if m else []:
+        Ns: list[Any] = []
+        for M in forms:
+            N: Any
+            if ray:
+                T = cp.Variable((1, 1), nonneg=True)
+                N = cp.vstack([T, np.zeros((size - 1, 1))])
+            else:
+                N = cp.Variable((size, m))
+                constraints.append(cp.abs(N) <= LARGEST)
+            Ns.append(N)
+            for E in vertices:
+                cross = N @ np.hstack([E, np.zeros((m, p))])
+                constraints.append(M + cross + cross.T >> room)
+        unknown.append(Ns)
+    least = cp.sum(cp.multiply(weights**2, cp.inv_pos(tau)))
+    problem = cp.Problem(cp.Maximize(tau[0]) if p == 1 else cp.Minimize(least), constraints)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of inaccuracy: the kernel judges the result
+            problem.solve(solver=cp.CLARABEL)
+    except (cp.SolverError, ArithmeticError):
+        return None
+    if P.value is None or tau.value is None or not (np.asarray(tau.value) > 0.0).all():
+        return None
+    R_found = np.eye(1) if p == 1 else np.asarray(R.value)
+    found = [[np.asarray(N.value) for N in Ns] for Ns in unknown]
+    return np.asarray(P.value), R_found, np.asarray(tau.value), found
+
+
+def _placed(M: Any, start: int, size: int) -> Any:
+    """M in the rows and columns from `start` on of a matrix that is zero elsewhere."""
+    J = np.zeros((M.shape[0], size))
+    J[:, start : start + len(J)] = np.eye(len(J))
+    return J.T @ M @ J
+
+
+def _rounded_up(width: float) -> float:
+    """The next number of three significant digits, or the float64 just below that decimal number.
+
+    Then the decimal number is a bound, and the kernel prints it as it is.
+    """
+    digits = 2 - int(np.floor(np.log10(width)))
+    rounded = float(np.round(np.ceil(width * (1.0 + 1e-12) * 10.0**digits) / 10.0**digits, digits))
+    above = Fraction(rounded) > Fraction(repr(rounded))
+    return float(np.nextafter(rounded, 0.0)) if above else rounded
+
+
+def _above(value: float) -> float:
+    """A float64 above the real number that `value` was rounded from."""
+    return float(np.nextafter(value * (1.0 + 1e-12), np.inf))

@@ -1,0 +1,224 @@
+"""`Stepper`: one sample of any identified model, in the state that tubes are proved in.
+
+    ŷ(t) = g(x, w(t)),    x⁺ = f(x, w(t)),    w(t) stacks u(t), u(t-1), …
+An observer is x⁺ = f(x, w) + L (y - g(x, w)): the injection comes after the model's own step, so
+every class has one. Several states are advanced at once; what depends on the input alone is
+computed once for them. The state is that of docs/certificate_stability.md, "The increment form".
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.models import (
+    BlockCascade,
+    DifferenceEquation,
+    ImplicitModel,
+    MonotoneEquation,
+    StableModel,
+    StateAffineModel,
+)
+from nlsid_core.models.monotone_equation import solve_increasing
+from nlsid_core.models.signal import Signal
+
+Advance = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+
+class Stepper:
+    """A model's steps along one run.
+
+    order: n; lags: how many samples `begin` needs. y, u: the model's signals. Raises DataError for
+    an implicit model that is not of recorded signals.
+    """
+
+    def __init__(self, model: StableModel) -> None:
+        self.model = model
+        single = isinstance(model, DifferenceEquation | BlockCascade)
+        self.y: tuple[Signal, ...] = _signals(model.y)
+        self.u: tuple[Signal, ...] = (model.u,) if single else model.u  # type: ignore[assignment]
+        if not self.y:
+            raise DataError("an implicit model without recorded signals has no tube of its outputs")
+        made: Any = _KINDS[type(model)](model)
+        self._kind = made
+        self.order: int = made.order
+        self.lags: int = max(made.lags, made.delays)
+        self._past: deque[FloatArray] = deque(maxlen=made.delays + 1)
+
+    def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        """The state (n,) after the samples y (k, p), u (k, n_u), k >= lags.
+
+        A block cascade's first filter starts as if its input had always been the first one.
+        """
+        if len(y) < self.lags or y.shape[1] != len(self.y) or u.shape != (len(y), len(self.u)):
+            raise ShapeError(
+                f"y and u should be (k, {len(self.y)}) and (k, {len(self.u)}), k >= {self.lags}; "
+                f"are {y.shape} and {u.shape}"
+            )
+        self._past.clear()
+        self._past.extend(u[max(0, len(u) - self._kind.delays - 1) :])
+        state: FloatArray = self._kind.begin(y, u)
+        return state
+
+    def advance(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs (B, p) and next states (B, n) of states x (B, n) under the input u (n_u,) now.
+
+        Raises DataError on an input that the model refuses, SolverError where an implicit model
+        has no next output.
+        """
+        self._past.append(u)
+        found: tuple[FloatArray, FloatArray] = self._kind.advance(x, self._past)
+        return found
+
+
+def _signals(given: Signal | tuple[Signal, ...]) -> tuple[Signal, ...]:
+    return (given,) if isinstance(given, Signal) else given
+
+
+class _Linear:
+    """x⁺ = A x + B u + f, y = x_1 + D u + c."""
+
+    delays = 0
+
+    def __init__(self, model: DifferenceEquation) -> None:
+        self._model = model
+        self.order = self.lags = len(model)
+        self._A, self._B, self._f = model.A.T.copy(), model.B[:, 0], model.offset
+        self._D, self._c = model.D, model.c
+
+    def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        n = self.order
+        return self._model.state_after(y[len(y) - n :, 0], u[len(u) - n :, 0])
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        u = past[-1][0]
+        return x[:, :1] + (self._D * u + self._c), x @ self._A + (self._B * u + self._f)
+
+
+class _StateAffine:
+    """ȳ = gains(w) x + forcing(w), x the lagged ȳ."""
+
+    def __init__(self, model: StateAffineModel) -> None:
+        self._model = model
+        p = len(model.y)
+        self.order, self.lags = len(model) * p, len(model)
+        self.delays = len(model)
+
+    def begin(self, y: FloatArray, _u: FloatArray) -> FloatArray:
+        model, n = self._model, self.lags
+        newest = (y[len(y) - n :] - model.y_offset) / model.y_scale
+        return np.asarray(newest[::-1].ravel())
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        model = self._model
+        gains, forcing = model.explicit(model.windows(np.array(past))[-1])
+        after = x @ gains.T + forcing
+        return after * model.y_scale + model.y_offset, _shifted(after, x)
+
+
+class _Cascade:
+    """Both filters' states, as in the increment form: v(t-1) …, and the second's observer form."""
+
+    delays = 0
+
+    def __init__(self, model: BlockCascade) -> None:
+        n1 = max(len(model.a1), model.b1.shape[1] - 1)
+        n2 = max(len(model.a2), model.b2.shape[1] - 1)
+        self._model, self._n1, self._n2 = model, n1, n2
+        self.order, self.lags = n1 + n2, max(n1, n2, 1)
+        self._a1, self._a2 = np.zeros(n1), np.zeros(n2)
+        self._a1[: len(model.a1)], self._a2[: len(model.a2)] = model.a1, model.a2
+        self._b1, self._b2 = np.zeros((len(model.b1), n1)), np.zeros((len(model.b2), n2))
+        self._b1[:, : model.b1.shape[1] - 1] = model.b1[:, 1:]
+        self._b2[:, : model.b2.shape[1] - 1] = model.b2[:, 1:]
+
+    def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        model, n1, n2 = self._model, self._n1, self._n2
+        rest = 1.0 - float(model.a1.sum())
+        if rest == 0.0:
+            raise DataError("the first filter has a pole at 1: no state goes with a held input")
+        first = np.full((1, n1), u[0, 0] / rest)
+        fs = []
+        for value in u[:, 0]:
+            f, first = self._first(first, float(value))
+            fs.append(f[0])
+        second = np.zeros(n2)
+        newest_y, newest_f = y[::-1, 0], np.array(fs)[::-1]
+        for i in range(n2):  # what the past says of y(t + i)
+            k = n2 - i
+            second[i] = self._a2[i:] @ newest_y[:k] + np.sum(self._b2[:, i:].T * newest_f[:k])
+        return np.concatenate([first[0], second])
+
+    def _first(self, x: FloatArray, u: float) -> tuple[FloatArray, FloatArray]:
+        """f at every phase (B, M), and the first filter's next state (B, n₁)."""
+        v = x @ self._a1 + u
+        f = self._model.f(v[:, None] * self._model.b1[:, 0] + x @ self._b1.T)
+        return f, _shifted(v[:, None], x)
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        n1 = self._n1
+        f, first = self._first(x[:, :n1], past[-1][0])
+        y = (f @ self._model.b2[:, 0])[:, None]
+        after = f @ self._b2
+        if self._n2:
+            y = y + x[:, n1 : n1 + 1]
+            after = after + y * self._a2
+            after[:, :-1] += x[:, n1 + 1 :]
+        return y, np.hstack([first, after])
+
+
+class _Monotone:
+    """e(ȳ) = c + a'x + b'w, x the lagged ȳ."""
+
+    def __init__(self, model: MonotoneEquation) -> None:
+        self._model = model
+        self.order = self.lags = len(model)
+        self.delays = max((d for _, d in model.window), default=0)
+        self._e = tuple(model.e.tolist())
+
+    def begin(self, y: FloatArray, _u: FloatArray) -> FloatArray:
+        return np.asarray((y[len(y) - self.lags :, 0] - self._model.y_offset)[::-1])
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        model = self._model
+        force = model.c
+        for weight, (i, d) in zip(model.b.tolist(), model.window, strict=True):
+            force += weight * (past[-1 - d][i] - model.u_offset[i])
+        targets = (x @ model.a + force).tolist()
+        pairs = zip(targets, x[:, 0].tolist(), strict=True)
+        after = np.array([[solve_increasing(self._e, t, guess)] for t, guess in pairs])
+        return after + model.y_offset, _shifted(after, x)
+
+
+class _Implicit:
+    """0 = h(v, x, w), x⁺ = [v; ã(x, w)], y = v."""
+
+    def __init__(self, model: ImplicitModel) -> None:
+        self._model = model
+        self.order, self.lags = len(model), model.lags
+        self.delays = max((d for _, d in model.window), default=0)
+
+    def begin(self, y: FloatArray, _u: FloatArray) -> FloatArray:
+        return np.asarray(y[len(y) - self.lags :][::-1].ravel())
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        w = np.array([past[-1 - d][i] for i, d in self._model.window])
+        after = self._model.step(x, np.tile(w, (len(x), 1)))
+        return after[:, : self._model.unknowns], after
+
+
+_KINDS: dict[type, Callable[..., Any]] = {
+    DifferenceEquation: _Linear,
+    StateAffineModel: _StateAffine,
+    BlockCascade: _Cascade,
+    MonotoneEquation: _Monotone,
+    ImplicitModel: _Implicit,
+}
+
+
+def _shifted(newest: FloatArray, x: FloatArray) -> FloatArray:
+    """`newest`, and all of x but as many of its last columns."""
+    return np.hstack([newest, x])[:, : x.shape[1]]

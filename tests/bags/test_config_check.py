@@ -1,0 +1,103 @@
+"""`nlsid config check`, and the page that lists every key of a configuration."""
+
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+import yaml
+from pydantic import TypeAdapter
+from typer.testing import CliRunner
+
+from bags.chain.config import Config
+from bags.chain.identification_config import CLASSES
+from bags.chain.reference import keys_of, option_rows, page
+from bags.chain.sections import Section, sections_in
+from bags.chain.shipped import config_file
+from bags.chain.tracking_config import TrackingConfig
+from bags.commands.cli import app
+from bags.samples import f1tenth
+from nlsid_core.identification import METHODS
+from tests.house.sources import ROOT
+
+CONFIG = config_file("f1tenth.yaml")
+PAGE = ROOT / "docs" / "configuration.md"
+
+
+def check(*arguments: object, status: int = 0) -> str:
+    done = CliRunner().invoke(app, ["config", "check", *map(str, arguments)])
+    assert done.exit_code == status, done.output
+    return done.output
+
+
+def edited(path: Path, **changes: Any) -> Path:
+    """The shipped configuration with whole keys changed; None leaves one out."""
+    content = yaml.safe_load(CONFIG.read_text()) | changes
+    path.write_text(yaml.safe_dump({k: v for k, v in content.items() if v is not None}))
+    return path
+
+
+def test_nothing_is_wrong_with_the_shipped_configurations() -> None:
+    assert "nothing is wrong, 41 bags fit" in check(CONFIG, *f1tenth())
+    for name in ("arm.yaml", "pendulum.yaml"):
+        assert "nothing is wrong" in check("--track", config_file(name))
+
+
+def test_a_configuration_that_does_not_fit_its_bags_says_all_at_once(tmp_path: Path) -> None:
+    signals = {
+        "response": {"name": "speed", "path": "/odom:twist.twist.linear.v"},
+        "excitation": {"name": "command", "path": "/cmd:twist.linear.x"},
+    }
+    path = edited(tmp_path / "robot.yaml", signals=signals, split={"test": ["trial_05", "run_1"]})
+    output = check(path, *f1tenth(), status=1)
+    assert "Field 'v' does not exist on 'geometry_msgs/msg/Vector3'" in output
+    assert "/cmd" in output
+    assert "trial_01 and 40 more" in output
+    assert "split.test: none of the bags is called run_1" in output
+    assert len(output.splitlines()) == 3
+
+
+def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(tmp_path: Path) -> None:
+    path = edited(tmp_path / "a.yaml", split=None)
+    assert "split: nothing to score on" in check(path, *f1tenth(), status=1)
+    path = edited(tmp_path / "b.yaml", split={"test": ["trial_05"]})
+    only = [bag for bag in f1tenth() if bag.name == "trial_05"]
+    assert "split.test: names every bag" in check(path, *only, status=1)
+
+
+def test_wrong_keys_end_with_status_1(tmp_path: Path) -> None:
+    path = edited(tmp_path / "robot.yaml", grid={"perid": 0.025, "max_gap": -1})
+    output = check(path, status=1)
+    assert "grid.perid: there is no such key" in output
+    assert "did you mean 'period'?" in output
+    assert "grid.max_gap: Input should be greater than 0, in s (found -1)" in output
+    assert "grid.period: Field required" in output
+
+
+def test_the_page_of_every_key_is_up_to_date() -> None:
+    said = "python -m bags.chain.reference > docs/configuration.md"
+    assert PAGE.read_text(encoding="utf-8") == page(), said
+
+
+def every_section(kind: type[Section]) -> list[type[Section]]:
+    inside = [s for f in kind.model_fields.values() for s in sections_in(f.annotation)]
+    return [kind, *(found for section in inside for found in every_section(section))]
+
+
+@pytest.mark.parametrize("kind", [Config, TrackingConfig])
+def test_every_key_says_what_it_is_and_its_example_is_accepted(kind: type[Section]) -> None:
+    for section in every_section(kind):
+        types = get_type_hints(section, include_extras=True)
+        for name, key in keys_of(section).items():
+            assert key.text, name
+            inside = sections_in(section.model_fields[name].annotation)
+            assert inside or key.example is not None, f"{section.__name__}.{name}"
+            if key.example is not None:
+                TypeAdapter(types[name]).validate_python(key.example)
+
+
+def test_every_option_of_a_class_and_a_method_is_on_the_page() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    for kind in (*CLASSES.values(), *METHODS.values()):
+        for key, what, _, _ in option_rows(kind):
+            assert what, f"{kind.__name__}.{key}"
+            assert f"`{key}` | {what}" in text

@@ -1,0 +1,217 @@
+"""`nlsid init`: a configuration from bags that the whole way takes as it is."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from bags.chain.config import load_config
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.recordings.bag import Bag
+from bags.recordings.message_types import decode, standard_types
+from bags.recordings.writer import BagWriter
+from bags.samples import f1tenth, schunk
+from bags.setup.candidates import look
+from bags.setup.proposal import choose
+from nlsid_core.errors import BagError, DataError
+from tests.bag_messages import COMMAND, SPEED, speed_bag
+from tests.conftest import SHARED
+
+CMD = "/cmd_vel:twist.linear.x"
+YAW = "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"
+
+
+def nlsid(*arguments: object, status: int | None = 0) -> str:
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    if status is None:
+        assert done.exception is not None
+        return str(done.exception)
+    assert done.exit_code == status, f"{done.output}\n{done.exception}"
+    return done.output
+
+
+def whole_way(bags: Path, config: Path, out: Path) -> str:
+    """Check, identify, design, decide, replay: what the last of them says."""
+    assert "nothing is wrong" in nlsid("config", "check", config, bags)
+    nlsid("identify", bags, "--config", config, "--out", out)
+    model = out / documents.MODEL
+    nlsid("funnel", "--model", model, "--config", config, "--out", out)
+    said = nlsid("check", out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF)
+    assert said.count("PROVED ") == 2
+    funnel = out / documents.FUNNEL
+    done = CliRunner().invoke(
+        app, ["monitor", "--replay", str(bags), "--funnel", str(funnel), "--config", str(config)]
+    )
+    assert done.exit_code in (0, 1), done.exception
+    assert "unknown" not in done.output
+    return done.output
+
+
+@pytest.mark.parametrize(
+    ("options", "response", "excitation"),
+    [
+        ((), YAW, "/steering_command:position[name=steering]"),
+        (("-u", CMD), SPEED, CMD),
+    ],
+)
+def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
+    tmp_path: Path, options: tuple[str, ...], response: str, excitation: str
+) -> None:
+    bags, config = f1tenth()[0].parent, tmp_path / "robot.yaml"
+    said = nlsid("init", bags, "--yes", "--out", config, *options)
+    settings = load_config(config)
+    assert settings.signals.response[0].path == response
+    assert settings.signals.excitation[0].path == excitation
+    assert settings.grid.period == 0.025
+    assert settings.clock == "header"
+    assert len(settings.split.test) == 8
+    assert f"{response}: " in said
+    replayed = whole_way(bags, config, tmp_path / "out")
+    assert replayed.count("inside") == 8
+
+
+def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
+    nlsid("init", f1tenth()[0].parent, "--yes", "--out", tmp_path / "robot.yaml")
+    lines = (tmp_path / "robot.yaml").read_text().splitlines()
+    keys = [k for k, line in enumerate(lines) if re.match(r" *[a-z_]+:", line)]
+    assert len(keys) > 15
+    assert not [lines[k] for k in keys if not lines[k - 1].lstrip().startswith("#")]
+    assert max(map(len, lines)) < 160
+
+
+def test_unstamped_commands_are_paired_by_log_times_and_said(tmp_path: Path) -> None:
+    """The F1TENTH speed trials with their commands as plain Twist, as nav2 publishes them."""
+    bags = [bag for bag in f1tenth() if int(bag.name[-2:]) in (1, 2, 3, 4, 5, 12, 13, 14, 23, 24)]
+    for bag in bags:
+        with Bag(bag) as source, BagWriter(tmp_path / "bags" / bag.name) as target:
+            for message in source.messages():
+                kind, types = source.types_on(message.topic)
+                data = message.data
+                if message.topic == "/cmd_vel":
+                    stamped = decode(message.data, kind, types)
+                    kind = "geometry_msgs/msg/Twist"
+                    data = bytes(standard_types().serialize_cdr(stamped.twist, kind))  # type: ignore[attr-defined]
+                times = {"log_time_ns": message.log_time_ns, "publish_time_ns": message.log_time_ns}
+                target.write(message.topic, kind, data, **times)
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", tmp_path / "bags", "--yes", "--out", config, "-u", "/cmd_vel:linear.x")
+    assert load_config(config).clock == "log"
+    assert "mind: /cmd_vel (geometry_msgs/msg/Twist) has no header stamp" in said
+    assert "inside" in whole_way(tmp_path / "bags", config, tmp_path / "out")
+
+
+def test_a_delay_that_is_known_is_found(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.standard_normal(60), 5)
+    speed = np.concatenate([np.zeros(4), command[:-4]])
+    found = look([speed_bag(tmp_path / "run", speed, command)])
+    best = found.pairs[0]
+    assert (best.command.text, best.response.text) == (COMMAND, SPEED)
+    assert best.correlation > 0.97
+    assert best.delay == pytest.approx(0.1, abs=0.0125)  # four samples of 25 ms
+    assert choose(found) == ([SPEED], [COMMAND])
+    with pytest.raises(BagError, match="name them with --excitation"):
+        choose(found, excitations=["/odom:twist.twist.linear.x"])
+
+
+def test_one_side_that_is_named_gets_the_other_that_goes_with_it_best() -> None:
+    found = look(f1tenth())
+    assert choose(found, responses=[SPEED]) == ([SPEED], [CMD])
+    assert choose(found, excitations=[CMD]) == ([SPEED], [CMD])
+    assert choose(found, [SPEED], ["/steering_command:position[name=steering]"])[0] == [SPEED]
+
+
+def test_a_measured_effort_drives_where_nothing_commands() -> None:
+    """The Schunk arm has one topic; the joint's own rate follows its torque."""
+    responses, excitations = choose(look(schunk()))
+    assert responses == ["/joint_states:velocity[name=joint_3]"]
+    assert excitations == ["/joint_states:effort[name=joint_3]"]
+
+
+def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: Path) -> None:
+    config = tmp_path / "robot.yaml"
+    nlsid("init", schunk()[0].parent, "--yes", "--out", config)
+    grid = load_config(config).grid
+    assert grid.resample == "last"
+    assert grid.period == pytest.approx(10 * 0.004)
+    whole_way(schunk()[0].parent, config, tmp_path / "out")
+
+
+def test_several_signals_get_a_class_for_several_and_a_word_about_tubes(tmp_path: Path) -> None:
+    config = tmp_path / "robot.yaml"
+    steering = "/steering_command:position[name=steering]"
+    said = nlsid(
+        "init", f1tenth()[0].parent, "--out", config,
+        "-u", CMD, "-u", steering, "-y", SPEED, "-y", YAW,
+    )  # fmt: skip
+    content = yaml.safe_load(config.read_text())
+    assert content["identification"]["input_range"] == [[0.0, 0.4], [-0.2, 0.2]]
+    assert "funnel" not in content
+    assert "mind: several signals" in said
+    nlsid("identify", f1tenth()[0].parent, "--config", config, "--out", tmp_path / "out")
+
+
+def test_without_a_terminal_somebody_has_to_choose(tmp_path: Path) -> None:
+    said = nlsid("init", f1tenth()[0].parent, "--out", tmp_path / "robot.yaml", status=None)
+    assert "name them with --response and --excitation" in said
+    assert not (tmp_path / "robot.yaml").exists()
+
+
+def test_an_existing_file_is_not_written_over(tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text("mine")
+    said = nlsid(
+        "init", f1tenth()[0].parent, "--yes", "--out", tmp_path / "robot.yaml", status=None
+    )
+    assert "exists already" in said
+    assert (tmp_path / "robot.yaml").read_text() == "mine"
+
+
+def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
+    still = speed_bag(tmp_path / "still", np.full(50, 0.3), np.full(50, 0.2))
+    with pytest.raises(DataError, match="no number varies in still"):
+        look([still])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
+def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
+    """A real pseudo-terminal: the second command, then what follows it best."""
+    keyboard, terminal = os.openpty()
+    command = [sys.executable, "-m", "bags.commands.cli", "init", str(f1tenth()[0].parent)]
+    os.write(keyboard, b"99\n2\n\n")
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path / "robot.yaml")], stdin=terminal, capture_output=True,
+        text=True, check=False, timeout=120,
+    )  # fmt: skip
+    os.close(terminal)
+    os.close(keyboard)
+    assert done.returncode == 0, done.stderr
+    assert "What drives the robot?" in done.stdout
+    assert "1 to " in done.stdout
+    settings = load_config(tmp_path / "robot.yaml")
+    assert settings.signals.excitation[0].path == CMD
+    assert settings.signals.response[0].path == SPEED
+
+
+@pytest.mark.parametrize(
+    ("robot", "clock"),
+    [
+        ("ur10_panda/ur10_exciting_trajectory.db3", "header"),
+        ("ur10_panda/panda_exciting_trajectory.db3", "header"),
+        ("cougars_auv/SO_lastbag_mcap", "header"),
+    ],
+)
+def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, clock: str) -> None:
+    bag = SHARED / robot
+    if not bag.exists():
+        pytest.skip(f"needs {robot} in ../shared/data")
+    config = tmp_path / "robot.yaml"
+    nlsid("init", bag, "--yes", "--out", config)
+    assert load_config(config).clock == clock
+    whole_way(bag, config, tmp_path / "out")
