@@ -109,9 +109,11 @@ def test_nodes_end_with_the_command_that_started_them(
     arguments = [f"funnel:={funnel}", f"model:={model}", "plant:=true", "highest:=0.4", *PATIENT]
     command = [sys.executable, "-m", "bags.commands.cli", "live", "closed_loop", *arguments]
     commands: list[float] = []
-    operator.node.create_subscription(
-        TwistStamped, "/cmd_vel", lambda m: commands.append(m.twist.linear.x), qos.STREAM
-    )
+
+    def hear(message: TwistStamped) -> None:
+        commands.append(message.twist.linear.x)
+
+    operator.node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
     running = subprocess.Popen(command, cwd=ROOT)
     try:
         operator.hears("funnel_monitor", "waiting for the controller")
