@@ -21,7 +21,7 @@ from typing import Final
 from bags.designs.design import AnyDesign, Wiring, read_design
 from nlsid_core import designs, files, proofs
 from nlsid_core.arrays import Json
-from nlsid_core.errors import CertificateMismatch, DocumentError, NlsidError
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
 from nlsid_core.kernel import Verdict
 from nlsid_core.kernel.files import read_regular
 
@@ -88,7 +88,9 @@ class Bundle:
 
         Raises CertificateRejected or CertificateMismatch with the reason.
         """
-        proof = self.contents.get(PROOF, b"")
+        if PROOF not in self.contents:
+            raise CertificateRejected("there is no proof in the bundle")
+        proof = self.contents[PROOF]
         about = {name: self.contents[r] for r, name in _names(proof).items() if r in self.contents}
         verdict = proofs.decide(proof, about)
         found = {role: files.digest(content) for role, content in self.contents.items()}
