@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
@@ -29,6 +31,7 @@ from nlsid_ros.running import ManagedNode, declare, declare_text, run
 
 NAME = "funnel_publisher"
 LOOK = 0.5  # s between looks at the files
+REPORT = 1.0  # s between diagnostics while nothing changes
 
 
 class FunnelPublisher(ManagedNode):
@@ -62,8 +65,10 @@ class FunnelPublisher(ManagedNode):
         }
         self._seen = self._files(self._path)
         self._publish(self._load(self._path))
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(REPORT, self._report, clock=wall)
         if self._watch:
-            self.create_timer(LOOK, self._look)
+            self.create_timer(LOOK, self._look, clock=wall)
 
     def stop(self) -> None:
         """Publish no more."""
@@ -110,8 +115,12 @@ class FunnelPublisher(ManagedNode):
         self.get_logger().info(verdict)
 
     def _say(self, level: bytes, message: str) -> None:
+        self._said = level, message
+        self._report()
+
+    def _report(self) -> None:
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, message, {}))
+        self._diagnostics.publish(status(now, name_of(self), *self._said, {}))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -81,7 +81,8 @@ class ManagedNode(LifecycleNode):
 
     def tunable(self) -> dict[str, Any]:
         """The tunable parameters' values."""
-        return {d.name: self.get_parameter(d.name).value for d in self.declared if d.tunable}
+        tunable = (declared for declared in self.declared if declared.tunable)
+        return {d.name: _as_meant(d, self.get_parameter(d.name).value) for d in tunable}
 
     def start_itself(self) -> None:
         """Configure and activate without a manager; raises what made it fail."""
@@ -150,9 +151,12 @@ class ManagedNode(LifecycleNode):
     def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
         values = self.tunable()
         asked = {parameter.name: parameter.value for parameter in changed}
-        if not asked.keys() & values.keys():
-            return SetParametersResult(successful=True)
         try:
+            for each in self.declared:
+                if each.name in asked:
+                    asked[each.name] = _as_meant(each, asked[each.name])
+            if not asked.keys() & values.keys():
+                return SetParametersResult(successful=True)
             self.tune({name: asked.get(name, value) for name, value in values.items()})
         except (NlsidError, OSError) as refusal:
             return SetParametersResult(successful=False, reason=str(refusal))
@@ -249,10 +253,11 @@ def declare(
 
     It can be changed while the node runs only if `tunable`: `ManagedNode.tune` is told then.
 
-    The default's type is the parameter's: ROS keeps 2 and 2.0 apart. Raises DataError if the value
-    given has another type or is out of range.
+    The default's type is the parameter's, and 2 is taken where 2.0 is meant. Raises DataError if
+    the value given has another type or is out of range.
     """
     descriptor = ParameterDescriptor(name=name, description=description, read_only=not tunable)
+    descriptor.dynamic_typing = isinstance(default, float)  # or ROS would refuse 2 for 2.0
     if between is not None:
         lo, hi = between
         if isinstance(default, int):
@@ -260,12 +265,26 @@ def declare(
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=lo, to_value=hi)]
     try:
-        value: Value = node.declare_parameter(name, default, descriptor).value
+        given = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
+    declared = Declared(name, default, description, between, tunable)
     if isinstance(node, ManagedNode):
-        node.declared.append(Declared(name, default, description, between, tunable))
-    return value
+        node.declared.append(declared)
+    return _as_meant(declared, given)
+
+
+def _as_meant(declared: Declared, given: Any) -> Value:
+    """A number as float where one is meant; DataError if it is none or is out of range."""
+    value: Value = given
+    if not isinstance(declared.default, float):
+        return value
+    what = f"parameter {declared.name} ({declared.description})"
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise DataError(f"{what}: {given!r} is not a number")
+    if declared.between is not None and not declared.between[0] <= given <= declared.between[1]:
+        raise DataError(f"{what}: {given} is not in [{declared.between[0]}, {declared.between[1]}]")
+    return float(given)
 
 
 def declare_number(

@@ -164,7 +164,7 @@ def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_run
     ("name", "wrong", "message"),
     [
         ("trajectory_recorder", {"split_time": -1.0}, "Min: 0.0, Max: 1000000.0, value: -1.0"),
-        ("trajectory_recorder", {"snapshot": 5}, "parameter snapshot (s kept in memory"),
+        ("trajectory_recorder", {"snapshot": "long"}, "parameter snapshot (s kept in memory"),
         ("excitation", {"period": 0.0}, "parameter period (s between commands)"),
         ("excitation", {"repeats": 0}, "parameter repeats (how often it is played)"),
         ("excitation", {"kind": "noise"}, "kind is 'noise'; it should be one of multisine"),

@@ -154,7 +154,8 @@ def test_every_node_ends_cleanly_when_asked_to(
     ("name", "parameters", "message"),
     [
         ("tracking_controller", {"highest": 0.4, "settling": -1.0}, "parameter settling"),
-        ("tracking_controller", {"highest": 1}, "parameter highest (greatest input; must be set)"),
+        ("tracking_controller", {"highest": "much"}, "parameter highest (greatest input; must be"),
+        ("tracking_controller", {"highest": 2 * 10**9}, "is not in [-1000000000.0, 1000000000.0]"),
         ("tracking_controller", {}, "no room between lowest and highest"),
         ("tracking_controller", {"lowest": 0.2, "highest": 0.4}, "limits: 0.0 should be in"),
         ("funnel_publisher", {"funnel": "/nowhere/funnel.json"}, "nowhere"),
@@ -175,7 +176,7 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
     with (
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_monitor") as monitor,
-        process("nlsid_ros.tracking_controller", highest=0.4) as controller,
+        process("nlsid_ros.tracking_controller", highest=1) as controller,
     ):
 
         def ask(name: str, key: str, value: float | str) -> str:
@@ -187,6 +188,8 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
         assert "warning_margin" in ask("funnel_monitor", "warning_margin", 1.5)
         assert "read-only" in ask("funnel_monitor", "nominal", "profile")
         assert ask("tracking_controller", "highest", 0.3) == ""
+        assert ask("tracking_controller", "highest", 1) == "", "a whole number is a number"
+        assert "is not a number" in ask("tracking_controller", "highest", "much")
         assert "no room between" in ask("tracking_controller", "highest", 0.0)
         assert "stop_rate" in ask("tracking_controller", "stop_rate", 0.0)
         assert funnel.is_file()
