@@ -11,14 +11,19 @@ from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
+from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
+from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import LinearTube, TubeDesign, design
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
 
 Progress = Callable[[str, float], None]
 
@@ -254,6 +259,51 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
     if options is None:
         raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
     model = documents.load_model(model_path)
+    trials, _ = _trials_beside(model_path, config, model)
+    weights = options.policy
+    problem = LinearTube(
+        model,
+        trials.design,
+        profile=options.profile or _at_rest(trials.design, options.horizon),
+        horizon=options.horizon,
+        safety_factor=options.safety_factor,
+        inlet=options.inlet,
+        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
+        calibration=trials.calibration,
+    )
+    found = design(problem)
+    found.save(out)
+    return found
+
+
+def what_a_funnel_catches(model_path: Path, config: Config, design: TubeDesign) -> Catching | None:
+    """What a designed funnel catches in the test trials beside its model; None if there are none.
+
+    The trials are held against the model driven by the recorded commands. Raises DataError.
+    """
+    model = design.model
+    trials, test = _trials_beside(model_path, config, model)
+    if test is None:
+        return None
+    y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
+    return what_it_catches(
+        Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
+        model,
+        design.funnel.half_widths.tolist(),
+        held_back=test,
+        calibration=trials.calibration,
+        ranges=np.ptp(y, axis=0),
+        factor=design.funnel.assumption.safety_factor,
+    )
+
+
+def _trials_beside(
+    model_path: Path, config: Config, model: DifferenceEquation
+) -> tuple[CalibrationTrials, Dataset | None]:
+    """The trials that design and scale the tube of a model, and the test trials if they are kept.
+
+    Raises DataError if those that the configuration names are not there.
+    """
     train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
     held_back = load_held_back(
         model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
@@ -263,20 +313,11 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesi
             f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
             "calibration trials; run `nlsid identify` with this configuration"
         )
-    weights = options.policy
-    problem = LinearTube(
-        model,
-        train,
-        profile=options.profile or _at_rest(train, options.horizon),
-        horizon=options.horizon,
-        safety_factor=options.safety_factor,
-        inlet=options.inlet,
-        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-        calibration=held_back.get("calibration"),
+    assert config.funnel is not None
+    least = round(config.funnel.horizon / model.period) + len(model)
+    return calibration_trials(train, held_back.get("calibration"), least=least), held_back.get(
+        "test"
     )
-    found = design(problem)
-    found.save(out)
-    return found
 
 
 def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:

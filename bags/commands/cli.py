@@ -178,19 +178,29 @@ def funnel(
         Path | None,
         typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
     ] = None,
+    require: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
+        ),
+    ] = None,
 ) -> None:
     """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.
 
     Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
+    Of the former it says what it catches: faults put into the test trials, through the monitor.
     """
     from bags.chain.config import load_config
-    from bags.chain.steps import design_funnel_files
+    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
+    from bags.pictures.report import write_catching
 
     if problem is not None:
-        if model is not None or config is not None:
-            raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
+        if not (model is None and config is None and require is None):
+            raise typer.BadParameter(
+                "--problem stands alone; it takes no --model, no --config and no --require"
+            )
         _funnel_around_trajectory(problem, out_dir)
         return
     if model is None or config is None:
@@ -199,10 +209,23 @@ def funnel(
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, out_dir)
+        progress("sabotaging the test trials", 0.7)
+        catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
     out.print(show.funnel_table(design))
-    for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
-        out.print(f"wrote {out_dir / name}", soft_wrap=True)
+    if catching is None:
+        out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
+        if require is not None:
+            raise typer.Exit(2)
+    else:
+        show.say_catching(out, catching, require)
+    for path in (
+        *(out_dir / n for n in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF)),
+        *([] if catching is None else write_catching(out_dir, catching)),
+    ):
+        out.print(f"wrote {path}", soft_wrap=True)
+    if catching is not None and require is not None and not catching.widest.share <= require:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -311,6 +334,32 @@ def monitor(
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.verdict != Status.INSIDE.value for entry in replays):
         raise typer.Exit(1)
+
+
+@app.command()
+def tolerances(
+    folder: Annotated[Path, typer.Argument(help="Folder of a design: funnel.json, its proof, ...")],
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; default the design's.")
+    ] = None,
+) -> None:
+    """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
+
+    Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
+    of Autoware's validators for speeds and distances, and a table of all signals.
+    """
+    from bags.designs import tolerances as proved
+
+    found = proved.tolerances(folder)
+    target = folder if out_dir is None else out_dir
+    target.mkdir(parents=True, exist_ok=True)
+    out.print(str(found), soft_wrap=True, markup=False, highlight=False)
+    written = found.write(target)
+    for path in written:
+        out.print(f"wrote {path}", soft_wrap=True)
+    for name, units in ((proved.CONTROLLER, proved.POSITIONS), (proved.VALIDATOR, ("m/s", "m"))):
+        if target / name not in written:
+            out.print(f"no {name}: no signal is in {' or '.join(units)}", soft_wrap=True)
 
 
 @app.command()

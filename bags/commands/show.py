@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from fractions import Fraction
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -12,6 +13,7 @@ from bags.chain.choosing import Compared
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
+from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
@@ -28,6 +30,7 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
+STABILITY = "proved rate a sample (time constant)"
 
 
 def say_identified(console: Console, result: Identified) -> None:
@@ -44,10 +47,11 @@ def say_identified(console: Console, result: Identified) -> None:
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
+    table.collapse_padding = True
     table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,
@@ -83,7 +87,7 @@ def selection_table(selection: Selection[Model]) -> Table:
     table.add_column("model class")
     for name in ("validation", "training", "test"):
         table.add_column(name, justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY, min_width=17)
     for entry in selection.tried:
         style = "bold" if entry.model_class is selection.best else ""
         label = describe(entry.model_class)
@@ -102,14 +106,14 @@ def comparison_table(compared: Compared) -> Table:
     title = [f"{len(compared.trials.test)} test trials {left_out}"]
     if len(labels) == 1:
         title = [*labels, *title]
-    table = Table(title=": ".join(title), title_justify="left")
-    table.add_column("method" if len(labels) == 1 else "model class, method")
-    table.add_column("simulation", justify="right")
+    table = Table(title=": ".join(title), title_justify="left", collapse_padding=True)
+    table.add_column("method" if len(labels) == 1 else "model class, method", min_width=13)
+    table.add_column("free run", justify="right")
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
     table.add_column("residual")
-    table.add_column("stable, rate a sample (time constant)")
+    table.add_column(STABILITY, min_width=9)
     table.add_column("time", justify="right")
     label = ""
     for row in compared.rows:
@@ -121,7 +125,7 @@ def comparison_table(compared: Compared) -> Table:
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            row.candidate.method.title,
+            row.candidate.method.name,
             percent(scores.simulation_percent),
             *(percent(scores.prediction_percent[k]) for k in horizons),
             ", ".join(flaws) or "white, independent",
@@ -132,10 +136,10 @@ def comparison_table(compared: Compared) -> Table:
 
 
 def stability(candidate: Candidate[Model]) -> str:
-    """Proved with its rate, or not, in colour."""
+    """The proved rate, or that none is, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    return f"[green]proved[/green], {stated_rate(candidate.proof, candidate.model.period)}"
+    return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
 def funnel_table(design: TubeDesign) -> Table:
@@ -154,6 +158,73 @@ def funnel_table(design: TubeDesign) -> Table:
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
     return table
+
+
+def catching_table(catching: Catching) -> Table:
+    """What the funnel and other detectors catch of every sabotage, and how soon."""
+    detectors = list(catching.rows[0].others)
+    table = Table(
+        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        caption=CATCHING_CAPTION,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,  # 79 columns in all
+    )
+    table.add_column("fault", no_wrap=True)
+    for name in ("outside", "violated", "unknown", "after", *detectors):
+        table.add_column(name, justify="right")
+    for row in catching.rows:
+        if row.refused:  # the reason is said below the table
+            table.add_row(row.fault, *["-"] * (4 + len(detectors)))
+            continue
+        funnel = row.funnel
+        counts = [str(funnel.outside), str(funnel.violated), str(funnel.unjudged)]
+        others = [_soon(row.others[name]) for name in detectors]
+        least = max((other.count for other in row.others.values()), default=0)
+        style = "dark_orange3" if least > funnel.count else ""
+        table.add_row(row.fault, *counts, _after(funnel), *others, style=style)
+    return table
+
+
+CATCHING_CAPTION = (
+    "outside and violated (what is assumed) are both caught; unknown: not judged to the end. "
+    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
+    "(untouched). Coloured: one of them catches more."
+)
+
+
+def _after(caught: Caught) -> str:
+    return "-" if math.isnan(caught.after) else f"{caught.after:.2f} s"
+
+
+def _soon(caught: Caught) -> str:
+    return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
+
+
+def say_catching(console: Console, catching: Catching, require: float | None) -> None:
+    """The widths, the table, and what is to be known of a tube that is too wide."""
+    for line in width_lines(catching):
+        console.print(line, soft_wrap=True, highlight=False)
+    console.print(catching_table(catching))
+    for row in catching.rows:
+        if row.refused:
+            console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    wide = catching.warnings(WIDE if require is None else require)
+    for line in wide:
+        word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
+        said = f"{word}{line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def width_lines(catching: Catching) -> list[str]:
+    """Every output's half-width beside its range."""
+    return [
+        f"half-width of {width.name}: {width.said}, {width.share:.2f} of its range, "
+        f"{width.range:.3g} {width.unit}"
+        for width in catching.widths
+    ]
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

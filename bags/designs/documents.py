@@ -23,6 +23,7 @@ SELECTION_PLOT = "select.png"
 COMPARISON_PLOT = "compare.png"
 MARGIN_PLOT = "monitor.png"
 FUNNEL_PLOT = "funnel.png"
+CATCHING_PLOT = "catching.png"
 FREE_RUN_PLOT = "free_run.png"
 MOTION_PLOT = "motion.png"
 

@@ -27,7 +27,7 @@ class LinearTube:
     """Policy, observer and tube of an identified model, under a bound on the innovations' energy.
 
     train: what the observer is chosen on. calibration: other trials, on which the bound is measured
-    (None: `calibration_split` of train); to state how often a next trial exceeds it, the model has
+    (None: `calibration_trials` of train); to state how often a next trial exceeds it, the model has
     to be fitted without them. profile: (s, output) corners of the nominal. horizon: s,
     how long the energy budget lasts. safety_factor: of the disturbance's amplitude over the largest
     measured, at least 1. inlet: allowed initial error of the output, in its unit. lqr_weights: of

@@ -131,6 +131,63 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     assert "probability at most 1/17" in said
 
 
+def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: Path) -> None:
+    """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
+    out = tmp_path / "copy"
+    shutil.copytree(chain, out)
+    model = str(out / documents.MODEL)
+    arguments = ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
+    made = CliRunner().invoke(app, arguments)
+    assert made.exit_code == 0, made.output
+    lines = {line[:20].strip(): line[20:].split() for line in made.output.splitlines()}
+    assert lines["untouched"] == ["0", "0", "0", "-", "0", "-", "0", "-", "0", "-"]
+    for fault in ("sensor x 0.6", "sensor x 0.8", "actuator x 0.8"):
+        assert int(lines[fault][0]) + int(lines[fault][1]) == 8
+        assert lines[fault][5] == "8", "CUSUM"
+    assert lines["5 samples lost"][:4] == ["0", "0", "8", "-"]
+    assert lines["bias, 10 % of range"][:2] == ["0", "0"]
+    assert lines["bias, 10 % of range"][4] == "8", "where CUSUM catches more the table shows it"
+    assert "0.61 of its range" in made.output
+    assert "warning: the half-width of speed, 0.236 m/s, is 0.606 of its range" in made.output
+    assert "trial_12 sets the level" in made.output
+    page = (out / documents.REPORT).read_text()
+    assert page.count("The funnel: what it can catch") == 1, "replaced, not added again"
+    cells = re.search(r"<td>sensor x 0.8</td>(.*?)</tr>", page).group(1)  # type: ignore[union-attr]
+    said = re.findall("<td>(.*?)</td>", cells)
+    assert said[:3] == lines["sensor x 0.8"][:3]
+    assert said[4] == f"8, {lines['sensor x 0.8'][6]} s"
+    assert "trial_12 sets the level" in page
+    assert (out / documents.CATCHING_PLOT).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("require", "status"), [("0.61", 0), ("0.6", 1)])
+def test_a_tube_wider_than_required_ends_with_status_1(
+    chain: Path, tmp_path: Path, require: str, status: int
+) -> None:
+    model, out = str(chain / documents.MODEL), str(tmp_path)
+    made = CliRunner().invoke(
+        app,
+        ["funnel", "--model", model, "--config", str(CONFIG), "--out", out, "--require", require],
+    )
+    assert made.exit_code == status
+    assert ("error: the half-width of speed" in made.output) == bool(status)
+    assert "warning" not in made.output
+
+
+def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
+    chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING):
+        shutil.copy(chain / name, tmp_path)
+    yaml_file = edited(tmp_path, split__calibration=[])
+    arguments = ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(yaml_file)]
+    made = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert "what it catches is not known" in made.output
+    required = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--require", "0.9"])
+    assert required.exit_code == 2, "not measured is neither yes nor no"
+
+
 def test_a_model_of_another_class_is_named_as_configurations_name_it(
     chain: Path, config: Config, tmp_path: Path
 ) -> None:
@@ -320,7 +377,7 @@ def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
 
 def test_the_report_is_one_file_with_its_pictures(chain: Path) -> None:
     page = (chain / documents.REPORT).read_text()
-    assert page.count("<svg") == 4  # trials, residuals, poles, the search
+    assert page.count("<svg") == 5  # trials, residuals, poles, the search, what the funnel catches
     assert "src=" not in page
     assert 'href="http' not in page
     assert "decided exactly" in page
