@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -142,10 +144,11 @@ class TrajectoryRecorder(ManagedNode):
         self._topics.want(self._wanted)
         if self._said_by:
             self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
-        self.create_timer(POLL, self._polled.take)
-        self.create_timer(DISCOVERY, self._topics.look)
-        self.create_timer(self._period, self._keep_up)
-        self.create_timer(REPORT, self._report)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulated time stands still
+        self.create_timer(POLL, self._polled.take, clock=wall)
+        self.create_timer(DISCOVERY, self._topics.look, clock=wall)
+        self.create_timer(self._period, self._keep_up, clock=wall)
+        self.create_timer(REPORT, self._report, clock=wall)
         for name, serve in (
             ("start", self._on_start),
             ("stop", self._on_stop),
@@ -296,6 +299,8 @@ class TrajectoryRecorder(ManagedNode):
             text = "; ".join(f"{topic}: {why}" for topic, why in problems.items())
         if recording is not None and recording.ended:
             level, text = DiagnosticStatus.ERROR, recording.ended
+        if self.get_parameter("use_sim_time").value and not self.get_clock().now().nanoseconds:
+            level, text = DiagnosticStatus.ERROR, f"nobody publishes /clock; {text}"
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, name_of(self), level, text, values))
 

@@ -141,6 +141,13 @@ def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
     assert "Traceback" not in output
 
 
+def test_a_recorder_that_waits_for_simulated_time_says_so(robot: Robot, tmp_path: Path) -> None:
+    settings: dict[str, object] = {"topics": "[/odom]", "bag": tmp_path / "bag"}
+    with process("nlsid_ros.trajectory_recorder", **settings, use_sim_time=True) as recorder:
+        robot.spin_until(lambda: robot.has_said("nobody publishes /clock", "trajectory_recorder"))
+        stop(recorder)
+
+
 def test_a_recording_stops_while_there_is_room_to_finish_it(robot: Robot, tmp_path: Path) -> None:
     bag = tmp_path / "full"
     settings: dict[str, object] = {"topics": "[/odom]", "bag": bag, "least_free": 1e11}
