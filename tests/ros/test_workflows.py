@@ -117,6 +117,7 @@ def test_nodes_end_with_the_command_that_started_them(
     running = subprocess.Popen(command, cwd=ROOT)
     try:
         operator.hears("funnel_monitor", "waiting for the controller")
+        operator.hears("tracking_controller", "idle")
         operator.call("/tracking_controller/start")
         operator.hears("funnel_monitor", "inside")
         children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
