@@ -109,8 +109,9 @@ class FunnelPublisher(ManagedNode):
     def _publish(self, proved: tuple[Bundle, AnyDesign, str]) -> None:
         bundle, design, verdict = proved
         self._latched["design"].publish(String(data=bundle.text()))
-        self._latched["tube"].publish(tube_markers(design, self._frame))
-        self._latched["nominal"].publish(nominal_trajectory(design))
+        if design.policy is not None:  # without a plan there is nothing to draw
+            self._latched["tube"].publish(tube_markers(design, self._frame))
+            self._latched["nominal"].publish(nominal_trajectory(design))
         self._say(DiagnosticStatus.OK, verdict)
         self.get_logger().info(verdict)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bags.chain.config import Config
+from bags.chain.config import Config, FunnelConfig
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
@@ -18,10 +18,12 @@ from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import LinearTube, TubeDesign, design
+from nlsid_core.design import LinearTube, OutputTube, OutputTubeDesign, TubeDesign, design
+from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Fit, Model
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
@@ -248,35 +250,46 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
     return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
 
 
-def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:
-    """A model file in; policy.json, funnel.json, funnel.proof.json (and model.json) in `out`.
+def design_funnel_files(
+    model_path: Path, config: Config, out: Path
+) -> TubeDesign | OutputTubeDesign:
+    """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
-    The observer is chosen on training.npz beside the model, the disturbance measured on the
-    calibration trials of held_back.npz, without which every second training trial is one. Raises
-    DataError or Infeasible.
+    With a profile, a policy and a tube around its plan, policy.json too; else a tube around the
+    simulation of a model of any class. The observer is chosen on training.npz beside the model, the
+    disturbance measured on the calibration trials of held_back.npz, without which every second
+    training trial is one. Raises DataError or Infeasible.
     """
     options = config.funnel
     if options is None:
         raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
-    model = documents.load_model(model_path)
+    planned = options.profile is not None
+    load = documents.load_model if planned else documents.load_stable_model
+    model: StableModel = load(model_path)
     trials, _ = _trials_beside(model_path, config, model)
-    weights = options.policy
-    problem = LinearTube(
-        model,
-        trials.design,
-        profile=options.profile or _at_rest(trials.design, options.horizon),
-        horizon=options.horizon,
-        safety_factor=options.safety_factor,
-        inlet=options.inlet,
-        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-        calibration=trials.calibration,
-    )
-    found = design(problem)
+    found: TubeDesign | OutputTubeDesign
+    if planned:
+        found = design(_around_plan(model, trials, options))
+    else:
+        found = design(
+            OutputTube(
+                model,
+                trials.design,
+                trials.calibration,
+                reaction_time=options.reaction_time,
+                safety_factor=options.safety_factor,
+                horizon=options.horizon,
+                box=getattr(config.identification.model_class, "box", None),
+            )
+        )
+        (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
     found.save(out)
     return found
 
 
-def what_a_funnel_catches(model_path: Path, config: Config, design: TubeDesign) -> Catching | None:
+def what_a_funnel_catches(
+    model_path: Path, config: Config, design: TubeDesign | OutputTubeDesign
+) -> Catching | None:
     """What a designed funnel catches in the test trials beside its model; None if there are none.
 
     The trials are held against the model driven by the recorded commands. Raises DataError.
@@ -286,6 +299,10 @@ def what_a_funnel_catches(model_path: Path, config: Config, design: TubeDesign) 
     if test is None:
         return None
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
+    if isinstance(design.funnel, TubeFunnel):
+        factor = design.funnel.tubes[0].safety_factor
+    else:
+        factor = design.funnel.assumption.safety_factor
     return what_it_catches(
         Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
         model,
@@ -293,12 +310,12 @@ def what_a_funnel_catches(model_path: Path, config: Config, design: TubeDesign) 
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        factor=design.funnel.assumption.safety_factor,
+        factor=factor,
     )
 
 
 def _trials_beside(
-    model_path: Path, config: Config, model: DifferenceEquation
+    model_path: Path, config: Config, model: StableModel
 ) -> tuple[CalibrationTrials, Dataset | None]:
     """The trials that design and scale the tube of a model, and the test trials if they are kept.
 
@@ -314,13 +331,27 @@ def _trials_beside(
             "calibration trials; run `nlsid identify` with this configuration"
         )
     assert config.funnel is not None
-    least = round(config.funnel.horizon / model.period) + len(model)
-    return calibration_trials(train, held_back.get("calibration"), least=least), held_back.get(
-        "test"
+    least = least_window(model, train)
+    if config.funnel.profile is not None and isinstance(model, DifferenceEquation):
+        least = round((config.funnel.horizon or 0.0) / model.period) + len(model)
+    trials = calibration_trials(train, held_back.get("calibration"), least=least)
+    return trials, held_back.get("test")
+
+
+def _around_plan(
+    model: StableModel, trials: CalibrationTrials, options: FunnelConfig
+) -> LinearTube:
+    assert isinstance(model, DifferenceEquation)
+    assert options.profile is not None
+    assert options.horizon is not None
+    weights = options.policy
+    return LinearTube(
+        model,
+        trials.design,
+        profile=options.profile,
+        horizon=options.horizon,
+        safety_factor=options.safety_factor,
+        inlet=options.inlet,
+        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
+        calibration=trials.calibration,
     )
-
-
-def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:
-    """A plan for a tube that follows received commands: the mean output, for `horizon` s."""
-    level = float(np.mean(np.concatenate([trial.y[:, 0] for trial in train])))
-    return [(0.0, level), (horizon, level)]

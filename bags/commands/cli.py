@@ -3,7 +3,6 @@
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
-import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
@@ -43,7 +42,9 @@ OutOption = Annotated[
 
 def _say_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"nlsid {importlib.metadata.version('nlsid')}")
+        from importlib.metadata import version
+
+        typer.echo(f"nlsid {version('nlsid')}")
         raise typer.Exit
 
 
@@ -185,10 +186,11 @@ def funnel(
         ),
     ] = None,
 ) -> None:
-    """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.
+    """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
-    Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
-    Of the former it says what it catches: faults put into the test trials, through the monitor.
+    Around the simulation of an identified model of any class, or a plan of a linear one (--model,
+    --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
+    it says what it catches: faults put into the test trials, through the monitor.
     """
     from bags.chain.config import load_config
     from bags.chain.steps import design_funnel_files, what_a_funnel_catches
@@ -220,7 +222,7 @@ def funnel(
     else:
         show.say_catching(out, catching, require)
     for path in (
-        *(out_dir / n for n in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF)),
+        *(out_dir / name for name in design.documents()),
         *([] if catching is None else write_catching(out_dir, catching)),
     ):
         out.print(f"wrote {path}", soft_wrap=True)
@@ -290,17 +292,16 @@ def monitor(
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if every bag is inside with the assumption kept, 1 if one is not. A tube of a linear
-    model is drawn too.
+    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside or breaks
+    the assumption, 2 if something was not judged. A tube of one output is drawn too.
     """
     from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
-    from bags.designs.design import Wiring, is_linear
+    from bags.designs.design import Wiring
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.folders import expand_bags
-    from nlsid_core.running.reading import Status
 
     if not replay:
         raise typer.BadParameter(
@@ -320,20 +321,24 @@ def monitor(
             replays.append(replay_bag(proved, bag, centre=centre))
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
-        drawn = report_available() and is_linear(proved.design)
+        drawn = report_available() and all(entry.half_width for entry in replays)
         if drawn:
             write_margins(picture, replays)
     out.print(show.replay_table(replays))
     for entry in replays:
-        if entry.reason:
+        if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
-        if entry.over is not None:
-            said = f"{entry.name}: not judged from {entry.over.t:.3f} s on: {entry.over.reason}"
+        for reading in entry.unjudged:
+            said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
+        if not entry.judged:
+            out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if drawn:
         out.print(f"wrote {picture}", soft_wrap=True)
-    if any(entry.verdict != Status.INSIDE.value for entry in replays):
+    if any(entry.first_bad is not None for entry in replays):
         raise typer.Exit(1)
+    if any(entry.unjudged or not entry.judged for entry in replays):
+        raise typer.Exit(2)
 
 
 @app.command()

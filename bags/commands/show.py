@@ -17,10 +17,12 @@ from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign
+from nlsid_core.design import OutputTubeDesign, TubeDesign
 from nlsid_core.errors import DataError, percent
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.kernel import text
+from nlsid_core.models import Signal, StableModel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -142,8 +144,37 @@ def stability(candidate: Candidate[Model]) -> str:
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
-def funnel_table(design: TubeDesign) -> Table:
+def funnel_table(design: TubeDesign | OutputTubeDesign) -> Table:
     """What the tube promises and on what."""
+    if isinstance(design.funnel, TubeFunnel):
+        return _output_tubes(design.model, design.funnel)
+    return _driven_tube(design)
+
+
+def _output_tubes(model: StableModel, funnel: TubeFunnel) -> Table:
+    table = Table(title="proved tube", title_justify="left", show_header=False)
+    table.add_column(style="dim")
+    table.add_column()
+    table.add_row("around", "the model's simulation under the inputs it receives; no policy")
+    signals = (model.y,) if isinstance(model.y, Signal) else model.y
+    for tube in funnel.tubes:
+        widths = zip(tube.half_widths, signals, strict=True)
+        lasting = "for ever"
+        if tube.samples is not None:
+            lasting = f"for {(tube.samples - 1) * model.period:g} s"
+        said = ", ".join(f"{width:g} {signal.unit} of {signal.name}" for width, signal in widths)
+        table.add_row("half-width", f"{said}, {lasting}")
+        table.add_row(
+            "assuming",
+            f"{tube.assumption}\n"
+            f"largest of {len(tube.measured_on)} calibration trials {tube.measured:.4g}, safety "
+            f"factor {tube.safety_factor:g} in amplitude",
+        )
+    table.add_row("starts", f"after {funnel.settling} samples")
+    return table
+
+
+def _driven_tube(design: TubeDesign) -> Table:
     model, funnel, assumption = design.model, design.funnel, design.funnel.assumption
     unit = model.y.unit
     table = Table(title="proved tube", title_justify="left", show_header=False)
@@ -163,8 +194,9 @@ def funnel_table(design: TubeDesign) -> Table:
 def catching_table(catching: Catching) -> Table:
     """What the funnel and other detectors catch of every sabotage, and how soon."""
     detectors = list(catching.rows[0].others)
+    plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        title=f"caught of {catching.trials} held-back trial{plural}, and how soon (median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
@@ -243,6 +275,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("axis", "left"),
         ("assumption", "right"),
         ("bad from", "right"),
+        ("judged", "right"),
     ):
         long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
         table.add_column(column, justify=justify, no_wrap=not long, overflow="fold")  # type: ignore[arg-type]
@@ -257,6 +290,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
             "-" if worst is None else worst.worst_axis,
             "-" if worst is None else _percent(replay.assumption),
             "-" if bad is None else f"{bad.t:.3f} s",
+            f"{replay.judged_span:.1f} of {replay.span:.1f} s",
         )
     return table
 

@@ -59,7 +59,7 @@ class OutputTube:
     """Tubes around the simulation of a stable model of any class, whatever drives it; for ever.
 
     train: the trials that observer and storage are chosen on. calibration: others, on which the
-    level is measured (None: every second one of `train`, of a single trial windows).
+    level is measured (None: every second recording of `train`, of a single one windows).
     reaction_time: s, how far ahead the forecast is to be narrow (None: ten samples). safety_factor:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every

@@ -29,7 +29,7 @@ from .positivity import expanded, positive, powers_of_two, read_squares
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
-PIECE = 20_000  # of the work that a claim may take: what a piece costs at the least
+PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
 Bounds = dict[int, tuple[Fraction, Fraction]]
 Curve = list[list[list[Fraction]]]  # by interval, control point, entry
 

@@ -10,32 +10,18 @@ most `level` while V(x̄_0) <= inlet and E <= budget. What the stored nominal de
 by is added to √level. Source: docs/certificate_driven_tube.md.
 """
 
-import re
-from bisect import bisect_left
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import accumulate
 
 from . import text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Mismatch, Node, Read, Rejected, bound_files
 from .increments import Linear, Model, Signal, read_model
+from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**6
-LONGEST = 10**12  # samples of a recording
-MAX_TRIALS = 10**5  # that one assumption was measured on, or one tube designed on
-WINDOW = re.compile(r"([0-9]{1,12}):([0-9]{1,12})\]")
 MAX_NOMINAL = 10**7  # samples of the nominal times the square of the states: a minute
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """A trial: the digest of its recording, and which samples of it: [0, LONGEST) is all."""
-
-    recording: str
-    first: int = 0
-    end: int = LONGEST
 
 
 @dataclass(frozen=True)
@@ -76,7 +62,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     linear = model.linear
     if linear is None:
         raise Rejected("a tube is decided for a model of kind difference_equation")
-    fitted_to = _recorded(documents["model"].member("bags"))
+    fitted_to = read_trials(documents["model"].member("bags"))
     tube = _read(documents["policy"], documents["funnel"], model, digests, fitted_to)
     slack = proof.members("slack")["slack"].number()
     if not 0 < slack < 1:
@@ -131,7 +117,7 @@ def _check_assumption(tube: Tube, linear: Linear) -> None:
     )
     if not tube.measured_on:
         raise Rejected("the assumption was measured on no trial")
-    if _shared(tube.measured_on, tube.designed_on):
+    if shared(tube.measured_on, tube.designed_on):
         raise Rejected(
             "a trial that the assumption was measured on also designed the tube: the largest of "
             "such trials says nothing of the next one"
@@ -204,51 +190,11 @@ def _assumptions(model: Model, tube: Tube) -> tuple[str, ...]:
             f"E <= {budget} after each of {tube.samples} samples, E+ = {text.exact(tube.rho)} E + "
             f"{energy} from 0"
         )
-    count = len(set(tube.measured_on))
-    windows = any(trial.end < LONGEST for trial in tube.measured_on)
-    kind = "window" if windows else "trial"
-    trials = f"{count} distinct {kind}" + "s" * (count > 1)
     return (
         start,
-        f"innovation energy: {bound} (largest of {trials}, each taken whole, "
-        f"{text.above(tube.measured)}, safety factor {text.below(tube.safety_factor)} in "
-        "amplitude; "
-        f"{_rank_bound(tube, count, windows=windows)})",
+        f"innovation energy: {bound} "
+        f"({calibration(tube.measured, tube.safety_factor, tube.measured_on, tube.fitted_to)})",
     )
-
-
-def _rank_bound(tube: Tube, count: int, *, windows: bool) -> str:
-    """How often a next trial exceeds the largest of those measured, if that can be said.
-
-    The largest of m + 1 exchangeable numbers is the last with probability at most 1/(m + 1). The
-    numbers are exchangeable only if the model and the tube were fixed before they were seen.
-    """
-    none = "no probability is stated of a next trial, as"
-    if windows:
-        return f"{none} windows of one recording are hardly exchangeable"
-    if seen := _shared(tube.measured_on, tube.fitted_to):
-        return f"{none} the model was fitted to {seen} of them"
-    return (
-        "a next trial that is exchangeable with them exceeds their largest with probability at "
-        f"most 1/{count + 1}"
-    )
-
-
-def _shared(trials: list[Recorded], others: list[Recorded]) -> int:
-    """How many distinct trials have samples that others have."""
-    spans: dict[str, list[tuple[int, int]]] = {}
-    for other in others:
-        spans.setdefault(other.recording, []).append((other.first, other.end))
-    reached = {
-        recording: ([first for first, _ in found], list(accumulate((e for _, e in found), max)))
-        for recording, found in ((key, sorted(value)) for key, value in spans.items())
-    }
-    count = 0
-    for trial in set(trials):
-        firsts, ends = reached.get(trial.recording, ([], []))
-        begun = bisect_left(firsts, trial.end)  # those that begin before the trial ends
-        count += begun > 0 and ends[begun - 1] > trial.first
-    return count
 
 
 def _read(
@@ -278,26 +224,10 @@ def _read(
         assumption=given["kind"].text(), budget=given["budget"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES), measured=given["measured"].number(),
         safety_factor=given["safety_factor"].number(),
-        measured_on=_recorded(given["measured_on"]), designed_on=_recorded(given["designed_on"]),
+        measured_on=read_trials(given["measured_on"]),
+        designed_on=read_trials(given["designed_on"]),
         fitted_to=fitted_to,
     )  # fmt: skip
-
-
-def _recorded(trials: Node) -> list[Recorded]:
-    """A list of {name, digest}; a digest may end in [first:end], samples of the recording."""
-    found = []
-    for trial in trials.items(0, MAX_TRIALS):
-        parts = trial.members("name digest")
-        parts["name"].text()
-        recording, cut, samples = parts["digest"].text().partition("[")
-        if not cut:
-            found.append(Recorded(recording))
-            continue
-        window = WINDOW.fullmatch(samples)
-        if window is None or not int(window[1]) < int(window[2]) < LONGEST:
-            raise Rejected(f"{trial.where}: a window should be [first:end] with first < end")
-        found.append(Recorded(recording, int(window[1]), int(window[2])))
-    return found
 
 
 def _opened(

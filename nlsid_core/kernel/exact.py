@@ -13,7 +13,7 @@ from .files import Rejected, common_denominator
 Matrix = list[list[Fraction]]
 Rows = Sequence[Sequence[Fraction | int]]
 MAX_ORDER = 200  # of a matrix whose definiteness is decided
-MAX_ELIMINATION = 10**8  # entries eliminated in one claim, long ones counted as several: a minute
+MAX_ELIMINATION = 10**8  # entries eliminated in one claim, long ones counted as several: 20 s
 LONG = 22  # an elimination whose longest numbers have b bits counts b^2 / 2^22 times
 
 _left: ContextVar[list[int] | None] = ContextVar("elimination", default=None)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 MAX_BYTES = 32 * 2**20  # of one file; real proofs are a few MB
-MAX_TOTAL = 48 * 2**20  # of all files of a claim: reading takes a second a MB and 50 times that
+MAX_TOTAL = 48 * 2**20  # of all files of a claim: half a minute, and 50 times that in memory
 MAX_WHOLE = 2**53  # beyond it a float64 no longer holds every whole number
 MAX_DIGITS = 4000  # of one integer of a "p/q": bounds what one number can cost
 MAX_NAME = 200

@@ -18,15 +18,15 @@ from typing import TypeVar, Union
 from .files import MAX_DEGREE, Rejected, Terms
 
 BITS = 6  # of an exponent: 2^BITS - 1 is MAX_DEGREE, of all exponents together
-MAX_WORK = 2 * 10**8  # products of coefficients in one claim: about a minute
+MAX_WORK = 10**8  # products of short coefficients in one claim: half a minute
 MAX_TERMS = 10**6  # of one polynomial: a few hundred MB
 MAX_HELD = 2**31  # bytes of the results of one ring, about
 TERM = 128  # bytes of a term without its digits
-LONG = 22  # a product of integers whose bits multiply to more than 2^22 counts as several
-VERY_LONG = 24  # and 2^24 as eight times that: nothing else takes time then
+LONG = 18  # a product of integers whose bits multiply to 2^18 counts twice
+CALL = 16  # products that a sum or a product of polynomials counts at the least
 WIDTHS = (64, 128, 192, 256, 384, 512, 768, 1024, 2048, 4096, 16384)
 
-MOST_WORK = 10**7  # the same of a claim without pieces: seconds
+MOST_WORK = 4 * 10**7  # the same of a claim without pieces: seconds
 FREE_OF_S = 1024  # a width for polynomials in x alone: nothing is packed, so it costs nothing
 
 Scalar = Union["Polynomial", Fraction, int]
@@ -138,9 +138,10 @@ class Ring:
             if factor:
                 norm += abs(factor) * p.norm
                 degree, order = max(degree, p.degree), max(order, p.order)
+                self.work.spend(len(p.terms) * long(self.bits(p), factor.bit_length()))
                 for key, value in p.terms.items():
                     terms[key] = terms.get(key, 0) + value * factor
-        self.work.spend(sum(len(p.terms) for _, p in parts))
+        self.work.spend(CALL + len(parts))
         self._hold(len(terms), self.width * order + norm.bit_length())
         return Polynomial(self, terms, common, degree, order, norm)
 
@@ -187,10 +188,8 @@ class Ring:
         norm = p.norm * q.norm
         if norm.bit_length() > WIDTHS[-1]:
             raise Rejected(f"coefficients of more than {WIDTHS[-1]} bits")
-        bits = [self.width * f.order + f.norm.bit_length() for f in (p, q)]
-        cost = bits[0] * bits[1]
-        long = 1 + (cost >> LONG - 3 * (cost >> VERY_LONG > 0))
-        self.work.spend((len(p.terms) * len(q.terms) + 1) * long)
+        bits = self.bits(p), self.bits(q)
+        self.work.spend(CALL + len(p.terms) * len(q.terms) * long(*bits))
         most = min(MAX_TERMS, (MAX_HELD - self.held[0]) // (TERM + sum(bits) // 7))
         terms: dict[int, int] = {}
         for left, a in p.terms.items():
@@ -203,6 +202,10 @@ class Ring:
         return Polynomial(
             self, terms, p.denominator * q.denominator, degree, p.order + q.order, norm
         )
+
+    def bits(self, p: Polynomial) -> int:
+        """How long its packed coefficients are at most."""
+        return self.width * p.order + p.norm.bit_length()
 
     def _hold(self, terms: int, bits: int) -> None:
         self.held[0] += terms * (TERM + bits // 7)
@@ -223,6 +226,11 @@ class Ring:
             for key, value in p.terms.items()
             if value
         }
+
+
+def long(a: int, b: int) -> int:
+    """How many products of short integers one of a and b bits counts as."""
+    return 1 + ((a + 64) * (b + 64) >> LONG)
 
 
 def packed(row: Sequence[int], width: int) -> int:

@@ -18,7 +18,7 @@ from fractions import Fraction
 from math import comb, lcm
 
 from .files import MAX_DEGREE, Node, Rejected
-from .polynomials import LONG, Polynomial, Ring, packed, unpacked
+from .polynomials import Polynomial, Ring, long, packed, unpacked
 
 MAX_BASIS = 200
 MAX_FACTORS = 24
@@ -218,8 +218,7 @@ def _grams(squares: Squares, ring: Ring, lowest: int) -> list[dict[int, int]]:
         most = max((abs(entry) for _, row in factor for entry in row), default=0)
         heaviest = max((weight for weight, _ in factor), default=1)
         width = (most * most * max(1, heaviest) * (len(factor) + 1)).bit_length() // 8 + 1
-        long = 1 + (size * 8 * width * most.bit_length() >> LONG)
-        ring.work.spend(size * (len(factor) + size) * long)
+        ring.work.spend(size * (len(factor) + size) * long(size * 8 * width, most.bit_length()))
         lines = [
             (weight * packed(row, width) << 8 * width * (size - len(row)), row)
             for weight, row in factor

@@ -32,6 +32,7 @@ from .text import above, below
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
+STEP = 5_000  # of the work that a claim may take: what a step costs at the least
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
 
@@ -108,6 +109,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         rooms: list[Fraction] = []
         for k, node in enumerate(bases["steps"].items(len(u), len(u))):
             at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
+            ring.work.spend(STEP)
             step = Ring(ring.count, ring.width, ring.work)  # what a step holds is not kept
             stated, link = _link(node, model, at, funnel.form, step)
             rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])

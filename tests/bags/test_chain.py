@@ -26,7 +26,6 @@ from bags.signals.signal import SignalPath
 from nlsid_core import files
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Status
 
 CONFIG = config_file("f1tenth.yaml")
@@ -188,6 +187,26 @@ def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     assert required.exit_code == 2, "not measured is neither yes nor no"
 
 
+def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_path: Path) -> None:
+    path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
+    content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
+    path.write_text(json.dumps(content))
+    common = ["--config", str(path), "--out", str(tmp_path)]
+    made = CliRunner().invoke(app, ["identify", str(trial("41")), *common])
+    assert made.exit_code == 0, made.output
+    model = str(tmp_path / documents.MODEL)
+    made = CliRunner().invoke(app, ["funnel", "--model", model, *common])
+    assert made.exit_code == 0, made.output
+    assert "of 1 held-back trial," in made.output
+    proved = documents.load_proved_funnel(tmp_path / documents.FUNNEL)
+    said = proved.verdict.assumptions[1]
+    assert "largest of 1 distinct window, taken whole, " in said
+    assert said.endswith("as windows of one recording are hardly exchangeable)")
+    (digest,) = {digest for _, digest in proved.design.model.bags}
+    assert proved.design.funnel.assumption.designed_on == (("trial_41[0:44]", f"{digest}[0:44]"),)
+    assert proved.design.funnel.assumption.measured_on[0][1] == f"{digest}[44:88]"
+
+
 def test_a_model_of_another_class_is_named_as_configurations_name_it(
     chain: Path, config: Config, tmp_path: Path
 ) -> None:
@@ -244,13 +263,36 @@ def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_pat
     assert "model.json is not the model this proof is about" in done.output
 
 
-def test_a_prediction_tube_needs_no_profile(chain: Path, tmp_path: Path) -> None:
-    path = edited(tmp_path, funnel__policy="none", funnel__profile=None)
-    found = design_funnel_files(chain / documents.MODEL, load_config(path), tmp_path / "out")
-    assert not found.policy.K.any()
-    replayed = replay(tmp_path / "out", trial("05"))
+def test_without_a_profile_the_tube_is_around_the_models_simulation(
+    chain: Path, tmp_path: Path
+) -> None:
+    path = edited(tmp_path, funnel={"safety_factor": 1.5})
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+        shutil.copy(chain / name, tmp_path)
+    done = CliRunner().invoke(
+        app,
+        ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(path),
+         "--out", str(tmp_path)],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "for ever" in done.output
+    assert not (tmp_path / documents.POLICY).exists()
+    done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
+    assert done.exit_code == 0, done.output
+    bags = [str(trial("05")), str(trial("11"))]
+    held = ["monitor", *bags, "--replay", "--funnel", str(tmp_path / documents.FUNNEL)]
+    done = CliRunner().invoke(app, held)
+    assert done.exit_code == 0, done.output
+    proved = documents.load_proved(tmp_path / documents.FUNNEL)
+    replayed = replay_bag(proved, trial("05"), centre=Centre.COMMAND)
     assert replayed.verdict == Status.INSIDE.value
-    assert len(replayed.judged) > 100
+    assert replayed.judged_span == pytest.approx(replayed.span)
+    assert replayed.span > 2.0
+    write_faulty_copy(
+        trial("05"), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS["zero after 1 s"]
+    )
+    done = CliRunner().invoke(app, [held[0], str(tmp_path / "bag"), *held[3:]])
+    assert done.exit_code == 1, done.output
 
 
 def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
@@ -292,22 +334,23 @@ def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
 
 
 def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Path) -> None:
-    whole = replay(chain, trial("05"))
+    whole = replace(replay(chain, trial("05")), period=0.0)  # these stamps are not of one run
     waiting, inside = whole.readings[0], whole.readings[-1]
     nan = inside._replace(status=Status.UNKNOWN, reason="speed is nan at t = 2 s")
     outside = inside._replace(status=Status.OUTSIDE, reason="left")
-    past = nan._replace(reason=f"{OVER} 117 samples; they are over")
+    past = nan._replace(reason="the proof covers 117 samples; they are over")
     assert "waiting" in waiting.reason
     for readings, verdict, reason in (
         ((waiting, inside, nan, nan), Status.UNKNOWN, nan.reason),
-        ((waiting, inside, past, waiting, inside), Status.INSIDE, ""),
+        ((waiting, inside, past, past, waiting, inside), Status.UNKNOWN, past.reason),
+        ((waiting, inside, inside), Status.INSIDE, ""),
         ((waiting, nan), Status.UNKNOWN, nan.reason),
         ((waiting, outside, nan), Status.OUTSIDE, "left"),
     ):
         found = replace(whole, readings=readings)
         assert (found.verdict, found.reason) == (verdict.value, reason)
-        assert found.over is None
-    assert replace(whole, readings=(inside, past, past)).over is past
+    parts = replace(whole, readings=(waiting, inside, past, past, nan))
+    assert parts.unjudged == (past, nan)
 
 
 @pytest.mark.parametrize("name", TEST)
@@ -393,6 +436,7 @@ def test_with_policy_none_the_funnel_is_a_prediction_tube(
     for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
     design = design_funnel_files(tmp_path / documents.MODEL, prediction, tmp_path)
+    assert design.policy is not None
     assert not design.policy.K.any()
     verdict = documents.load_proved_funnel(tmp_path / documents.FUNNEL).verdict
     assert "no feedback" in verdict.statement
@@ -415,8 +459,8 @@ def edited(tmp_path: Path, **changes: object) -> Path:
 
     content = yaml.safe_load(CONFIG.read_text())
     for dotted, value in changes.items():
-        section, key = dotted.split("__")
-        content[section][key] = value
+        section, _, key = dotted.partition("__")
+        content[section] = content[section] | {key: value} if key else value
     path = tmp_path / "config.yaml"
     path.write_text(json.dumps(content))
     return path

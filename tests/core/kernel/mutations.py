@@ -97,7 +97,7 @@ def mutant(case: Case, rng: np.random.Generator) -> Case:
 
 def bind_again(forged: Case) -> None:
     """The digests inside policies and funnels, then those of the claims, as an adversary would."""
-    prefixes = {name.removesuffix("policy.json") for name in forged.about if "policy" in name}
+    prefixes = {name.removesuffix("funnel.json") for name in forged.about if "funnel" in name}
     for prefix in sorted(prefixes) if forged.kind in ("tube", "funnel_composition") else []:
         of = "vector_field" if f"{prefix}vector_field.json" in forged.about else "model"
         for name, role in (("policy", of), ("funnel", of), ("funnel", "policy")):
