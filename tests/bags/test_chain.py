@@ -146,7 +146,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     assert lines["5 samples lost"][:4] == ["0", "0", "8", "-"]
     assert lines["bias, 10 % of range"][:2] == ["0", "0"]
     assert lines["bias, 10 % of range"][4] == "8", "where CUSUM catches more the table shows it"
-    assert "0.61 of its range" in made.output
+    assert "half-width of speed: 0.236 m/s, 0.606 of its range, 0.39 m/s" in made.output
     assert "warning: the half-width of speed, 0.236 m/s, is 0.606 of its range" in made.output
     assert "trial_12 sets the level" in made.output
     page = (out / documents.REPORT).read_text()
