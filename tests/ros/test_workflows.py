@@ -118,6 +118,9 @@ def test_nodes_end_with_the_command_that_started_them(
     try:
         operator.hears("funnel_monitor", "waiting for the controller")
         operator.hears("tracking_controller", "idle")
+        counted = operator.node.count_subscribers
+        operator.spin_until(lambda: counted("/cmd_vel") >= 3)  # plant, monitor and this one
+        operator.waits(1.0)  # the graph knows a subscription before its publisher does
         operator.call("/tracking_controller/start")
         operator.hears("funnel_monitor", "inside")
         children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
