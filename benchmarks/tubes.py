@@ -134,6 +134,7 @@ def measure(case: Case) -> dict[str, float | int]:
     caught = what_it_catches(
         monitor, model, fading.half_widths.tolist(), held_back=case.judged,
         calibration=case.calibration, ranges=np.ptp(y, axis=0), factor=FACTOR,
+        remedy="another model",
     )  # fmt: skip
     untouched, *faults = caught.rows
     after = [row.funnel.after for row in faults if np.isfinite(row.funnel.after)]
