@@ -71,6 +71,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "quadrotor": Benchmark("quadrotor"),
         "recorder": Benchmark("recorder"),
         "repeated_experiments": Benchmark("repeated_experiments"),
+        "robots": Benchmark("robots", data="."),
         "rwse_scaling": Benchmark("rwse_scaling"),
         "satellite": Benchmark("satellite"),
         "wiener_hammerstein": Benchmark("wiener_hammerstein", data="wh2009"),

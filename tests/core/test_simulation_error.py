@@ -9,7 +9,8 @@ import pytest
 from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.identification import LinearClass, identify, prove_stability
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
@@ -244,3 +245,15 @@ def test_the_identification_error_has_no_weights() -> None:
     weighted = replace(stacked, rows=stacked.rows.weighted(np.full(len(stacked.rows), 2.0)))
     with pytest.raises(ShapeError, match="weights"):
         robust_identification_error(weighted)
+
+
+def test_a_start_whose_simulation_overflows_is_refused_with_a_reason() -> None:
+    """An unstable model over a long trial: its derivatives are no numbers."""
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(4000)
+    y = np.cumsum(u) * 1e-3
+    data = Dataset((Trajectory(t=0.01 * np.arange(4000.0), y=y, u=u, name="long"),))
+    regression = build_regression(data, 2)
+    start = replace(least_squares(regression), a=np.array([1.9, -0.7]))
+    with pytest.raises(SolverError, match=r"grows beyond all numbers|J is infinite"):
+        minimise_simulation_error(regression, start)
