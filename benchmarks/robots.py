@@ -172,7 +172,8 @@ def write_drive(file: Path, bag: Path) -> None:
     """One drive as commands and motion, every 50 ms by the motion capture's clock.
 
     Speed and yaw rate are the slopes of positions and yaw over the last DART_WINDOW s, as a monitor
-    would have them. Rows before the first pose and with repeated times are left out.
+    would have them. `/drive` has the measured speed beside the steering command, for a model whose
+    inputs both are. Rows before the first pose and with repeated times are left out.
     """
     with file.open(encoding="utf-8-sig") as stream:
         titles = stream.readline().strip().split(",")
@@ -197,7 +198,8 @@ def write_drive(file: Path, bag: Path) -> None:
         for k in np.flatnonzero(np.isfinite(yaw_rate)):
             motion = {"x": float(np.hypot(rates[0][k], rates[1][k])), "yaw": float(yaw_rate[k])}
             command = {"x": float(throttle[k]), "yaw": float(steering[k])}
-            for topic, numbers in (("/command", command), ("/odom", motion)):
+            drive = {"x": motion["x"], "yaw": command["yaw"]}
+            for topic, numbers in (("/command", command), ("/drive", drive), ("/odom", motion)):
                 stamp = int(stamps[k])
                 data = twist(stamp, numbers["x"], numbers["yaw"])
                 writer.write(topic, TWIST, data, log_time_ns=stamp, publish_time_ns=stamp)
@@ -249,7 +251,7 @@ ROBOTS = (
     Robot("DART steering to yaw rate", "dart", dart_bags, ("/odom:twist.angular.z",),
           ("/command:twist.angular.z",)),
     Robot("DART yaw rate by steering and speed", "dart", dart_bags, ("/odom:twist.angular.z",),
-          ("/command:twist.angular.z", "/odom:twist.linear.x")),
+          ("/drive:twist.angular.z", "/drive:twist.linear.x")),
     Robot("Schunk arm", "schunk_arm", schunk_bags),
     Robot("EMPS slide", "emps", emps_bags),
     Robot("KUKA KR300", "kuka_kr300", kuka_bags),
@@ -282,14 +284,15 @@ def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
             fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
             row["test_error"] = fit.fit.errors["test"][fit.fit.chosen.method.name]
             step = "funnel"
-            if config.funnel is None:
-                row["refused"] = "funnel: no tube for several responses or excitations"
-                return row
             design = design_funnel_files(out / documents.MODEL, config, out)
             test = [bag for bag in bags if bag.name in config.split.test]
-            span = spread(bags, config.signals.response[0].path)
-            row["half_width_of_range"] = design.funnel.half_width / span
-            row["half_width"] = design.funnel.half_width
+            widths = [
+                float(width) / spread(bags, signal.path)
+                for width, signal in zip(
+                    design.funnel.half_widths, config.signals.response, strict=True
+                )
+            ]
+            row |= {"half_width_of_range": max(widths), "each": widths}
             step = "monitor"
             row |= held_against(config, test, out)
             if robot.folder == "dart":
@@ -349,7 +352,7 @@ def floors(config: Config, folder: Path, cache: Path, out: Path) -> dict[str, st
 
 def flagged(config: Config, bag: Path, out: Path) -> bool:
     """Whether a bag is outside or violates the assumption."""
-    proved = documents.load_proved_funnel(out / documents.FUNNEL)
+    proved = documents.load_proved(out / documents.FUNNEL)
     replay = replay_bag(proved, bag, centre=config.monitor.nominal_source)
     return replay.verdict in (Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value)
 
@@ -386,12 +389,13 @@ def line(row: dict[str, Any]) -> str:
     """One robot's row."""
     parts_of_row = [f"{row['robot']:36s}{row['lines_of_yaml_edited']:7d}"]
     parts_of_row.append(f"{row['test_error']:9.2f}" if "test_error" in row else f"{'-':>9s}")
-    if "half_width_of_range" in row:
+    if "false_alarms" in row:
         false = f"{row['false_alarms']}/{row['test_bags']}"
         caught = f"{row['caught']}/{row['broken']}"
         parts_of_row.append(f"{row['half_width_of_range']:12.3f}{false:>8s}{caught:>8s}")
     else:
-        parts_of_row.append(f"{'-':>12s}{'-':>8s}{'-':>8s}")
+        width = row.get("half_width_of_range")
+        parts_of_row.append(f"{'-' if width is None else f'{width:.3f}':>12s}{'-':>8s}{'-':>8s}")
     parts_of_row.append(f"{row.get('minutes', 0.0):6.2f}")
     floors_of_row = [f"{key}: {value}" for key, value in row.items() if key.startswith("flagged")]
     extras = [extra for extra in (*floors_of_row, row.get("refused", "")) if extra]

@@ -1,7 +1,7 @@
 """The YAML configuration of one robot: which signals, which split, which model, which tube."""
 
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -84,6 +84,13 @@ class SplitConfig(Section):
     validation: Annotated[
         Names, Key("bags by which orders, knots and bases are chosen", example=["trial_06"])
     ] = ()
+    calibration: Annotated[
+        Names,
+        Key(
+            "bags that scale the level of the tube; without any, every second training trial does",
+            example=["trial_07"],
+        ),
+    ] = ()
     share: Annotated[
         Annotated[float, Field(gt=0.0, lt=1.0)] | None,
         Key("instead of test bags, the end of every bag of this share of it", example=0.2),
@@ -108,11 +115,25 @@ def _none_word(value: object) -> object:
 
 
 class FunnelConfig(Section):
-    """The tube that `nlsid funnel` designs."""
+    """The tube that `nlsid funnel` designs: without `profile` around the model's simulation."""
 
     horizon: Annotated[
-        Positive, Key("how long the disturbance budget has to last", unit="s", example=2.9)
-    ]
+        Positive | None,
+        Key(
+            "how long the disturbance budget has to last: needed with `profile`; without, a second "
+            "tube for so long beside the one that lasts for ever",
+            unit="s",
+            example=2.9,
+        ),
+    ] = None
+    reaction_time: Annotated[
+        Positive | None,
+        Key(
+            "how far ahead the forecast is to be narrow, without `profile` (null: ten samples)",
+            unit="s",
+            example=0.5,
+        ),
+    ] = None
     safety_factor: Annotated[
         float,
         Field(ge=1.0, allow_inf_nan=False),
@@ -125,12 +146,13 @@ class FunnelConfig(Section):
     policy: Annotated[
         LqrConfig | None,
         BeforeValidator(_none_word),
-        Key("weights of an LQR, or `none` for a prediction tube", example="none"),
+        Key("with `profile`: weights of an LQR, or `none` for K = 0", example="none"),
     ] = LqrConfig()
     profile: Annotated[
         Annotated[tuple[Corner, ...], Field(min_length=2, strict=False)] | None,
         Key(
-            "corners [time, output] that the LQR policy tracks; `policy: none` needs none",
+            "corners [time, output] of a plan, for `model: linear`; without it the tube is around "
+            "the model's own simulation, for every class of models and for ever",
             unit="[s, the response's unit]",
             example=[[0.0, 0.0], [2.9, 0.35]],
         ),
@@ -139,12 +161,18 @@ class FunnelConfig(Section):
     @model_validator(mode="after")
     def _profile_to_track(self) -> "FunnelConfig":
         if self.profile is None:
-            if self.policy is not None:
+            if "policy" in self.model_fields_set and self.policy is not None:
                 raise ValueError(
-                    "an LQR policy tracks a profile: give `profile`, or `policy: none` for a tube "
-                    "around the motion that the received commands give"
+                    "an LQR policy tracks a profile: give `profile`, or leave out `policy` for a "
+                    "tube around the model's simulation"
                 )
+            if self.inlet:
+                raise ValueError("inlet is for a plan: give `profile`, or leave it out")
             return self
+        if self.horizon is None:
+            raise ValueError("a tube around a plan needs `horizon`, how long its budget lasts")
+        if self.reaction_time is not None:
+            raise ValueError("reaction_time is for a tube without `profile`; leave it out")
         times = [time for time, _ in self.profile]
         if any(later <= time for time, later in pairwise(times)):
             raise ValueError(f"profile: times should increase; they are {times}")
@@ -299,13 +327,15 @@ def _time_refusals(config: Config) -> Iterator[str]:
             f"{period:g} s, so that the live monitor would call every response stale; give at "
             "least 2 periods"
         )
-    if config.funnel is not None and round(config.funnel.horizon / period) < 1:
+    horizon = None if config.funnel is None else config.funnel.horizon
+    if horizon is not None and round(horizon / period) < 1:
         yield (
-            f"funnel.horizon: {config.funnel.horizon:g} s is not one sample of {period:g} s; give "
-            "the length of a run"
+            f"funnel.horizon: {horizon:g} s is not one sample of {period:g} s; give the length of "
+            "a run"
         )
-    if twice := set(config.split.test) & set(config.split.validation):
-        yield f"split: '{min(twice)}' is named for test and for validation"
+    for use, other in combinations(("test", "validation", "calibration"), 2):
+        if twice := set(getattr(config.split, use)) & set(getattr(config.split, other)):
+            yield f"split: '{min(twice)}' is named for {use} and for {other}"
 
 
 def _model_refusals(config: Config) -> Iterator[str]:
@@ -317,12 +347,27 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"identification.model: a {kind.__name__} has one response and one excitation, not "
             f"{said}; take state_affine or implicit, or leave out signals"
         )
-    elif config.funnel is not None and (kind is not LinearClass or counts != (1, 1)):
+    elif (
+        config.funnel is not None
+        and config.funnel.profile is not None
+        and (kind is not LinearClass or counts != (1, 1))
+    ):
         yield (
-            "funnel: a tube is designed for `model: linear` with one response and one excitation, "
-            f"not for a {kind.__name__} with {said}; leave out the section `funnel`, or use "
-            "`nlsid track` for a measured state"
+            "funnel.profile: a plan is tracked by `model: linear` with one response and one "
+            f"excitation, not by a {kind.__name__} with {said}; leave out `profile` for a tube "
+            "around the model's simulation, or use `nlsid track` for a measured state"
         )
+    if config.funnel is not None:
+        for role, signals in (
+            ("response", config.signals.response),
+            ("excitation", config.signals.excitation),
+        ):
+            topics = sorted({signal.path.partition(":")[0] for signal in signals})
+            if len(topics) > 1:
+                yield (
+                    f"funnel: a monitor reads every {role} from one topic, not from "
+                    f"{', '.join(topics)}; publish them in one message, or leave out `funnel`"
+                )
     if kind is BlockCascadeClass and not config.split.validation:
         yield "split.validation: a block_cascade chooses its knots on validation trials; name bags"
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):

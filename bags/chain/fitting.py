@@ -28,7 +28,8 @@ def misfits(config: Config, bags: Sequence[Path]) -> list[str]:
             found.setdefault(what, []).append(path.name)
     names = {path.stem if path.is_file() else path.resolve().name for path in bags}
     lines = [f"{_some(where)}: {what}" for what, where in found.items()]
-    for use, wanted in (("test", config.split.test), ("validation", config.split.validation)):
+    for use in ("test", "validation", "calibration"):
+        wanted = getattr(config.split, use)
         if absent := [name for name in wanted if name not in names]:
             lines.append(f"split.{use}: none of the bags is called {', '.join(absent)}")
         if wanted and set(wanted) >= names:

@@ -1,23 +1,31 @@
 """The chain's offline steps: each takes files, returns what it made, and writes it whole or not."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from bags.chain.config import Config
+from bags.chain.config import Config, FunnelConfig
 from bags.chain.sections import SignalConfig
-from bags.chain.training import load_training, save_training
+from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
+from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
+from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import LinearTube, TubeDesign, design
+from nlsid_core.design import LinearTube, OutputTube, OutputTubeDesign, TubeDesign, design
+from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Fit, Model
+from nlsid_core.models import DifferenceEquation, StableModel
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
 
 Progress = Callable[[str, float], None]
 
@@ -32,6 +40,7 @@ class Trials:
     train: Dataset
     test: Dataset
     validation: Dataset | None = None
+    calibration: Dataset | None = None
     skipped: int = 0
     absent: tuple[str, ...] = ()
 
@@ -58,7 +67,7 @@ class Identified:
 def identify_bags(
     bags: Sequence[Path], config: Config, out: Path, *, progress: Progress
 ) -> Identified:
-    """Bags in; model.json, model.proof.json, training.npz and report.html in `out`.
+    """Bags in; model.json, model.proof.json, training.npz, held_back.npz and report.html in `out`.
 
     Raises DataError (BagError for bags) before anything is written.
     """
@@ -82,7 +91,14 @@ def write_identified(
     )
     model: Model = replace(fit.model, training=save_training(training, trials.train))
     files.write_document(path, model.document())
-    written = [path, training]
+    held_back = out / documents.HELD_BACK
+    parts = {"test": trials.test, "calibration": trials.calibration}
+    save_held_back(
+        held_back,
+        {use: data for use, data in parts.items() if data is not None},
+        model=files.digest(model.document()),
+    )
+    written = [path, training, held_back]
     if fit.chosen.proof is None:
         proof.unlink(missing_ok=True)
     else:
@@ -93,7 +109,7 @@ def write_identified(
         written.append(out / documents.REPORT)
         write_report(
             written[-1], fit, trials.train, trials.test,
-            validation=trials.validation, robot=config.robot,
+            validation=trials.validation, calibration=trials.calibration, robot=config.robot,
         )  # fmt: skip
     progress("done", 1.0)
     return Identified(fit, trials, tuple(written))
@@ -122,10 +138,20 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
     )
     labelled = _labelled(dataset, responses, excitations)
     if config.split.share is not None:
-        trials = cut(labelled, config.split.share, validation=config.split.validation)
+        trials = cut(
+            labelled,
+            config.split.share,
+            validation=config.split.validation,
+            calibration=config.split.calibration,
+        )
     else:
-        trials = split(labelled, test=config.split.test, validation=config.split.validation)
-    named = (*config.split.test, *config.split.validation)
+        trials = split(
+            labelled,
+            test=config.split.test,
+            validation=config.split.validation,
+            calibration=config.split.calibration,
+        )
+    named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
     return replace(trials, skipped=skipped_samples(dataset), absent=absent)
 
@@ -141,42 +167,48 @@ def _labelled(
     return Dataset(tuple(replace(trial, **labels) for trial in dataset))  # type: ignore[arg-type]
 
 
-def split(dataset: Dataset, *, test: Sequence[str], validation: Sequence[str] = ()) -> Trials:
-    """The trials by name of their bag; DataError if a name is for both, or a part is empty."""
-    if twice := set(test) & set(validation):
-        raise DataError(f"split: '{min(twice)}' is named for test and for validation")
-    chosen = {
-        "test": _of_bags(dataset, test),
-        "validation": _of_bags(dataset, validation),
-    }
+def split(
+    dataset: Dataset,
+    *,
+    test: Sequence[str],
+    validation: Sequence[str] = (),
+    calibration: Sequence[str] = (),
+) -> Trials:
+    """The trials by name of their bag; DataError if a name is for two uses, or a part is empty."""
+    chosen = _held_out(
+        dataset, {"test": test, "validation": validation, "calibration": calibration}
+    )
     present = ", ".join(dataset.names)
     if not chosen["test"]:
         raise DataError(
             "none of the bags is a test trial, so no model can be scored; split.test names "
             f"{', '.join(test) or 'nothing'}, the bags are {present}"
         )
-    if validation and not chosen["validation"]:
-        raise DataError(
-            f"none of the bags is a validation trial; split.validation names "
-            f"{', '.join(validation)}, the bags are {present}"
-        )
-    held_out = [*chosen["test"], *chosen["validation"]]
-    if len(chosen["test"]) == len(dataset):
-        raise DataError("all of the bags are test trials; give some to train on")
+    held_out = [name for names in chosen.values() for name in names]
     if len(held_out) == len(dataset):
-        raise DataError("all of the bags are test or validation trials; give some to train on")
+        uses = [use for use, names in chosen.items() if names]
+        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     return Trials(
         dataset.without(held_out),
         dataset.select(chosen["test"]),
-        dataset.select(chosen["validation"]) if chosen["validation"] else None,
+        _selected(dataset, chosen["validation"]),
+        _selected(dataset, chosen["calibration"]),
     )
 
 
-def cut(dataset: Dataset, share: float, *, validation: Sequence[str] = ()) -> Trials:
-    """Test trials are the `share` at the end of every trial that is not for validation."""
-    held_out = _of_bags(dataset, validation)
+def cut(
+    dataset: Dataset,
+    share: float,
+    *,
+    validation: Sequence[str] = (),
+    calibration: Sequence[str] = (),
+) -> Trials:
+    """Test trials are the `share` at the end of every trial that is not named for another use."""
+    chosen = _held_out(dataset, {"validation": validation, "calibration": calibration})
+    held_out = [name for names in chosen.values() for name in names]
     if len(held_out) == len(dataset):
-        raise DataError("all of the bags are validation trials; give some to train on")
+        uses = [use for use, names in chosen.items() if names]
+        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
     for trial in dataset.without(held_out):
         count = round(share * len(trial.t))
@@ -190,8 +222,27 @@ def cut(dataset: Dataset, share: float, *, validation: Sequence[str] = ()) -> Tr
     return Trials(
         Dataset(tuple(parts[0])),
         Dataset(tuple(parts[1])),
-        dataset.select(held_out) if held_out else None,
+        _selected(dataset, chosen["validation"]),
+        _selected(dataset, chosen["calibration"]),
     )
+
+
+def _held_out(dataset: Dataset, named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """The trials of each use; DataError if a name is for two, or if nothing is for validation."""
+    for (use, names), (other, others) in combinations(named.items(), 2):
+        if twice := set(names) & set(others):
+            raise DataError(f"split: '{min(twice)}' is named for {use} and for {other}")
+    chosen = {use: _of_bags(dataset, names) for use, names in named.items()}
+    if named["validation"] and not chosen["validation"]:
+        raise DataError(
+            "none of the bags is a validation trial; split.validation names "
+            f"{', '.join(named['validation'])}, the bags are {', '.join(dataset.names)}"
+        )
+    return chosen
+
+
+def _selected(dataset: Dataset, names: Sequence[str]) -> Dataset | None:
+    return dataset.select(names) if names else None
 
 
 def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
@@ -199,32 +250,108 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
     return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
 
 
-def design_funnel_files(model_path: Path, config: Config, out: Path) -> TubeDesign:
-    """A model file in; policy.json, funnel.json, funnel.proof.json (and model.json) in `out`.
+def design_funnel_files(
+    model_path: Path, config: Config, out: Path
+) -> TubeDesign | OutputTubeDesign:
+    """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
-    The disturbance is measured on training.npz beside the model. Raises DataError or Infeasible.
+    With a profile, a policy and a tube around its plan, policy.json too; else a tube around the
+    simulation of a model of any class. The observer is chosen on training.npz beside the model, the
+    disturbance measured on the calibration trials of held_back.npz, without which every second
+    training trial is one. Raises DataError or Infeasible.
     """
     options = config.funnel
     if options is None:
         raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
-    model = documents.load_model(model_path)
-    train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
-    weights = options.policy
-    problem = LinearTube(
-        model,
-        train,
-        profile=options.profile or _at_rest(train, options.horizon),
-        horizon=options.horizon,
-        safety_factor=options.safety_factor,
-        inlet=options.inlet,
-        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-    )
-    found = design(problem)
+    planned = options.profile is not None
+    load = documents.load_model if planned else documents.load_stable_model
+    model: StableModel = load(model_path)
+    trials, _ = _trials_beside(model_path, config, model)
+    found: TubeDesign | OutputTubeDesign
+    if planned:
+        found = design(_around_plan(model, trials, options))
+    else:
+        found = design(
+            OutputTube(
+                model,
+                trials.design,
+                trials.calibration,
+                reaction_time=options.reaction_time,
+                safety_factor=options.safety_factor,
+                horizon=options.horizon,
+                box=getattr(config.identification.model_class, "box", None),
+            )
+        )
+        (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
     found.save(out)
     return found
 
 
-def _at_rest(train: Dataset, horizon: float) -> list[tuple[float, float]]:
-    """A plan for a tube that follows received commands: the mean output, for `horizon` s."""
-    level = float(np.mean(np.concatenate([trial.y[:, 0] for trial in train])))
-    return [(0.0, level), (horizon, level)]
+def what_a_funnel_catches(
+    model_path: Path, config: Config, design: TubeDesign | OutputTubeDesign
+) -> Catching | None:
+    """What a designed funnel catches in the test trials beside its model; None if there are none.
+
+    The trials are held against the model driven by the recorded commands. Raises DataError.
+    """
+    model = design.model
+    trials, test = _trials_beside(model_path, config, model)
+    if test is None:
+        return None
+    y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
+    if isinstance(design.funnel, TubeFunnel):
+        factor = design.funnel.tubes[0].safety_factor
+    else:
+        factor = design.funnel.assumption.safety_factor
+    return what_it_catches(
+        Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
+        model,
+        design.funnel.half_widths.tolist(),
+        held_back=test,
+        calibration=trials.calibration,
+        ranges=np.ptp(y, axis=0),
+        factor=factor,
+    )
+
+
+def _trials_beside(
+    model_path: Path, config: Config, model: StableModel
+) -> tuple[CalibrationTrials, Dataset | None]:
+    """The trials that design and scale the tube of a model, and the test trials if they are kept.
+
+    Raises DataError if those that the configuration names are not there.
+    """
+    train = load_training(model_path.with_name(documents.TRAINING), digest=model.training)
+    held_back = load_held_back(
+        model_path.with_name(documents.HELD_BACK), model=files.digest(model.document())
+    )
+    if config.split.calibration and "calibration" not in held_back:
+        raise DataError(
+            f"split.calibration names bags, and {documents.HELD_BACK} beside the model has no "
+            "calibration trials; run `nlsid identify` with this configuration"
+        )
+    assert config.funnel is not None
+    least = least_window(model, train)
+    if config.funnel.profile is not None and isinstance(model, DifferenceEquation):
+        least = round((config.funnel.horizon or 0.0) / model.period) + len(model)
+    trials = calibration_trials(train, held_back.get("calibration"), least=least)
+    return trials, held_back.get("test")
+
+
+def _around_plan(
+    model: StableModel, trials: CalibrationTrials, options: FunnelConfig
+) -> LinearTube:
+    assert isinstance(model, DifferenceEquation)
+    assert options.profile is not None
+    assert options.horizon is not None
+    weights = options.policy
+    return LinearTube(
+        model,
+        trials.design,
+        profile=options.profile,
+        horizon=options.horizon,
+        safety_factor=options.safety_factor,
+        inlet=options.inlet,
+        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
+        calibration=trials.calibration,
+    )

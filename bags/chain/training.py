@@ -1,9 +1,10 @@
-"""The training data kept beside a model, so that later steps measure on what it was fitted to."""
+"""The trials kept beside a model: those it was fitted to, and those that were held back from it."""
 
 import hashlib
 import io
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,9 @@ NAMES = ("name", "group", "digest", "provenance")
 
 def save_training(path: Path | str, dataset: Dataset) -> str:
     """Write `dataset` as an .npz file and return its `sha256:` digest."""
-    arrays: dict[str, np.ndarray] = {}
-    labels = []
-    for index, trial in enumerate(dataset):
-        arrays |= {f"t{index}": trial.t, f"y{index}": trial.y, f"u{index}": trial.u}
-        labels.append({key: getattr(trial, key) for key in (*NAMES, *LABELS)})
-    arrays["labels"] = np.frombuffer(json.dumps(labels).encode(), dtype=np.uint8)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-    write_atomically(path, stream.getvalue())
-    return _digest(stream.getvalue())
+    content = _encoded({"training": dataset}, model="")
+    write_atomically(path, content)
+    return _digest(content)
 
 
 def load_training(path: Path | str, *, digest: str) -> Dataset:
@@ -39,22 +33,60 @@ def load_training(path: Path | str, *, digest: str) -> Dataset:
     content = Path(path).read_bytes()
     if _digest(content) != digest:
         raise DataError(f"{path}: not the data the model was fitted to; run `nlsid identify` again")
+    return _decoded(content, model="", source=f"{path}: not a training file")["training"]
+
+
+def save_held_back(path: Path | str, parts: Mapping[str, Dataset], *, model: str) -> None:
+    """Write trials that the model with this digest was not fitted to, by what they are for."""
+    write_atomically(path, _encoded(parts, model=model))
+
+
+def load_held_back(path: Path | str, *, model: str) -> dict[str, Dataset]:
+    """Read what `save_held_back` wrote, nothing if there is no such file.
+
+    Raises DataError if the trials were held back from another model.
+    """
+    path = Path(path)
+    if not path.exists():
+        return {}
+    return _decoded(path.read_bytes(), model=model, source=f"{path}: not trials held back")
+
+
+def _encoded(parts: Mapping[str, Dataset], *, model: str) -> bytes:
+    arrays: dict[str, np.ndarray] = {}
+    labels: list[dict[str, Any]] = []
+    for use, dataset in parts.items():
+        for trial in dataset:
+            index = len(labels)
+            arrays |= {f"t{index}": trial.t, f"y{index}": trial.y, f"u{index}": trial.u}
+            labels.append({key: getattr(trial, key) for key in (*NAMES, *LABELS)} | {"use": use})
+    document = json.dumps({"model": model, "trials": labels})
+    arrays["labels"] = np.frombuffer(document.encode(), dtype=np.uint8)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _decoded(content: bytes, *, model: str, source: str) -> dict[str, Dataset]:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            labels = json.loads(arrays["labels"].tobytes())
-            return Dataset(
-                tuple(
-                    Trajectory(
-                        t=arrays[f"t{index}"],
-                        y=arrays[f"y{index}"],
-                        u=arrays[f"u{index}"],
-                        **_labels(entry),
-                    )
-                    for index, entry in enumerate(labels)
+            document = json.loads(arrays["labels"].tobytes())
+            if document["model"] != model:
+                raise DataError(f"{source} from this model; run `nlsid identify` again")
+            parts: dict[str, list[Trajectory]] = {}
+            for index, entry in enumerate(document["trials"]):
+                trial = Trajectory(
+                    t=arrays[f"t{index}"],
+                    y=arrays[f"y{index}"],
+                    u=arrays[f"u{index}"],
+                    **_labels(entry),
                 )
-            )
+                parts.setdefault(str(entry["use"]), []).append(trial)
     except (KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path}: not a training file: {error}") from error
+        if isinstance(error, DataError):
+            raise
+        raise DataError(f"{source}: {error}") from error
+    return {use: Dataset(tuple(trials)) for use, trials in parts.items()}
 
 
 def _labels(entry: dict[str, Any]) -> dict[str, Any]:

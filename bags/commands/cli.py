@@ -3,7 +3,6 @@
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
-import importlib.metadata
 import importlib.util
 import sys
 from pathlib import Path
@@ -43,7 +42,9 @@ OutOption = Annotated[
 
 def _say_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"nlsid {importlib.metadata.version('nlsid')}")
+        from importlib.metadata import version
+
+        typer.echo(f"nlsid {version('nlsid')}")
         raise typer.Exit
 
 
@@ -178,19 +179,30 @@ def funnel(
         Path | None,
         typer.Option(help="Dynamics, nominal and goal in a file; instead of model and config."),
     ] = None,
+    require: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
+        ),
+    ] = None,
 ) -> None:
-    """Design a tracking policy and a proved funnel: policy.json, funnel.json, funnel.proof.json.
+    """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
-    Around an identified model (--model, --config), or a trajectory of given dynamics (--problem).
+    Around the simulation of an identified model of any class, or a plan of a linear one (--model,
+    --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
+    it says what it catches: faults put into the test trials, through the monitor.
     """
     from bags.chain.config import load_config
-    from bags.chain.steps import design_funnel_files
+    from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
+    from bags.pictures.report import write_catching
 
     if problem is not None:
-        if model is not None or config is not None:
-            raise typer.BadParameter("--problem stands alone; it takes no --model and no --config")
+        if not (model is None and config is None and require is None):
+            raise typer.BadParameter(
+                "--problem stands alone; it takes no --model, no --config and no --require"
+            )
         _funnel_around_trajectory(problem, out_dir)
         return
     if model is None or config is None:
@@ -199,10 +211,23 @@ def funnel(
     with progress_bar("designing") as progress:
         progress("policy, observer and tube", 0.1)
         design = design_funnel_files(model, settings, out_dir)
+        progress("sabotaging the test trials", 0.7)
+        catching = what_a_funnel_catches(model, settings, design)
         progress("done", 1.0)
     out.print(show.funnel_table(design))
-    for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
-        out.print(f"wrote {out_dir / name}", soft_wrap=True)
+    if catching is None:
+        out.print(f"what it catches is not known: no test trials in {documents.HELD_BACK}")
+        if require is not None:
+            raise typer.Exit(2)
+    else:
+        show.say_catching(out, catching, require)
+    for path in (
+        *(out_dir / name for name in design.documents()),
+        *([] if catching is None else write_catching(out_dir, catching)),
+    ):
+        out.print(f"wrote {path}", soft_wrap=True)
+    if catching is not None and require is not None and not catching.widest.share <= require:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -229,14 +254,16 @@ def check(
     """
     status = 0
     for path in proofs:
+        name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
-            typer.echo(str(kernel.check(path)))
+            said = str(kernel.check(path))
+            typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
         except kernel.Rejected as refusal:
             status = max(status, 1)
-            typer.echo(f"REJECTED {path.name}: {refusal}")
+            typer.echo(f"REJECTED {name}: {refusal}")
         except OSError as error:
             status = 2
-            typer.echo(f"NOT READ {path.name}: {error.strerror}")
+            typer.echo(f"NOT READ {name}: {error.strerror}")
     raise typer.Exit(status)
 
 
@@ -265,17 +292,16 @@ def monitor(
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if every bag is inside with the assumption kept, 1 if one is not. A tube of a linear
-    model is drawn too.
+    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside or breaks
+    the assumption, 2 if something was not judged. A tube of one output is drawn too.
     """
     from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
-    from bags.designs.design import Wiring, is_linear
+    from bags.designs.design import Wiring
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.folders import expand_bags
-    from nlsid_core.running.reading import Status
 
     if not replay:
         raise typer.BadParameter(
@@ -295,20 +321,50 @@ def monitor(
             replays.append(replay_bag(proved, bag, centre=centre))
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
-        drawn = report_available() and is_linear(proved.design)
+        drawn = report_available() and all(entry.half_width for entry in replays)
         if drawn:
             write_margins(picture, replays)
     out.print(show.replay_table(replays))
     for entry in replays:
-        if entry.reason:
+        if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
-        if entry.over is not None:
-            said = f"{entry.name}: not judged from {entry.over.t:.3f} s on: {entry.over.reason}"
+        for reading in entry.unjudged:
+            said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
+        if not entry.judged:
+            out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if drawn:
         out.print(f"wrote {picture}", soft_wrap=True)
-    if any(entry.verdict != Status.INSIDE.value for entry in replays):
+    if any(entry.first_bad is not None for entry in replays):
         raise typer.Exit(1)
+    if any(entry.unjudged or not entry.judged for entry in replays):
+        raise typer.Exit(2)
+
+
+@app.command()
+def tolerances(
+    folder: Annotated[Path, typer.Argument(help="Folder of a design: funnel.json, its proof, ...")],
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder for the files; default the design's.")
+    ] = None,
+) -> None:
+    """Write proved tolerances: joint_trajectory_controller.yaml, validator.yaml, tolerances.txt.
+
+    Path and goal tolerances of ros2_control's joint_trajectory_controller for positions, thresholds
+    of Autoware's validators for speeds and distances, and a table of all signals.
+    """
+    from bags.designs import tolerances as proved
+
+    found = proved.tolerances(folder)
+    target = folder if out_dir is None else out_dir
+    target.mkdir(parents=True, exist_ok=True)
+    out.print(str(found), soft_wrap=True, markup=False, highlight=False)
+    written = found.write(target)
+    for path in written:
+        out.print(f"wrote {path}", soft_wrap=True)
+    for name, units in ((proved.CONTROLLER, proved.POSITIONS), (proved.VALIDATOR, ("m/s", "m"))):
+        if target / name not in written:
+            out.print(f"no {name}: no signal is in {' or '.join(units)}", soft_wrap=True)
 
 
 @app.command()

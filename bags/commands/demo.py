@@ -15,12 +15,12 @@ from bags import samples
 from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
+from bags.chain.steps import design_funnel_files, identify_bags, what_a_funnel_catches
 from bags.commands import show
 from bags.commands.progress import progress_bar
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
-from bags.pictures.report import report_available, write_margins
+from bags.pictures.report import report_available, write_catching, write_margins
 from nlsid_core.proofs import check
 from nlsid_core.running.reading import Status
 
@@ -69,7 +69,11 @@ class _Demo:
         self._command(f"funnel --model {model} --config {self.config_path} --out {self.out}")
         with progress_bar("designing policy, observer and tube"):
             design = design_funnel_files(model, self.config, self.out)
+            catching = what_a_funnel_catches(model, self.config, design)
         self.console.print(show.funnel_table(design))
+        if catching is not None:
+            show.say_catching(self.console, catching, None)
+            write_catching(self.out, catching)
 
     def check(self) -> None:
         self._heading("3  check both proofs, exactly and without a solver")

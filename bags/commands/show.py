@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -11,12 +13,16 @@ from bags.chain.choosing import Compared
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
+from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign
+from nlsid_core.design import OutputTubeDesign, TubeDesign
 from nlsid_core.errors import DataError, percent
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
+from nlsid_core.kernel import text
+from nlsid_core.models import Signal, StableModel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -26,6 +32,7 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
+STABILITY = "proved rate a sample (time constant)"
 
 
 def say_identified(console: Console, result: Identified) -> None:
@@ -42,10 +49,11 @@ def say_identified(console: Console, result: Identified) -> None:
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
+    table.collapse_padding = True
     table.add_column("method", no_wrap=True)
     table.add_column("test error", justify="right")
     table.add_column("time", justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,
@@ -81,7 +89,7 @@ def selection_table(selection: Selection[Model]) -> Table:
     table.add_column("model class")
     for name in ("validation", "training", "test"):
         table.add_column(name, justify="right")
-    table.add_column("stability")
+    table.add_column(STABILITY, min_width=17)
     for entry in selection.tried:
         style = "bold" if entry.model_class is selection.best else ""
         label = describe(entry.model_class)
@@ -100,14 +108,14 @@ def comparison_table(compared: Compared) -> Table:
     title = [f"{len(compared.trials.test)} test trials {left_out}"]
     if len(labels) == 1:
         title = [*labels, *title]
-    table = Table(title=": ".join(title), title_justify="left")
-    table.add_column("method" if len(labels) == 1 else "model class, method")
-    table.add_column("simulation", justify="right")
+    table = Table(title=": ".join(title), title_justify="left", collapse_padding=True)
+    table.add_column("method" if len(labels) == 1 else "model class, method", min_width=13)
+    table.add_column("free run", justify="right")
     horizons = list(compared.rows[0].scores.prediction_percent)
     for horizon in horizons:
         table.add_column(f"{horizon} ahead", justify="right")
-    for name in ("residual", "stability"):
-        table.add_column(name)
+    table.add_column("residual")
+    table.add_column(STABILITY, min_width=9)
     table.add_column("time", justify="right")
     label = ""
     for row in compared.rows:
@@ -119,7 +127,7 @@ def comparison_table(compared: Compared) -> Table:
         flaws = [] if scores.white else ["not white"]
         flaws += [] if scores.independent else ["follows the input"]
         table.add_row(
-            row.candidate.method.title,
+            row.candidate.method.name,
             percent(scores.simulation_percent),
             *(percent(scores.prediction_percent[k]) for k in horizons),
             ", ".join(flaws) or "white, independent",
@@ -130,15 +138,43 @@ def comparison_table(compared: Compared) -> Table:
 
 
 def stability(candidate: Candidate[Model]) -> str:
-    """Proved with its rate, or not, in colour."""
+    """The proved rate, or that none is, in colour."""
     if candidate.proof is None:
         return "[dark_orange3]not proved"
-    rate = stated_rate(candidate.proof).removesuffix(" a sample")  # the table is narrow
-    return f"[green]proved[/green], {rate}"
+    return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
-def funnel_table(design: TubeDesign) -> Table:
+def funnel_table(design: TubeDesign | OutputTubeDesign) -> Table:
     """What the tube promises and on what."""
+    if isinstance(design.funnel, TubeFunnel):
+        return _output_tubes(design.model, design.funnel)
+    return _driven_tube(design)
+
+
+def _output_tubes(model: StableModel, funnel: TubeFunnel) -> Table:
+    table = Table(title="proved tube", title_justify="left", show_header=False)
+    table.add_column(style="dim")
+    table.add_column()
+    table.add_row("around", "the model's simulation under the inputs it receives; no policy")
+    signals = (model.y,) if isinstance(model.y, Signal) else model.y
+    for tube in funnel.tubes:
+        widths = zip(tube.half_widths, signals, strict=True)
+        lasting = "for ever"
+        if tube.samples is not None:
+            lasting = f"for {(tube.samples - 1) * model.period:g} s"
+        said = ", ".join(f"{width:g} {signal.unit} of {signal.name}" for width, signal in widths)
+        table.add_row("half-width", f"{said}, {lasting}")
+        table.add_row(
+            "assuming",
+            f"{tube.assumption}\n"
+            f"largest of {len(tube.measured_on)} calibration trials {tube.measured:.4g}, safety "
+            f"factor {tube.safety_factor:g} in amplitude",
+        )
+    table.add_row("starts", f"after {funnel.settling} samples")
+    return table
+
+
+def _driven_tube(design: TubeDesign) -> Table:
     model, funnel, assumption = design.model, design.funnel, design.funnel.assumption
     unit = model.y.unit
     table = Table(title="proved tube", title_justify="left", show_header=False)
@@ -146,19 +182,80 @@ def funnel_table(design: TubeDesign) -> Table:
     table.add_column()
     tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
     table.add_row("policy", tracking)
-    table.add_row(
-        "half-width",
-        f"{funnel.half_width:g} {unit} of {model.y.name}",
-    )
-    span = (assumption.samples - 1) * model.period
-    table.add_row("horizon", f"{assumption.samples} samples, which span {span:g} s")
-    table.add_row(
-        "assuming",
-        f"disturbance energy Σe² ≤ {assumption.budget:.4g} ({unit})²\n"
-        f"largest of {len(assumption.measured_on)} training trials {assumption.measured:.4g}, "
-        f"safety factor {assumption.safety_factor:g} in amplitude",
-    )
+    width = text.above(Fraction(funnel.half_width))
+    table.add_row("half-width", f"{width} {unit} of {model.y.name}")
+    span = text.below((assumption.samples - 1) * Fraction(model.period))
+    table.add_row("horizon", f"{assumption.samples} samples, which span {span} s")
+    for line in design.verdict.assumptions:
+        table.add_row("assuming", escape(line))
     return table
+
+
+def catching_table(catching: Catching) -> Table:
+    """What the funnel and other detectors catch of every sabotage, and how soon."""
+    detectors = list(catching.rows[0].others)
+    table = Table(
+        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        caption=CATCHING_CAPTION,
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,  # 79 columns in all
+    )
+    table.add_column("fault", no_wrap=True)
+    for name in ("outside", "violated", "unknown", "after", *detectors):
+        table.add_column(name, justify="right")
+    for row in catching.rows:
+        if row.refused:  # the reason is said below the table
+            table.add_row(row.fault, *["-"] * (4 + len(detectors)))
+            continue
+        funnel = row.funnel
+        counts = [str(funnel.outside), str(funnel.violated), str(funnel.unjudged)]
+        others = [_soon(row.others[name]) for name in detectors]
+        least = max((other.count for other in row.others.values()), default=0)
+        style = "dark_orange3" if least > funnel.count else ""
+        table.add_row(row.fault, *counts, _after(funnel), *others, style=style)
+    return table
+
+
+CATCHING_CAPTION = (
+    "outside and violated (what is assumed) are both caught; unknown: not judged to the end. "
+    "The others have the funnel's safety factor and calibration trials, and no more false alarms "
+    "(untouched). Coloured: one of them catches more."
+)
+
+
+def _after(caught: Caught) -> str:
+    return "-" if math.isnan(caught.after) else f"{caught.after:.2f} s"
+
+
+def _soon(caught: Caught) -> str:
+    return f"{caught.count} {_after(caught)}" if caught.count else "0 -"
+
+
+def say_catching(console: Console, catching: Catching, require: float | None) -> None:
+    """The widths, the table, and what is to be known of a tube that is too wide."""
+    for line in width_lines(catching):
+        console.print(line, soft_wrap=True, highlight=False)
+    console.print(catching_table(catching))
+    for row in catching.rows:
+        if row.refused:
+            console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    wide = catching.warnings(WIDE if require is None else require)
+    for line in wide:
+        word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
+        said = f"{word}{line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def width_lines(catching: Catching) -> list[str]:
+    """Every output's half-width beside its range."""
+    return [
+        f"half-width of {width.name}: {width.said}, {width.share:.2f} of its range, "
+        f"{width.range:.3g} {width.unit}"
+        for width in catching.widths
+    ]
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:
@@ -177,6 +274,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("axis", "left"),
         ("assumption", "right"),
         ("bad from", "right"),
+        ("judged", "right"),
     ):
         long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
         table.add_column(column, justify=justify, no_wrap=not long, overflow="fold")  # type: ignore[arg-type]
@@ -191,6 +289,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
             "-" if worst is None else worst.worst_axis,
             "-" if worst is None else _percent(replay.assumption),
             "-" if bad is None else f"{bad.t:.3f} s",
+            f"{replay.judged_span:.1f} of {replay.span:.1f} s",
         )
     return table
 

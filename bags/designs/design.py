@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic, TypeAlias, TypeGuard, TypeVar
 
 from bags.signals.expressions import Expression
@@ -10,13 +11,21 @@ from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.protocol import AnyFunnel, read_funnel
 from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.models import (
+    DifferenceEquation,
+    Signal,
+    StableModel,
+    StateModel,
+    TrapezoidalModel,
+)
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.linear import LinearPolicy
@@ -27,7 +36,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
 
 M = TypeVar("M", bound=Dynamics)
-P = TypeVar("P", bound=AnyPolicy)
+P = TypeVar("P", bound=AnyPolicy | None)
 F = TypeVar("F", bound=AnyFunnel)
 
 
@@ -63,29 +72,36 @@ class WiredDesign(Generic[M, P, F]):
     @property
     def name(self) -> str:
         """What is measured, in words."""
-        if isinstance(self.model, DifferenceEquation):
-            return self.model.y.name
         if isinstance(self.model, VectorField):
             return ", ".join(f"x{i}" for i in range(self.model.n))
-        return ", ".join(signal.name for signal in self.model.x)
+        return ", ".join(signal.name for signal in self.signals[0])
+
+    @property
+    def signals(self) -> tuple[tuple[Signal, ...], tuple[Signal, ...]]:
+        """The model's outputs or states, and its inputs."""
+        model: Any = self.model
+        measured = model.x if isinstance(model, StateModel | TrapezoidalModel) else model.y
+        return tuple((s,) if isinstance(s, Signal) else s for s in (measured, model.u))  # type: ignore[return-value]
 
     @property
     def response(self) -> SignalPath | SignalVector:
-        """Where the output or the state is read; BagError if a state is not on one topic."""
-        if isinstance(self.model, DifferenceEquation):
-            return Expression.parse(self.model.y.path).path
+        """Where the outputs or the state are read; BagError if they are not on one topic."""
         if isinstance(self.model, VectorField):
             return self._wired().response
-        return SignalVector.parse(signal.path for signal in self.model.x)
+        return _read_at(self.signals[0], single=self._is_single)
 
     @property
     def command(self) -> SignalPath | SignalVector:
         """Where the inputs are read and written; BagError if they are not on one topic."""
-        if isinstance(self.model, DifferenceEquation):
-            return Expression.parse(self.model.u.path).path
         if isinstance(self.model, VectorField):
             return self._wired().command
-        return SignalVector.parse(signal.path for signal in self.model.u)
+        return _read_at(self.signals[1], single=self._is_single)
+
+    @property
+    def _is_single(self) -> bool:
+        """One output and one input of an identified model: numbers, not vectors."""
+        measured = isinstance(self.model, StateModel | TrapezoidalModel)
+        return not measured and all(len(part) == 1 for part in self.signals)
 
     @property
     def period(self) -> float:
@@ -98,15 +114,13 @@ class WiredDesign(Generic[M, P, F]):
             wiring = self._wired()
             y, u = (list(map(Expression, v.paths)) for v in (wiring.response, wiring.command))
             return Sampler(y, u, period=self.period)
-        if isinstance(self.model, DifferenceEquation):
-            return Sampler([self.model.y.path], [self.model.u.path], period=self.period)
-        states, inputs = ([signal.path for signal in s] for s in (self.model.x, self.model.u))
-        return Sampler(states, inputs, period=self.period)
+        outputs, inputs = ([signal.path for signal in part] for part in self.signals)
+        return Sampler(outputs, inputs, period=self.period)
 
     @property
     def has_plan(self) -> bool:
-        """Whether the funnel is always around the policy's plan; a linear tube may follow."""
-        return not isinstance(self.funnel, LinearFunnel)
+        """Whether the funnel is always around the policy's plan; a tube may follow commands."""
+        return not isinstance(self.funnel, LinearFunnel | TubeFunnel)
 
     @property
     def digest(self) -> str:
@@ -121,6 +135,8 @@ class WiredDesign(Generic[M, P, F]):
     def controller(self, limits: Limits, settling: float) -> Controller:
         """A controller for one run; `settling`: s to wait for a state where it may start."""
         period = self.period if isinstance(self.model, VectorField) else None
+        if self.policy is None:
+            raise DocumentError("a tube around a model's simulation has no policy to run")
         return Controller(
             self.model, self.policy, self.funnel, limits=limits, settling=settling, period=period
         )
@@ -137,7 +153,8 @@ class WiredDesign(Generic[M, P, F]):
 LinearDesign: TypeAlias = WiredDesign[DifferenceEquation, LinearPolicy, LinearFunnel]
 SampledDesign: TypeAlias = WiredDesign[MeasuredState, SampledPolicy, SampledFunnel]
 ContinuousDesign: TypeAlias = WiredDesign[VectorField, ContinuousPolicy, ContinuousFunnel]
-AnyDesign: TypeAlias = LinearDesign | SampledDesign | ContinuousDesign
+WiredTube: TypeAlias = WiredDesign[StableModel, None, TubeFunnel]
+AnyDesign: TypeAlias = LinearDesign | SampledDesign | ContinuousDesign | WiredTube
 
 
 def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) -> AnyDesign:
@@ -146,14 +163,16 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
     The funnel's kind decides. Raises DocumentError if one is not what it should be,
     CertificateMismatch if they do not belong together.
     """
-    funnel, policy = read_funnel(documents["funnel"]), read_policy(documents["policy"])
-    readers: dict[type[AnyFunnel], tuple[type[AnyPolicy], Any]] = {
+    funnel = read_funnel(documents["funnel"])
+    readers: dict[type[AnyFunnel], tuple[type[AnyPolicy] | None, Any]] = {
         LinearFunnel: (LinearPolicy, DifferenceEquation.from_document),
         SampledFunnel: (SampledPolicy, read_measured_state),
         ContinuousFunnel: (ContinuousPolicy, VectorField.from_document),
+        TubeFunnel: (None, partial(read, source="model")),
     }
     kind, read_model = readers[type(funnel)]
-    if not isinstance(policy, kind):
+    policy = None if kind is None else read_policy(documents["policy"])
+    if kind is not None and not isinstance(policy, kind):
         raise DocumentError(
             f"policy: a {type(policy).__name__}, the funnel needs a {kind.__name__}"
         )
@@ -162,6 +181,12 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
     design: Any = WiredDesign(model, policy, funnel, wiring)
     made: AnyDesign = design
     return made
+
+
+def _read_at(signals: tuple[Signal, ...], *, single: bool) -> SignalPath | SignalVector:
+    if single:
+        return Expression.parse(signals[0].path).path
+    return SignalVector.parse(signal.path for signal in signals)
 
 
 def is_linear(design: AnyDesign) -> TypeGuard[LinearDesign]:
@@ -177,3 +202,8 @@ def is_sampled(design: AnyDesign) -> TypeGuard[SampledDesign]:
 def is_continuous(design: AnyDesign) -> TypeGuard[ContinuousDesign]:
     """Whether it is a funnel of a vector field."""
     return isinstance(design.funnel, ContinuousFunnel)
+
+
+def is_tube(design: AnyDesign) -> TypeGuard[WiredTube]:
+    """Whether it is a tube around the simulation of a model, without a policy."""
+    return isinstance(design.funnel, TubeFunnel)

@@ -2,28 +2,40 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast, get_args
 
 from bags.designs.design import AnyDesign, LinearDesign, SampledDesign, WiredDesign, Wiring
 from nlsid_core import designs, files
+from nlsid_core.documents import load
 from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.models import DifferenceEquation, StableModel
 from nlsid_core.running.monitor import refuse_mismatch
 
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
 MODEL_PROOF = "model.proof.json"
 TRAINING = "training.npz"
+HELD_BACK = "held_back.npz"
 REPORT = "report.html"
 SELECTION_PLOT = "select.png"
 COMPARISON_PLOT = "compare.png"
 MARGIN_PLOT = "monitor.png"
 FUNNEL_PLOT = "funnel.png"
+CATCHING_PLOT = "catching.png"
 FREE_RUN_PLOT = "free_run.png"
 MOTION_PLOT = "motion.png"
+
+
+def load_stable_model(path: Path | str) -> StableModel:
+    """Read a model file of any class that tubes are proved for; DocumentError if it is none."""
+    model = load(path)
+    if not isinstance(model, get_args(StableModel)):
+        raise DocumentError(f"{path}: not a model that `nlsid identify` writes")
+    found: StableModel = model
+    return found
 
 
 D_co = TypeVar("D_co", covariant=True)

@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import Any
 
-from bags.designs.design import AnyDesign, is_linear
+from bags.designs.design import AnyDesign, is_linear, is_tube
 from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Stamped, Watch
@@ -15,7 +14,6 @@ from bags.recordings.message_types import decode
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Reading, Status
 
 STRING = "std_msgs/msg/String"
@@ -35,6 +33,39 @@ class Replay:
     axis: str
     unit: str
     half_width: float
+    period: float = 0.0
+
+    @property
+    def span(self) -> float:
+        """S of the run, from the first sample after those that start it to the last."""
+        stamps = [r.t for r in self.readings if not _starting(r)]
+        return stamps[-1] - stamps[0] + self.period if stamps else 0.0
+
+    @property
+    def judged_span(self) -> float:
+        """S of it that were judged."""
+        return self.period * len(self.judged)
+
+    @property
+    def unjudged(self) -> tuple[Reading, ...]:
+        """The first reading of every stretch that was not judged, starts left out.
+
+        Of samples that never came, one that says so.
+        """
+        said, found = "", []
+        before: Reading | None = None
+        for reading in self.readings:
+            if before is not None and self.period > 0.0 and not _starting(reading):
+                lost = round((reading.t - before.t) / self.period) - 1
+                if lost > 0:
+                    reason = f"{lost} samples are missing"
+                    t = before.t + self.period
+                    found.append(Reading(t, Status.UNKNOWN, reason=reason))
+            again, said = said, reading.reason if _unjudged(reading) else ""
+            if said and said != again:
+                found.append(reading)
+            before = reading
+        return tuple(found)
 
     @property
     def judged(self) -> tuple[Reading, ...]:
@@ -52,18 +83,6 @@ class Replay:
         return next((r for r in self.judged if r.status is not Status.INSIDE), None)
 
     @property
-    def lost(self) -> Reading | None:
-        """The first reading that is unknown in a run that had begun, its proof not over."""
-        begun = dropwhile(lambda r: r.status is Status.UNKNOWN, self.readings)
-        return next((r for r in begun if _lost(r)), None)
-
-    @property
-    def over(self) -> Reading | None:
-        """The first reading after the end of the last run's proof, which says nothing of it."""
-        after = takewhile(lambda r: r.reason.startswith(OVER), reversed(self.readings))
-        return min(after, key=lambda r: r.t, default=None)
-
-    @property
     def assumption(self) -> float:
         """The part of what is assumed that is used at the last judged sample; 1 is all of it."""
         return self.judged[-1].assumption if self.judged else float("nan")
@@ -72,12 +91,11 @@ class Replay:
     def verdict(self) -> str:
         """The status at the first bad sample, else inside, else unknown.
 
-        Inside says that every sample was, so a run that is lost on its way is unknown.
+        Inside says that every sample was judged; those that start a run are not counted.
         """
-        bad = self.first_bad
-        if bad is not None:
-            return bad.status.value
-        whole = self.judged and self.lost is None
+        if self.first_bad is not None:
+            return self.first_bad.status.value
+        whole = self.judged and not self.unjudged
         return Status.INSIDE.value if whole else Status.UNKNOWN.value
 
     @property
@@ -85,15 +103,17 @@ class Replay:
         """Why it is not inside; empty if it is."""
         if self.first_bad is not None:
             return self.first_bad.reason
-        if self.lost is not None:
-            return self.lost.reason
+        if self.unjudged:
+            return self.unjudged[0].reason
         return "" if self.judged or not self.readings else self.readings[-1].reason
 
 
-def _lost(reading: Reading) -> bool:
-    waiting = reading.reason.startswith("waiting for ")
-    over = reading.reason.startswith(OVER)
-    return reading.status is Status.UNKNOWN and not (waiting or over)
+def _starting(reading: Reading) -> bool:
+    return reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
+
+
+def _unjudged(reading: Reading) -> bool:
+    return reading.status is Status.UNKNOWN and not _starting(reading)
 
 
 def replay_bag(proved: Proved[AnyDesign], bag: Path | str, *, centre: Centre) -> Replay:
@@ -103,13 +123,17 @@ def replay_bag(proved: Proved[AnyDesign], bag: Path | str, *, centre: Centre) ->
     """
     design = proved.design
     stamped = replay_messages(design, bag, centre=centre)
+    unit, half_width = "", 0.0
+    if is_linear(design) or (is_tube(design) and len(design.signals[0]) == 1):
+        unit, half_width = design.signals[0][0].unit, design.funnel.half_width
     return Replay(
         name=Path(bag).name,
         readings=tuple(entry.reading for entry in stamped),
         stamps_ns=tuple(entry.stamp_ns for entry in stamped),
         axis=design.name,
-        unit=design.model.y.unit if is_linear(design) else "",
-        half_width=design.funnel.half_width if is_linear(design) else 0.0,
+        unit=unit,
+        half_width=half_width,
+        period=design.period,
     )
 
 

@@ -130,7 +130,11 @@ class Watch:
             y, u = self._values(sample)
             if not self._running:
                 reading = self.monitor.waiting(t, y, WAITING)
-            elif sample.missing and not sample.missing.endswith(NOT_FINITE):  # it says which
+            elif (
+                sample.missing
+                and not self.monitor.goes_on
+                and not sample.missing.endswith(NOT_FINITE)  # it says which
+            ):
                 reading = self.monitor.missing(t, sample.missing)
             else:
                 reading = self.monitor.update(t, y, u)

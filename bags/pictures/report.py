@@ -1,16 +1,19 @@
 """`report.html`: one file that shows what was identified, how well, and what is proved."""
 
 import importlib.util
+import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
+from bags.designs import documents
+from bags.monitoring.catching import Catching, Row
 from bags.monitoring.replay import Replay
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, percent
-from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model
+from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import (
     DifferenceEquation,
     ImplicitModel,
@@ -18,6 +21,7 @@ from nlsid_core.models import (
     StateAffineModel,
 )
 
+FUNNEL_BEGINS, FUNNEL_ENDS = "<!-- funnel begins -->", "<!-- funnel ends -->"
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto;
        padding: 0 1rem }
@@ -45,11 +49,15 @@ def write_report(
     test: Dataset,
     *,
     validation: Dataset | None = None,
+    calibration: Dataset | None = None,
     robot: str,
 ) -> None:
     """Write the page; needs the extra `report`."""
     files.write_atomically(
-        path, page(fit, train, test, validation=validation, robot=robot).encode()
+        path,
+        page(
+            fit, train, test, validation=validation, calibration=calibration, robot=robot
+        ).encode(),
     )
 
 
@@ -60,12 +68,76 @@ def write_margins(path: Path, replays: Sequence[Replay]) -> None:
     plots.write_png(path, plots.margins(replays))
 
 
+def write_catching(folder: Path, catching: Catching) -> list[Path]:
+    """The picture of what a funnel catches, and its section in the report; the files written.
+
+    Nothing without the extra `report`; no section where there is no report.
+    """
+    if not report_available():
+        return []
+    from bags.pictures import catching_plots, plots
+
+    picture, report = folder / documents.CATCHING_PLOT, folder / documents.REPORT
+    figure = catching_plots.catching(catching)
+    plots.write_png(picture, figure)
+    if not report.exists():
+        return [picture]
+    before, begins, rest = report.read_text(encoding="utf-8").partition(FUNNEL_BEGINS)
+    _, ends, after = rest.partition(FUNNEL_ENDS)
+    if not ends:
+        return [picture]
+    section = _catching(catching, plots.svg(figure))
+    files.write_atomically(report, f"{before}{begins}{section}{ends}{after}".encode())
+    return [picture, report]
+
+
+def _catching(catching: Catching, drawn: str) -> str:
+    """The section of the report."""
+    detectors = list(catching.rows[0].others)
+    head = "".join(f"<th>{escape(name)}</th>" for name in ("outside", "assumption violated",
+                   "unknown", "after", *detectors))  # fmt: skip
+    rows = "".join(_catching_row(row, detectors) for row in catching.rows)
+    widths = "; ".join(
+        f"{escape(w.name)} {escape(w.said)}, {w.share:.2f} of its range, {w.range:.3g} "
+        f"{escape(w.unit)}"
+        for w in catching.widths
+    )
+    wide = "".join(f'<p class="not">{escape(line)}</p>' for line in catching.warnings())
+    return f"""
+<h2>The funnel: what it can catch</h2>
+<p>Half-width: {widths}.</p>{wide}
+<table><thead><tr><th>fault</th>{head}</tr></thead><tbody>{rows}</tbody></table>
+<p class="note">Of {catching.trials} trials that neither the model nor the funnel was made on,
+sabotaged: how many are caught, and how soon after the fault (median). <i>Outside</i> the tube and
+<i>assumption violated</i> are both caught; <i>unknown</i>: not judged to the end. CUSUM and 3σ
+watch the innovation, the box the difference from the nominal. Their thresholds have the same
+calibration trials and safety factor as the funnel's level, and are raised until they have no more
+false alarms on the untouched trials.</p>
+{drawn}
+"""
+
+
+def _catching_row(row: Row, detectors: Sequence[str]) -> str:
+    if row.refused:
+        return f'<tr><td>{escape(row.fault)}</td><td colspan="7">{escape(row.refused)}</td></tr>'
+    funnel = row.funnel
+    cells = [
+        *(str(count) for count in (funnel.outside, funnel.violated, funnel.unjudged)),
+        "-" if math.isnan(funnel.after) else f"{funnel.after:.2f} s",
+    ]
+    for name in detectors:
+        other = row.others[name]
+        cells.append(f"{other.count}, {other.after:.2f} s" if other.count else "0")
+    return f"<tr><td>{escape(row.fault)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
+
+
 def page(
     fit: Fit[Model],
     train: Dataset,
     test: Dataset,
     *,
     validation: Dataset | None = None,
+    calibration: Dataset | None = None,
     robot: str,
 ) -> str:
     """The whole HTML page as text."""
@@ -76,9 +148,11 @@ def page(
     simulated = "".join(plots.svg(model_plots.simulations(fit, test, i)) for i in outputs)
     columns = [name for name in ("test", "validation", "train") if name in fit.errors]
     head = "".join(f"<th>{name} error</th>" for name in columns)
-    chosen_on = "" if validation is None else f"{len(validation)} validation, "
-    recordings = [(train, "training"), (validation, "validation"), (test, "test")]
-    listed = "".join(_recordings(data, use) for data, use in recordings if data is not None)
+    recordings = [(train, "training"), (validation, "validation"), (calibration, "calibration"),
+                  (test, "test")]  # fmt: skip
+    kept = [(data, use) for data, use in recordings if data is not None]
+    listed = "".join(_recordings(data, use) for data, use in kept)
+    counts = ", ".join(f"{len(data)} {use}" for data, use in kept)
     rows = "\n".join(_row(c, fit, columns) for c in fit.candidates)
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
@@ -91,11 +165,12 @@ def page(
 <th>stability</th></tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Error: 100·‖y - ŷ‖/‖y - mean(y)‖ over all samples of each trial after those the
 simulation starts from{_left_out(chosen)}, ŷ simulated with the recorded input.
-Trials: {len(train)} training, {chosen_on}{len(test)} test; test trials were only used
-for this table and the pictures below.</p>
+Trials: {counts}; test trials were only used
+for this table and the pictures below{_calibrated(calibration)}.</p>
 <h2>Measured and simulated, test trials</h2>{simulated}
 {_residuals(chosen, test)}
 {_inside(fit)}
+{FUNNEL_BEGINS}{FUNNEL_ENDS}
 <h2>Recordings</h2>
 <table class="left">
 <thead><tr><th>trial</th><th>samples</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
@@ -118,7 +193,8 @@ def _stability(chosen: Candidate[Model]) -> str:
         clip = chosen.model.on_out_of_range == "clip"
         inputs += " (others are clipped to it)" if clip else " (others are refused)"
     if chosen.proof.rate < 1.0:
-        approach = f"approach each other at {chosen.proof.rate:.4f} a sample or faster"
+        rate = stated_rate(chosen.proof, chosen.model.period)
+        approach = f"approach each other at the rate {rate} a sample or faster"
     else:
         approach = "differ by a square summable sequence; no rate is claimed"
         if isinstance(chosen.proof, ImplicitProof) and chosen.proof.box:
@@ -171,6 +247,10 @@ def _equation(m: Model) -> str:
     if isinstance(m, ImplicitModel):
         return f"0 = h(y(t), x, w), x = y(t-1) … y(t-{m.lags}): {m}; {signals}"
     return f"y = G₂ f(G₁ u): {m}; {signals}"
+
+
+def _calibrated(calibration: Dataset | None) -> str:
+    return "" if calibration is None else ", calibration trials for neither: they scale the tube"
 
 
 def _left_out(chosen: Candidate[Model]) -> str:

@@ -39,6 +39,7 @@ FEW_GAPS: Final = 5.0  # periods: gaps up to here are filled in, longer ones cut
 DYNAMICS: Final = 40.0  # samples in a period of the fastest motion that are enough
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
+SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 RELATED: Final = 0.3  # correlation below which command and response may be unrelated
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
@@ -126,17 +127,13 @@ def propose(
         ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
-        proposal.walls.append(
-            "several signals: a tube is designed for one response and one excitation; the model "
-            "is identified and proved, `nlsid funnel` has nothing for it"
-        )
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
     if linear:
         _say_lags(proposal, trials.train)
-        _say_funnel(proposal, trials)
     else:
         _say_degree(proposal, trials.train)
+    _say_funnel(proposal)
     return proposal
 
 
@@ -369,7 +366,8 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
         proposal.content["split"] = {"share": SHARE}
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
         proposal.walls.append(
-            "one bag: the disturbance is measured on the drive that was fitted; record more"
+            "one bag: a tube is designed on one trial and its level measured on another; record "
+            "more, or cut it: nlsid bag split BAG --out PART --every 5"
         )
 
 
@@ -468,17 +466,14 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
     proposal.why["right_degree"] = "as the lags"
 
 
-def _say_funnel(proposal: Proposal, trials: Trials) -> None:
-    lags = int(proposal.content["identification"]["lags"])
-    period = float(proposal.content["grid"]["period"])
-    samples = max(len(trial) for trial in trials.train) - lags
-    longest = max(len(trial) for trial in trials.test)
-    samples = max(min(samples, longest), 1)
-    proposal.content["funnel"] = {"horizon": float(f"{samples * period:.6g}"), "policy": "none"}
-    proposal.why["horizon"] = f"{samples} samples: the longest run that training and test have"
-    proposal.why["policy"] = "a prediction tube around what the received commands give"
-    if longest - lags > samples:
-        proposal.walls.append(
-            f"the longest test run is {longest * period:.4g} s; a tube is proved for "
-            f"{samples * period:.4g} s, and the monitor says nothing after"
-        )
+def _say_funnel(proposal: Proposal) -> None:
+    for role, signals in proposal.content["signals"].items():
+        topics = sorted({signal["path"].partition(":")[0] for signal in signals})
+        if len(topics) > 1:
+            proposal.walls.append(
+                f"a monitor reads every {role} from one topic, and these are on "
+                f"{', '.join(topics)}: a model is identified and proved, without a tube"
+            )
+            return
+    proposal.content["funnel"] = {"safety_factor": SAFETY}
+    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less"

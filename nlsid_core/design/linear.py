@@ -3,7 +3,8 @@
 The observer's state obeys x̂⁺ = A x̂ + B u + f + L e by definition of the innovation e, so a bound
 on Σ e² is all the tube rests on. The ellipsoid is the smallest (in the output) that satisfies
 V(x̄⁺) ≤ V(x̄) + e² both with the nominal inputs played and with the policy engaged; the observer
-gain is the one whose tube is narrowest on the training trials.
+gain is the one whose tube is narrowest on the trials of the design, and the bound on Σ e² the
+largest that the other trials, those of the calibration, reach over their whole length.
 """
 
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from scipy.optimize import lsq_linear
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
+from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
@@ -46,29 +48,29 @@ def design_tube(
     safety_factor: float = 1.5,
     inlet: float = 0.0,
     lqr_weights: tuple[float, float] | None = (1.0, 1.0),
+    calibration: Dataset | None = None,
 ) -> TubeDesign:
     """The policy, observer and tube that `LinearTube` describes; its options are these.
 
     Raises DataError on options that make no sense, Infeasible if no ellipsoid exists.
     """
     samples = round(horizon / model.period)
-    longest = max(len(trial) for trial in train) - len(model)
+    trials = calibration_trials(train, calibration, least=samples + len(model))
+    longest = max(len(trial) for trial in trials.calibration) - len(model)
     if not 0 < samples <= longest:
         raise DataError(
             f"horizon {horizon} s is {samples} samples; the disturbance can be measured on the "
-            f"training trials for 1 to {longest}"
+            f"calibration trials for 1 to {longest}"
         )
     K: FloatArray = np.zeros(len(model))
     if lqr_weights is not None:
         K = lqr_gain(model, output_weight=lqr_weights[0], input_weight=lqr_weights[1])
     gains = np.array([kalman_gain(model, ratio) for ratio in NOISE_RATIOS])
-    measured = innovation_energies(model, gains, train).max(axis=0)
-    widths = [
-        np.sqrt(energy * (1.0 + open_loop_covariance(model, L)[0, 0]))
-        for L, energy in zip(gains, measured, strict=True)
-    ]
-    best = int(np.argmin(widths))
-    L, energy = gains[best], float(measured[best])
+    designed = innovation_energies(model, gains, trials.design).max(axis=0)
+    reaches = np.array([float(open_loop_covariance(model, L)[0, 0]) for L in gains])
+    levels = safety_factor**2 * designed + inlet**2 / reaches
+    L = gains[int(np.argmin(levels * (1.0 + reaches)))]
+    energy = float(innovation_energies(model, L[None, :], trials.calibration).max())
     W = _smallest_ellipsoid(model, K, L)
     P = np.linalg.inv(W)
     P = (P + P.T) / 2.0
@@ -92,7 +94,8 @@ def design_tube(
             samples=samples,
             measured=energy,
             safety_factor=safety_factor,
-            measured_on=tuple((trial.name, trial.digest) for trial in train),
+            measured_on=trials.measured_on,
+            designed_on=trials.designed_on,
         ),
         model=policy.model,
         policy=files.digest(policy.document()),

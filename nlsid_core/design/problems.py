@@ -26,7 +26,9 @@ Objective = Literal["volume", "reference"]
 class LinearTube:
     """Policy, observer and tube of an identified model, under a bound on the innovations' energy.
 
-    train: what the bound is measured on. profile: (s, output) corners of the nominal. horizon: s,
+    train: what the observer is chosen on. calibration: other trials, on which the bound is measured
+    (None: `calibration_trials` of train); to state how often a next trial exceeds it, the model has
+    to be fitted without them. profile: (s, output) corners of the nominal. horizon: s,
     how long the energy budget lasts. safety_factor: of the disturbance's amplitude over the largest
     measured, at least 1. inlet: allowed initial error of the output, in its unit. lqr_weights: of
     output and input, positive; None is K = 0, a prediction tube.
@@ -40,6 +42,7 @@ class LinearTube:
     safety_factor: float = 1.5
     inlet: float = 0.0
     lqr_weights: tuple[float, float] | None = (1.0, 1.0)
+    calibration: Dataset | None = None
 
     def __post_init__(self) -> None:
         if len(self.profile) < 2:
@@ -56,7 +59,7 @@ class OutputTube:
     """Tubes around the simulation of a stable model of any class, whatever drives it; for ever.
 
     train: the trials that observer and storage are chosen on. calibration: others, on which the
-    level is measured (None: every second one of `train`, of a single trial windows).
+    level is measured (None: every second recording of `train`, of a single one windows).
     reaction_time: s, how far ahead the forecast is to be narrow (None: ten samples). safety_factor:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every

@@ -8,12 +8,11 @@ semidefinite programs, on the training trials; the level is measured on other tr
 Source: TUBES, sections 2, 4, 5 and 6; docs/certificate_tube.md.
 """
 
-import hashlib
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import pairwise, product
+from itertools import product
 from typing import Any, TypeAlias
 
 import cvxpy
@@ -23,10 +22,11 @@ from scipy.signal import lfilter
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
-from nlsid_core.funnels.tube import Trial, Tube, TubeFunnel
+from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import Rejected, increments
 from nlsid_core.kernel.files import Node, parse
@@ -38,9 +38,11 @@ NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Ka
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
 REACTION = 10  # samples: the reaction time if none is named
+LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
 LONGEST_SETTLING = 0.25  # of the shortest trial
 ROOM = 1e-6  # least eigenvalue asked for, in balanced units
+WORST = 0.3  # part of it that a solution has to have
 TAU_ROOM = 1e-3  # relative, given up of τ for the exact proof
 UNREACHED = 1e-4  # of the Gramian's mean: noise on states that no injection moves
 LARGEST = 1e4  # entry of a multiplier in balanced units
@@ -67,14 +69,8 @@ def design_output_tube(
     """
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    if calibration is None:
-        train, calibration = halves(train, 4 * (settling + REACTION))
-    designed_on, measured_on = _trials(train), _trials(calibration)
-    if common := {t.digest for t in designed_on} & {t.digest for t in measured_on}:
-        raise DataError(
-            f"{sum(t.digest in common for t in measured_on)} of the trials that the level is "
-            "measured on are among those that the tube is designed on; give others"
-        )
+    trials = calibration_trials(train, calibration, least=least_window(model, train))
+    train = trials.design
     y_box, u_box = _box(model, stepper, train, box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
     form = _Form.of(model, bounds)
@@ -94,10 +90,10 @@ def design_output_tube(
         tube = Tube(
             rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
             half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
-            safety_factor=safety_factor, designed_on=designed_on, measured_on=measured_on,
-            samples=length,
+            safety_factor=safety_factor, designed_on=trials.designed_on,
+            measured_on=trials.measured_on, samples=length,
         )  # fmt: skip
-        tubes.append(scaled_to(tube, model, calibration, settling))
+        tubes.append(scaled_to(tube, model, trials.calibration, settling))
     funnel = TubeFunnel(
         tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
         y_box=y_box, u_box=u_box,
@@ -108,6 +104,11 @@ def design_output_tube(
         return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
     except CertificateRejected as refusal:
         raise Infeasible(f"no proved tube: {refusal}") from refusal
+
+
+def least_window(model: StableModel, train: Dataset) -> int:
+    """Samples of a window of a single recording, on which a tube is designed or measured."""
+    return LEAST_WINDOW * (_settling(model, Stepper(model), train) + REACTION)
 
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
@@ -148,44 +149,6 @@ def innovations(
         e[k] = y - predicted
         x = x + np.einsum("bnp,bp->bn", gains, e[k])
     return e
-
-
-def halves(dataset: Dataset, least: int) -> tuple[Dataset, Dataset]:
-    """Every second trial to design on, the others to measure on; of one trial, windows.
-
-    least: samples that a window should have.
-    """
-    trials = dataset.trajectories
-    if len(trials) == 1:
-        count = min(20, len(trials[0]) // max(least, 1))
-        if count < 2:
-            raise DataError(
-                f"{trials[0].name}: {len(trials[0])} samples of one trial; a tube is designed on "
-                f"one part and measured on another, of {least} samples each at least"
-            )
-        trials = _windows(trials[0], count)
-    return Dataset(trials[::2]), Dataset(trials[1::2])
-
-
-def _windows(trial: Trajectory, count: int) -> tuple[Trajectory, ...]:
-    ends = np.linspace(0, len(trial), count + 1).astype(int)
-    return tuple(
-        replace(trial, t=trial.t[a:b], y=trial.y[a:b], u=trial.u[a:b],
-                x=None if trial.x is None else trial.x[a:b], name=f"{trial.name} [{a}:{b}]")
-        for a, b in pairwise(ends)
-    )  # fmt: skip
-
-
-def _trials(dataset: Dataset) -> tuple[Trial, ...]:
-    """The trials by digest: the recording's, or of their own samples where several share one."""
-    shared = [t.digest for t in dataset]
-    found = []
-    for t in dataset:
-        alone = t.digest and shared.count(t.digest) == 1 and "[" not in t.name
-        content = b"".join(np.ascontiguousarray(part).tobytes() for part in (t.t, t.y, t.u))
-        own = "sha256:" + hashlib.sha256(content).hexdigest()
-        found.append(Trial(t.name, t.digest) if alone else Trial(t.name, own, t.digest or own))
-    return tuple(found)
 
 
 def _settling(model: StableModel, stepper: Stepper, dataset: Dataset) -> int:
@@ -546,6 +509,12 @@ def _program(
         return None
     if P.value is None or tau.value is None or not (np.asarray(tau.value) > 0.0).all():
         return None
+    for constraint in constraints:
+        if (
+            isinstance(constraint, cp.constraints.PSD)
+            and float(np.linalg.eigvalsh(constraint.args[0].value)[0]) < (WORST - 1.0) * ROOM
+        ):
+            return None
     R_found = np.eye(1) if p == 1 else np.asarray(R.value)
     found = [[np.asarray(N.value) for N in Ns] for Ns in unknown]
     return np.asarray(P.value), R_found, np.asarray(tau.value), found

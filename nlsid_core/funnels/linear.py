@@ -21,8 +21,9 @@ class EnergyAssumption:
 
     e = y - ŷ is the observer's innovation; ρ and R are the funnel's. With ρ = 1 it is a bound on
     Σ e'Re (a document calls it `energy`), with ρ < 1 it forgets (`fading`). budget =
-    safety_factor² · measured, measured being the largest E over the trials `measured_on`
-    (name, digest).
+    safety_factor² · measured, measured being the largest E that any of the trials `measured_on`
+    (name, digest) reaches over its whole length. The funnel was designed on `designed_on`, other
+    trials. A digest ends in `[first:end]` where a trial is these samples of a recording.
     """
 
     budget: float
@@ -30,6 +31,7 @@ class EnergyAssumption:
     measured: float
     safety_factor: float
     measured_on: tuple[tuple[str, str], ...]
+    designed_on: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +155,7 @@ class LinearFunnel:
                 "measured": a.measured,
                 "safety_factor": a.safety_factor,
                 "measured_on": [{"name": n, "digest": d} for n, d in a.measured_on],
+                "designed_on": [{"name": n, "digest": d} for n, d in a.designed_on],
             },
             "R": self.R.tolist(),
             "P": self.P.tolist(),
@@ -172,7 +175,10 @@ class LinearFunnel:
         expected = "energy" if rho == 1.0 else "fading"
         if found != expected:
             raise DocumentError(f"{where}: kind is '{found}', expected '{expected}' for rho {rho}")
-        trials = files.member(nested, "measured_on", list, source=where)
+        measured_on, designed_on = (
+            tuple(files.named_digests(files.member(nested, key, list, source=where), source=where))
+            for key in ("measured_on", "designed_on")
+        )
         return cls(
             P=files.array(document, "P", (None, None), source=source),
             R=files.array(document, "R", (None, None), source=source),
@@ -186,7 +192,8 @@ class LinearFunnel:
                 samples=files.member(nested, "samples", int, source=where),
                 measured=files.number(nested, "measured", source=where),
                 safety_factor=files.number(nested, "safety_factor", source=where),
-                measured_on=tuple(files.named_digests(trials, source=where)),
+                measured_on=measured_on,
+                designed_on=designed_on,
             ),
             model=files.member(document, "model", str, source=source),
             policy=files.member(document, "policy", str, source=source),

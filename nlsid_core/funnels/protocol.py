@@ -6,12 +6,13 @@ from typing import Protocol, TypeAlias
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnels import continuous, linear, sampled
+from nlsid_core.funnels import continuous, linear, sampled, tube
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 
-AnyFunnel: TypeAlias = LinearFunnel | SampledFunnel | ContinuousFunnel
+AnyFunnel: TypeAlias = LinearFunnel | SampledFunnel | ContinuousFunnel | TubeFunnel
 
 
 class Funnel(Protocol):
@@ -47,6 +48,7 @@ def read_funnel(document: Json, *, source: str = "funnel") -> AnyFunnel:
         linear.KIND: LinearFunnel,
         sampled.KIND: SampledFunnel,
         continuous.KIND: ContinuousFunnel,
+        tube.KIND: TubeFunnel,
     }
     kind = document.get("kind")
     if kind not in kinds:

@@ -13,23 +13,6 @@ FORMAT = "nlsid/funnel"
 KIND = "tube"
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A recording, or a window of one: its name, the digest of its data, that of the recording.
-
-    recording: empty if the trial is all of it.
-    """
-
-    name: str
-    digest: str
-    recording: str = ""
-
-    def document(self) -> Json:
-        """The JSON form."""
-        own = {"name": self.name, "digest": self.digest}
-        return own | ({"recording": self.recording} if self.recording else {})
-
-
 @dataclass(frozen=True, eq=False)
 class Tube:
     """|y_j - y°_j| <= half_widths_j while E <= level, E+ = rho E + e'R e from 0.
@@ -38,7 +21,7 @@ class Tube:
     P: (n, n), R: (p, p), tau, half_widths: (p,), the latter in the outputs' units. samples: the
     number of samples for which an energy (rho = 1) is assumed; None with rho < 1, for ever. level =
     safety_factor² · measured, the largest E on the trials `measured_on`; `designed_on` are those
-    that L, rho, P, R were chosen on. inlet: V = x̄'Px̄ that the start may have.
+    that L, rho, P, R were chosen on; each (name, digest). inlet: V = x̄'Px̄ that the start may have.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -52,8 +35,8 @@ class Tube:
     level: float
     measured: float
     safety_factor: float
-    designed_on: tuple[Trial, ...]
-    measured_on: tuple[Trial, ...]
+    designed_on: tuple[tuple[str, str], ...]
+    measured_on: tuple[tuple[str, str], ...]
     samples: int | None = None
     inlet: float = 0.0
 
@@ -98,8 +81,8 @@ class Tube:
             | {
                 "measured": self.measured,
                 "safety_factor": self.safety_factor,
-                "designed_on": [trial.document() for trial in self.designed_on],
-                "measured_on": [trial.document() for trial in self.measured_on],
+                "designed_on": _named(self.designed_on),
+                "measured_on": _named(self.measured_on),
             },
             "L": self.L.tolist(),
             "R": self.R.tolist(),
@@ -196,10 +179,10 @@ def _tube(document: Any, source: str) -> Tube:
     )
 
 
-def _trials(document: Json, key: str, source: str) -> tuple[Trial, ...]:
+def _named(trials: tuple[tuple[str, str], ...]) -> list[Json]:
+    return [{"name": name, "digest": digest} for name, digest in trials]
+
+
+def _trials(document: Json, key: str, source: str) -> tuple[tuple[str, str], ...]:
     entries = files.member(document, key, list, source=source)
-    pairs = files.named_digests(entries, source=source)
-    return tuple(
-        Trial(*pair, files.member({"recording": ""} | entry, "recording", str, source=source))
-        for pair, entry in zip(pairs, entries, strict=True)
-    )
+    return tuple(files.named_digests(entries, source=source))

@@ -1,5 +1,6 @@
 """`Fit`: what `identify` returns, every method's model with its proof and scores."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol
@@ -27,9 +28,15 @@ class Proof(Protocol):
         ...
 
 
-def stated_rate(proof: Proof) -> str:
-    """The rate in words: `0.9500 a sample`."""
-    return f"{proof.rate:.4f} a sample" if proof.rate < 1.0 else "no rate"
+def stated_rate(proof: Proof, period: float) -> str:
+    """The rate a sample, rounded up, and its time constant at `period` (s): `0.9500 (0.49 s)`."""
+    if proof.rate >= 1.0:
+        return "proved, no rate"
+    digits = 4 if proof.rate <= 0.999 else 7
+    rate = max(math.ceil(proof.rate * 10**digits), 1) / 10**digits
+    if rate >= 1.0:
+        return f"{proof.rate!r} ({-period / math.log(proof.rate):.2g} s)"
+    return f"{rate:.{digits}f} ({-period / math.log(rate):.2g} s)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +127,11 @@ class Fit(Generic[M]):
     def __str__(self) -> str:
         columns = list(self.errors)
         header = f"  {'simulation error [%]':52s}" + "".join(f"{name:>12s}" for name in columns)
+        header += f"{'time':>11s}  proved rate a sample (time constant)"
         rows: list[str] = []
         for c in self.candidates:
             scores = "".join(f"{self.errors[name][c.method.name]:12.2f}" for name in columns)
-            state = f"proved, {stated_rate(c.proof)}" if c.proof else "not proved"
+            state = stated_rate(c.proof, c.model.period) if c.proof else "not proved"
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
         return "\n".join([str(self.model), str(self.history), header, *rows])

@@ -74,6 +74,7 @@ class FirstRse:
 class Rse:
     """Minimise the robust simulation error: bounds that are made exact by iterating.
 
+    A linear model is iterated from several starts, and the best on the training data is kept.
     iterations: of bounds, 1 to 1000 at most; it stops earlier once the bound no longer falls.
     Source: thesis (4.1)-(4.3), Section 4.4.
     """
@@ -103,7 +104,7 @@ class CertifiedRse:
 
 @dataclass(frozen=True)
 class Sem:
-    """Minimise the simulation error from one or several starts: a local minimum.
+    """Minimise the simulation error from several starts: the best of the local minima they reach.
 
     Source: thesis Definition 2.2 and Section 1.2.
     """
@@ -114,9 +115,10 @@ class Sem:
 
 @dataclass(frozen=True)
 class CertifiedSem:
-    """`Sem` inside the stable models, from the last iterate of `Rse` or `CertifiedRse`.
+    """`Sem` inside the stable models, from every proved model at hand, of which the best is kept.
 
-    iterations: of the method it starts from. Source: thesis Definition 2.2 and (4.1)-(4.3).
+    iterations: of `Rse` or `CertifiedRse`, one of its starts. Source: thesis Definition 2.2
+    and (4.1)-(4.3).
     """
 
     iterations: int = 40

@@ -43,14 +43,19 @@ class Iterate:
 
 
 def robust_simulation_error(
-    rows: Rows, *, iterations: int = 40, tolerance: float = 1e-6
+    rows: Rows,
+    *,
+    start: FloatArray | None = None,
+    iterations: int = 40,
+    tolerance: float = 1e-6,
 ) -> Iterator[Iterate]:
     """Yield the minimiser of each bound, first to last.
 
-    Stops after `iterations` bounds or when J falls by less than `tolerance` of itself. Raises
-    SolverError if Newton's method cannot go on.
+    start: left parameters at which the first bound is exact (None: the first bound is that of
+    G_m = I). Stops after `iterations` bounds or when J falls by less than `tolerance` of itself.
+    Raises SolverError if Newton's method cannot go on.
     """
-    linearised_at: FloatArray | None = None
+    linearised_at = start
     previous = float("inf")
     for _ in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at

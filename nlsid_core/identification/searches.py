@@ -50,7 +50,9 @@ from nlsid_core.identification.monotone import (
 )
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import prove_stability
+from nlsid_core.identification.starts import reflected, stable_starts
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
     StateAffineRows,
@@ -76,17 +78,26 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
-    trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p))
-    trail.add(Sem, lambda _: minimise_simulation_error(regression, least_squares(regression)))
+    starts = tuple(stable_starts(regression))
+    trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p), starts)
 
-    def last_step(method: CertifiedSem) -> DifferenceEquation:
-        *_, last = robust_simulation_error(regression.rows, iterations=method.iterations)
-        start = regression.model(last.theta, last.p)
-        if prove_stability(start) is None:
-            raise Infeasible("the robust simulation error found no stable model to start from")
-        return minimise_simulation_error(regression, start, stable=True)
+    def minimised(iterations: int, *, stable: bool) -> DifferenceEquation:
+        """The best of the local minima from the robust simulation error and the other starts."""
+        *_, last = robust_simulation_error(regression.rows, iterations=iterations)
+        thetas = [reflected(last.theta), *(theta for _, theta in starts)]
+        if not stable:
+            thetas.append(last.theta)
+        models = []
+        for theta in thetas:
+            start = regression.model(theta, SimulationError(regression.rows).at(theta).p)
+            if not stable or prove_stability(start) is not None:
+                models.append(minimise_simulation_error(regression, start, stable=stable))
+        if not models:
+            raise Infeasible("no start of the search has a proof of stability")
+        return min(models, key=lambda model: simulation_percent(model, train))
 
-    trail.add(CertifiedSem, last_step)
+    trail.add(Sem, lambda _: minimised(Rse().iterations, stable=False))
+    trail.add(CertifiedSem, lambda method: minimised(method.iterations, stable=True))
     return trail
 
 
@@ -102,11 +113,14 @@ def state_affine(
     trail.add(CertifiedRse, lambda method: _certified(problem, trail, method))
 
     def last_step(method: CertifiedSem) -> StateAffineModel:
-        start = _certified(problem, trail, method)
-        proof = prove_stability(start)
-        if proof is None:
+        last = _certified(problem, trail, method)
+        at_hand = [c.model for c in trail.candidates if c.proof is not None]
+        at_hand.sort(key=lambda model: simulation_percent(model, train))
+        proofs = [(start, prove_stability(start)) for start in (last, *at_hand[:1])]
+        reached = [descend_certified(problem, start, p) for start, p in proofs if p is not None]
+        if not reached:
             raise Infeasible("no proof for the last certified iterate, where the last step starts")
-        return descend_certified(problem, start, proof)
+        return min(reached, key=lambda model: simulation_percent(model, train))
 
     trail.add(CertifiedSem, last_step)
     return trail

@@ -2,18 +2,22 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
+from scipy.linalg import LinAlgError
+
+from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import NlsidError
+from nlsid_core.errors import NlsidError, SolverError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.fit import Candidate, History, Proof, Step
 from nlsid_core.identification.methods import FirstRse, Method, Rse
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rse import Iterate, robust_simulation_error
+from nlsid_core.identification.simulation_error import SimulationError
 
 Progress = Callable[[str, float], None]
 T = TypeVar("T", bound=Model)
@@ -77,25 +81,44 @@ class Trail(Generic[T]):
             return
         self._keep(method, model, proof, time.perf_counter() - started)
 
-    def follow(self, rows: Rows, model: Callable[[Iterate], T]) -> None:
-        """The iterates of the robust simulation error; the first and the last are candidates."""
+    def follow(
+        self,
+        rows: Rows,
+        model: Callable[[Iterate], T],
+        starts: Iterable[tuple[str, FloatArray]] = (),
+    ) -> None:
+        """The iterates of the robust simulation error; the first and the best are candidates.
+
+        starts: left parameters with their names, at which a first bound is made exact; from each
+        it is iterated too, and the iterate of the least simulation error is kept.
+        """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
         if first is None and final is None:
             return
         iterations = 1 if final is None else final.iterations
-        steps: list[Step] = []
-        started, last = time.perf_counter(), None
-        for last in robust_simulation_error(rows, iterations=iterations):
-            steps.append(Step(f"iterate {len(steps) + 1}", last.J))
-            if len(steps) == 1 and first is not None:
-                seconds, found = time.perf_counter() - started, model(last)
-                self._keep(first, found, self.prove(found), seconds)
-            done = 0.2 + 0.4 * len(steps) / iterations
-            self.task.progress(f"robust simulation error, iterate {len(steps)}", done)
-        assert last is not None, "there is at least one iterate"
-        self.history = History(self.history.value, tuple(steps))
+        error = SimulationError(rows)
+        started, best = time.perf_counter(), None
+        for start, theta in (("", None), *(() if final is None else starts)):
+            steps: list[Step] = []
+            try:
+                for last in robust_simulation_error(rows, start=theta, iterations=iterations):
+                    steps.append(Step(f"iterate {len(steps) + 1} {start}".rstrip(), last.J))
+                    if theta is None and len(steps) == 1 and first is not None:
+                        seconds, found = time.perf_counter() - started, model(last)
+                        self._keep(first, found, self.prove(found), seconds)
+                    done = 0.2 + 0.4 * len(steps) / iterations
+                    self.task.progress(f"robust simulation error, iterate {len(steps)}", done)
+                reached = error.at(last.theta).J
+            except (SolverError, LinAlgError):
+                if theta is None:
+                    raise
+                continue
+            if best is None or reached < best[0]:
+                best = reached, last, tuple(steps)
+        assert best is not None, "there is at least one iterate"
+        self.history = History(self.history.value, best[2])
         if final is not None:
-            seconds, found = time.perf_counter() - started, model(last)
+            seconds, found = time.perf_counter() - started, model(best[1])
             self._keep(final, found, self.prove(found), seconds)
 
     def solved(self, method: Method, bound: float) -> None:

@@ -24,6 +24,7 @@ from nlsid_core.identification.prediction import (
     predict,
     simulate_trial,
 )
+from nlsid_core.models import StateAffineModel
 
 NORMAL_99 = 2.5758293035489004  # two-sided 99 % of a standard normal
 CONFIDENCE = 0.99
@@ -59,17 +60,21 @@ class Validation:
     """Scores of one model on one dataset.
 
     simulation_percent: 100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation, output_percent of each output
-    alone; fit_percent: 100 minus it. prediction_percent: of the k-step predictions, by horizon k.
+    alone; fit_percent: 100 minus it. output_rms: of y - ŷ of each output with its name and unit.
+    prediction_percent: of the k-step predictions, by horizon k. clipped_percent: of the samples
+    with an input beyond the model's range, where the model uses the nearest in the range instead.
     one_step is white where noise enters the equation, simulation where it enters the measurement:
     under a model that explains everything one of them is. samples: how many were scored.
     """
 
     simulation_percent: float
     output_percent: tuple[float, ...]
+    output_rms: tuple[tuple[str, float, str], ...]
     prediction_percent: dict[int, float]
     one_step: Residual
     simulation: Residual
     samples: int
+    clipped_percent: float = 0.0
 
     @property
     def fit_percent(self) -> float:
@@ -95,6 +100,14 @@ class Validation:
             f"one-step residual is {self.one_step}",
             f"simulation residual is {self.simulation}",
         ]
+        rms = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in self.output_rms]
+        lines.insert(1, f"rms error of the simulation: {', '.join(rms)}")
+        if self.clipped_percent:
+            lines.insert(
+                2,
+                f"{self.clipped_percent:.2g} % of the samples have an input beyond the model's "
+                "range, which the model clips; a wider input_range takes them as they are",
+            )
         if len(self.output_percent) > 1:
             each = ", ".join(f"{percent:.2f} %" for percent in self.output_percent)
             lines.insert(1, f"simulation error of each output: {each}")
@@ -137,6 +150,13 @@ def validate(
             _percent([(y[:, [i]], x[:, [i]]) for y, x in simulated])
             for i in range(simulated[0][0].shape[1])
         ),
+        output_rms=tuple(
+            (name, _rms([(y - x)[:, i] for y, x in simulated]), unit)
+            for i, (name, unit) in enumerate(
+                zip(dataset.trajectories[0].y_names, dataset.trajectories[0].y_units, strict=True)
+            )
+        ),
+        clipped_percent=_clipped_percent(model, dataset),
         prediction_percent={
             k: prediction_percent(model, dataset, k, transient=transient) for k in horizons
         },
@@ -243,6 +263,21 @@ def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatAr
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
         return [(trial.y[first:], simulate_trial(model, trial)[first:]) for trial in dataset]
+
+
+def _rms(errors: list[FloatArray]) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
+    return rms if np.isfinite(rms) else np.inf
+
+
+def _clipped_percent(model: Model, dataset: Dataset) -> float:
+    """Of the samples, those with an input that a state-affine model clips."""
+    if not isinstance(model, StateAffineModel):
+        return 0.0
+    low, high = model.u_range.T
+    u = np.concatenate([trial.u for trial in dataset])
+    return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
 def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:

@@ -1,7 +1,6 @@
 """`check`: a proof file in, a verdict out, or `Rejected` with the reason."""
 
 import os
-from collections.abc import Callable
 from contextvars import copy_context
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -13,8 +12,6 @@ from .decision import Decision
 from .exact import allow_elimination
 from .files import MAX_TOTAL, Node, Read, Rejected, digest, parse, plain, read_regular
 
-FORMAT = "nlsid/proof"
-VERSION = 2
 # Each claim is a module of this package with a function `decide(claim, proof, read) -> Decision`.
 KINDS = (
     "stability",
@@ -26,22 +23,15 @@ KINDS = (
     "polynomial_bound",
     "region_of_attraction",
 )
-# Kinds of version 1, and what makes their proofs again.
+# What makes proofs again whose kinds, of version 1, are not decided any more.
 FORMER = {
-    "incremental_stability": "nlsid identify",
-    "state_affine_stability": "nlsid identify",
-    "block_cascade_stability": "nlsid identify",
-    "monotone_equation_stability": "nlsid identify",
-    "implicit_stability": "nlsid identify",
-    "well_posedness": "nlsid identify",
-    "energy_tube": "nlsid funnel",
-    "discrete_funnel": "nlsid track",
-    "implicit_funnel": "nlsid track",
-    "trajectory_funnel": "nlsid funnel --problem",
-    "funnel_composition": "nlsid compose",
-    "matrix_inequality": "the search that wrote it",
-    "polynomial_bound": "the search that wrote it",
-    "region_of_attraction": "the search that wrote it",
+    "nlsid identify": "incremental_stability state_affine_stability block_cascade_stability "
+    "monotone_equation_stability implicit_stability well_posedness",
+    "nlsid funnel": "energy_tube",
+    "nlsid track": "discrete_funnel implicit_funnel",
+    "nlsid funnel --problem": "trajectory_funnel",
+    "nlsid compose": "funnel_composition",
+    "the search that wrote it": "matrix_inequality polynomial_bound region_of_attraction",
 }
 
 
@@ -77,10 +67,22 @@ def check(path: str | os.PathLike[str]) -> Verdict:
 
 def decide(content: bytes, read: Read) -> Verdict:
     """Decide a proof's bytes; `read` gives those of the files it names. Raises Rejected."""
+    left = MAX_TOTAL - len(content)
+
+    def limited(name: str) -> bytes:
+        nonlocal left
+        found = read(name)
+        left -= len(found)
+        if left < 0:
+            raise Rejected(f"the files of one claim have at most {MAX_TOTAL} bytes together")
+        return found
+
     try:
         document = parse(content, "proof file")
-        kind, claim, proof = opened(document)
-        decision = copy_context().run(_decided, kind, claim, proof, _limited(read, content))
+        _refuse_former(document)
+        parts = document.document("proof", "claim proof")
+        kind = parts["claim"].kind()
+        decided = copy_context().run(_decided, kind, parts["claim"], parts["proof"], limited)
     except Rejected:
         raise
     except (RecursionError, MemoryError) as error:
@@ -89,61 +91,22 @@ def decide(content: bytes, read: Read) -> Verdict:
         ) from error
     except Exception as error:
         raise Rejected(f"not decided: {type(error).__name__}: {plain(str(error))}") from error
-    return Verdict(
-        kind,
-        decision.statement,
-        decision.margin,
-        decision.assumptions,
-        {**decision.digests, "proof": digest(content)},
-    )
-
-
-def _limited(read: Read, proof: bytes) -> Read:
-    """`read`, for files of MAX_TOTAL bytes together with the proof."""
-    left = MAX_TOTAL - len(proof)
-
-    def limited(name: str) -> bytes:
-        nonlocal left
-        content = read(name)
-        left -= len(content)
-        if left < 0:
-            raise Rejected(f"the files of one claim have at most {MAX_TOTAL} bytes together")
-        return content
-
-    return limited
+    digests = {**decided.digests, "proof": digest(content)}
+    return Verdict(kind, decided.statement, decided.margin, decided.assumptions, digests)
 
 
 def _decided(kind: str, claim: Node, proof: Node, read: Read) -> Decision:
+    if kind not in KINDS:
+        raise Rejected(f"claim {kind!r} is unknown; known: {', '.join(KINDS)}")
     allow_elimination()
-    return _decider(kind)(claim, proof, read)
+    decision: Decision = import_module(f".{kind}", __package__).decide(claim, proof, read)
+    return decision
 
 
-def opened(document: Node) -> tuple[str, Node, Node]:
-    """The kind, claim and proof of a proof file."""
+def _refuse_former(document: Node) -> None:
     if type(document.value) is dict and document.value.get("version") == 1:
         claim = document.value.get("claim")
         kind = claim.get("kind") if type(claim) is dict else None
-        again = (
-            FORMER.get(kind, "the command that wrote it")
-            if type(kind) is str
-            else "the command that wrote it"
-        )
-        raise Rejected(f"a proof of version 1 is not decided any more; make it again: {again}")
-    parts = document.members("format version claim proof")
-    if parts["format"].text() != FORMAT:
-        raise Rejected(f"format is {parts['format'].text()!r}, expected {FORMAT!r}")
-    version = parts["version"].whole(0)
-    if version != VERSION:
-        raise Rejected(f"version {version}; this kernel decides version {VERSION}")
-    if type(parts["claim"].value) is not dict or "kind" not in parts["claim"].value:
-        raise Rejected("the claim should be an object with a kind")
-    kind = Node(parts["claim"].value["kind"], "kind").text()
-    return kind, parts["claim"], parts["proof"]
-
-
-def _decider(kind: str) -> Callable[[Node, Node, Read], Decision]:
-    if kind not in KINDS:
-        raise Rejected(f"claim {kind!r} is unknown; known: {', '.join(KINDS)}")
-    module = import_module(f".{kind}", __package__)
-    decider: Callable[[Node, Node, Read], Decision] = module.decide
-    return decider
+        again = (command for command, kinds in FORMER.items() if kind in kinds.split())
+        how = next(again, "the command that wrote it")
+        raise Rejected(f"a proof of version 1 is not decided any more; make it again: {how}")

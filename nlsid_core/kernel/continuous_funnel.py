@@ -21,22 +21,22 @@ from math import prod
 
 from . import text
 from .decision import Decision
-from .exact import at_most, definite, inverse_forms, semidefinite
-from .files import Mismatch, Node, Read, Rejected, bound_files
-from .polynomials import WIDTHS, Polynomial, Ring, Work, at_width
-from .positivity import MAX_SHIFT, expanded, positive, read_basis, read_squares
+from .exact import Matrix, at_most, definite, inverse_forms, semidefinite
+from .files import Node, Read, Rejected, Terms, bound_files
+from .polynomials import Polynomial, Ring, Work, at_width
+from .positivity import expanded, positive, powers_of_two, read_squares
 
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
-MAX_TERMS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
-PIECE = 20_000  # of the work that a claim may take: what a piece costs at the least
+MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
+PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
 Bounds = dict[int, tuple[Fraction, Fraction]]
 Curve = list[list[list[Fraction]]]  # by interval, control point, entry
 
 
 @dataclass(frozen=True)
 class Field:
-    """By time span: bounds of entries of (x, u), and equations of (exponents, coefficient)."""
+    """By time span: bounds of entries of (x, u), and equations in t, x, u and w."""
 
     n: int
     m: int
@@ -44,7 +44,7 @@ class Field:
     breaks: list[Fraction]
     bounds: list[Bounds]
     expansion: str
-    equations: list[list[list[tuple[list[int], Fraction]]]]
+    equations: list[list[Terms]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Policy:
     """Control points of u₀ and K; limits: low and high by input."""
 
     u: Curve
-    K: list[list[list[list[Fraction]]]]
+    K: list[list[Matrix]]
     limits: Bounds
 
 
@@ -62,7 +62,7 @@ class Funnel:
 
     t: list[Fraction]
     x: Curve
-    P: list[list[list[Fraction]]]
+    P: list[Matrix]
     rho: list[Fraction]
 
 
@@ -80,17 +80,18 @@ def decide_funnel(
     field = read_field(documents["vector_field"])
     funnel = read_funnel(documents["funnel"], field.n, digests)
     policy = read_policy(documents["policy"], field, funnel, digests)
-    more = ["goal_multiplier"] * ("goal" in parts) + ["sides"] * bool(policy.limits)
-    required = " ".join(["margin basis multiplier pieces", *more])
+    required = "margin basis multiplier pieces" + " goal_multiplier" * ("goal" in parts)
+    required += " sides" * bool(policy.limits)
     stated = proof.members(required, "kappa" if field.box else "")
     margin = stated["margin"].number()
     if margin <= 0:
         raise Rejected("the margin should be positive")
-    goal = ""
-    if "goal" in parts:
-        goal = _decide_goal(parts["goal"], stated, funnel)
-    spans, work = _spans(field, funnel), work or Work()
-    bounds = [field.bounds[span] for span in spans]
+    goal = _decide_goal(parts["goal"], stated, funnel) if "goal" in parts else ""
+    for t in field.breaks:
+        if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
+            raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
+    spans = [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
+    bounds, work = [field.bounds[span] for span in spans], work or Work()
     _decide_valid(field, policy, funnel, bounds, work)
     count = _decide_pieces(field, policy, funnel, spans, stated, margin, work)
     end = text.exact(funnel.t[-1])
@@ -107,9 +108,8 @@ def decide_funnel(
 
 def read_field(node: Node) -> Field:
     """The vector field: monomials distinct and increasing, each entry of w at most once in one."""
-    parts = _opened(
-        node, "nlsid/vector_field", "states inputs uncertain breaks valid expansion pieces"
-    )
+    names = "states inputs uncertain breaks valid expansion pieces"
+    parts = node.document("vector_field", names)
     n, m = parts["states"].whole(1, MAX_STATES), parts["inputs"].whole(0, MAX_INPUTS)
     box = [(low, high) for low, high in parts["uncertain"].array(None, 2)]
     if len(box) > MAX_UNCERTAIN or any(low > high for low, high in box):
@@ -117,7 +117,7 @@ def read_field(node: Node) -> Field:
     breaks = _increasing(parts["breaks"], 0, MAX_SPANS)
     count = len(breaks) + 1
     bounds: list[Bounds] = [{} for _ in range(count)]
-    for row in parts["valid"].items(0, MAX_TERMS):
+    for row in parts["valid"].items(0, MAX_BOUNDS):
         j, low, high, *only = row.array(4 if type(row.value) is list and row.value[3:] else 3)
         if j not in range(n + m) or not all(span in range(count) for span in only):
             raise Rejected(f"{row.where} should be an entry of (x, u), low, high, and maybe a span")
@@ -125,31 +125,18 @@ def read_field(node: Node) -> Field:
             before = found.get(int(j), (low, high))
             found[int(j)] = max(low, before[0]), min(high, before[1])
     equations = [
-        [_equation(row, n, m, len(box)) for row in piece.items(n, n)]
+        [row.polynomial(1 + n + m + len(box), MAX_DEGREE, tuple) for row in piece.items(n, n)]
         for piece in parts["pieces"].items(count, count)
     ]
+    if any(max(e[1 + n + m :], default=0) > 1 for span in equations for p in span for e, _ in p):
+        raise Rejected(f"{parts['pieces'].where}: a monomial has degree above 1 in an entry of w")
     return Field(n, m, box, breaks, bounds, parts["expansion"].text(), equations)
-
-
-def _equation(node: Node, n: int, m: int, uncertain: int) -> list[tuple[list[int], Fraction]]:
-    parts = node.members("exponents coefficients")
-    rows = parts["exponents"].wholes(None, 1 + n + m + uncertain)
-    numbers = [entry.rational() for entry in parts["coefficients"].items(len(rows), len(rows))]
-    if len(rows) > MAX_TERMS or any(later <= row for row, later in pairwise(rows)):
-        raise Rejected(f"{node.where}: monomials should be distinct, in increasing order")
-    for row in rows:
-        if min(row) < 0 or sum(row) > MAX_DEGREE or any(e > 1 for e in row[1 + n + m :]):
-            raise Rejected(
-                f"{node.where}: a monomial should have degree at most {MAX_DEGREE}, and at most 1 "
-                "in each w"
-            )
-    return list(zip(rows, numbers, strict=True))
 
 
 def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
     """The funnel: x₀ continuous, P ≻ 0 and ρ > 0 at every knot, and so in between."""
-    parts = _opened(node, "nlsid/funnel", "kind vector_field policy t x P rho")
-    _made_for(parts, digests, "funnel", "vector_field policy")
+    made_for = {role: digests[role] for role in ("vector_field", "policy")}
+    parts = node.document("funnel", "t x P rho", "continuous", made_for=made_for)
     t = _increasing(parts["t"], 2, MAX_KNOTS)
     K = len(t)
     x = _curve(parts["x"], K - 1, n)
@@ -166,15 +153,14 @@ def read_funnel(node: Node, n: int | None, digests: dict[str, str]) -> Funnel:
 
 def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str]) -> Policy:
     """The policy: around the funnel's own nominal, each input clipped at most once."""
-    parts = _opened(node, "nlsid/policy", "kind vector_field t x u K limits")
-    _made_for(parts, digests, "policy", "vector_field")
-    count = len(funnel.x)
+    made_for = {"vector_field": digests["vector_field"]}
+    parts, count = (
+        node.document("policy", "t x u K limits", "continuous", made_for=made_for),
+        len(funnel.x),
+    )
     if parts["t"].array(None) != funnel.t or _curve(parts["x"], count, field.n) != funnel.x:
         raise Rejected("the funnel is around another nominal than the policy's")
-    u = _curve(parts["u"], count, field.m)
-    K = parts["K"].array(count, None, field.m, field.n)
-    if any(not 0 < len(control) <= MAX_TIME_DEGREE + 1 for control in K):
-        raise Rejected(f"the gain should have degree 0 to {MAX_TIME_DEGREE} in time")
+    u, K = _curve(parts["u"], count, field.m), _curve(parts["K"], count, field.m, field.n)
     rows = parts["limits"].array(None, 3)
     limits = {int(row[0]): (row[1], row[2]) for row in rows if row[0] in range(field.m)}
     if len(limits) != len(rows) or len(rows) > MAX_LIMITED:
@@ -182,6 +168,21 @@ def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str
     if any(low >= high for low, high in limits.values()):
         raise Rejected("limits should be rows (input, low, high) with low < high")
     return Policy(u, K, limits)
+
+
+def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
+    times: list[Fraction] = node.array(None)
+    if not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)):
+        raise Rejected(f"{node.where} should be {least} to {most} times that increase")
+    return times
+
+
+def _curve(node: Node, count: int, *shape: int | None) -> list:  # type: ignore[type-arg]
+    curve = node.array(count, None, *shape)
+    for control in curve:
+        if not 0 < len(control) <= MAX_TIME_DEGREE + 1 or len(control[0]) != len(curve[0][0]):
+            raise Rejected(f"{node.where} should have degree 0 to {MAX_TIME_DEGREE} in time")
+    return curve
 
 
 def inside(
@@ -200,57 +201,20 @@ def inside(
     semidefinite([*rows, [*(-e for e in Bd), corner]], what)
 
 
-def _opened(node: Node, name: str, members: str) -> dict[str, Node]:
-    parts = node.members(f"format version {members}")
-    if parts["format"].text() != name or parts["version"].whole(0) != 2:
-        raise Rejected(f"{node.where} should have format {name!r}, version 2")
-    if "kind" in parts and parts["kind"].text() != "continuous":
-        raise Rejected(f"{node.where} should be of kind 'continuous'")
-    return parts
-
-
-def _made_for(parts: dict[str, Node], digests: dict[str, str], owner: str, roles: str) -> None:
-    for role in roles.split():
-        if parts[role].text() != digests[role]:
-            raise Mismatch(f"the {owner} was made for another {role}")
-
-
-def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
-    times = node.array(None)
-    if not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)):
-        raise Rejected(f"{node.where} should be {least} to {most} times that increase")
-    return times
-
-
-def _curve(node: Node, count: int, size: int | None) -> Curve:
-    curve: Curve = node.array(count, None, size)
-    for control in curve:
-        if not 0 < len(control) <= MAX_TIME_DEGREE + 1 or len(control[0]) != len(curve[0][0]):
-            raise Rejected(f"{node.where} should have degree 0 to {MAX_TIME_DEGREE} in time")
-    return curve
-
-
-def _spans(field: Field, funnel: Funnel) -> list[int]:
-    """The time span of each interval."""
-    for t in field.breaks:
-        if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
-            raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
-    return [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
-
-
 def _decide_goal(node: Node, stated: dict[str, Node], funnel: Funnel) -> str:
     goal, n = node.members("centre P"), len(funnel.x[0][0])
     centre, P = goal["centre"].array(n), goal["P"].array(n, n)
     multiplier = stated["goal_multiplier"].number()
     what = "that the funnel ends in the goal, by the S-lemma,"
     inside(funnel.x[-1][-1], funnel.P[-1], funnel.rho[-1], centre, P, multiplier, what)
-    units = [[Fraction(i == j) for j in range(n)] for i in range(n)]
-    reach = [text.root_above(q) for q in inverse_forms(P, units, "the goal's matrix")]
-    box = ", ".join(
-        f"x{i} in [{text.below(c - r)}, {text.above(c + r)}]"
-        for i, (c, r) in enumerate(zip(centre, reach, strict=True))
-    )
-    return f", ends in the goal, an ellipsoid within {box}"
+    forms = inverse_forms(P, [_unit(i, n) for i in range(n)], "the goal's matrix")
+    ends = [(c, text.root_above(q)) for c, q in zip(centre, forms, strict=True)]
+    box = (f"x{i} in [{text.below(c - r)}, {text.above(c + r)}]" for i, (c, r) in enumerate(ends))
+    return f", ends in the goal, an ellipsoid within {', '.join(box)}"
+
+
+def _unit(i: int, n: int) -> list[Fraction]:
+    return [Fraction(i == j) for j in range(n)]
 
 
 def _decide_valid(
@@ -266,24 +230,19 @@ def _decide_valid(
     rooms: list[dict[tuple[int, tuple[Fraction, ...]], Fraction]] = [{} for _ in funnel.t]
     for k, entries in enumerate(bounds):
         for j, (low, high) in entries.items():
-            if j < field.n:
-                middle = [point[j] for point in funnel.x[k]]
-                rows = [[Fraction(i == j) for i in range(field.n)]]
-            else:
-                middle = [point[j - field.n] for point in policy.u[k]]
-                rows = [gain[j - field.n] for gain in policy.K[k]]
+            i = j - field.n
+            middle = [point[j] for point in funnel.x[k]] if i < 0 else [u[i] for u in policy.u[k]]
+            rows = [_unit(j, field.n)] if i < 0 else [gain[i] for gain in policy.K[k]]
             room = [min(middle) - low, high - max(middle)]
-            if j - field.n in policy.limits:
-                least, most = policy.limits[j - field.n]
+            if i in policy.limits:
+                least, most = policy.limits[i]
                 if not (low <= most and least <= high):
-                    raise Rejected(
-                        f"the limits of u{j - field.n} lie where its dynamics are not valid"
-                    )
+                    raise Rejected(f"the limits of u{i} lie where its dynamics are not valid")
                 room = room[least >= low : 2 - (most <= high)]
             for row, knot in product(rows, (k, k + 1)):
                 if room:
                     key = j, tuple(row)
-                    rooms[knot][key] = min(min(room), rooms[knot].get(key, min(room)))
+                    rooms[knot][key] = min(*room, rooms[knot].get(key, room[0]))
     for knot, found in enumerate(rooms):
         work.spend(10 * field.n**2 * (field.n + len(found)))
         forms = inverse_forms(funnel.P[knot], [g for _, g in found], "P")
@@ -350,7 +309,7 @@ def _decide_pieces(
     if combinations > MAX_PIECES:
         raise Rejected(f"{combinations} intervals, vertices and modes; at most {MAX_PIECES}")
     covered = {key: Fraction(0) for key in needed}
-    names = "interval vertex level index mu columns squares" + (" mode tau" if limited else "")
+    names = "interval vertex level index mu columns squares" + " mode tau" * bool(limited)
     pieces = [node.members(names) for node in stated["pieces"].items(1, MAX_PIECES)]
     order = []
     for i, piece in enumerate(pieces):
@@ -359,9 +318,8 @@ def _decide_pieces(
         mode = tuple(piece["mode"].wholes(limited)) if limited else ()
         key = piece["interval"].whole(0), piece["vertex"].whole(0), mode
         if key not in covered:
-            raise Rejected(
-                f"piece {i} is about interval {key[0]}, vertex {key[1]}, mode {mode}: none"
-            )
+            k, v, mode = key
+            raise Rejected(f"piece {i} is about interval {k}, vertex {v}, mode {mode}: none")
         order.append((key, Fraction(index, 2**level), level, index, i))
     for key, start, level, *_ in sorted(order):
         if start <= covered[key]:
@@ -369,9 +327,7 @@ def _decide_pieces(
     for (k, v, mode), until in covered.items():
         if until < 1:
             raise Rejected(f"a piece of interval {k} is missing (vertex {v}, mode {mode})")
-    multiplier = stated["multiplier"].wholes(None, field.n)
-    if len(set(map(tuple, multiplier))) < len(multiplier):
-        raise Rejected("the monomials of the multiplier should be distinct")
+    multiplier = stated["multiplier"].monomials(field.n)
     work.spend(PIECE * len(pieces))
     loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
 
@@ -381,15 +337,13 @@ def _decide_pieces(
         if key not in loops:
             loops.clear()
             loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, kappa, margin)
-        piece = pieces[number]
-        c = loops[key].condition(multiplier, piece, stated, vertices[v])
-        basis = read_basis(stated["basis"], piece["columns"], ring)
-        what = f"piece {number} (interval {k}, vertex {v}, mode {mode})"
-        positive(c, read_squares(piece["squares"], basis), ring, what)
+        loop, piece = loops[key], pieces[number]
+        c = loop.condition(multiplier, piece, stated, vertices[v])
+        squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
+        positive(c, squares, loop.ring, f"piece {number} (interval {k}, vertex {v}, mode {mode})")
 
-    width = WIDTHS[0]
     for number in range(len(pieces)):
-        width = at_width(field.n, work, partial(decide_piece, number=number), width)
+        at_width(field.n, work, partial(decide_piece, number=number))
     return len(pieces)
 
 
@@ -401,98 +355,76 @@ class _Loop:
         place: tuple[int, int, int], mode: tuple[int, ...], kappa: list[Fraction] | None,
         margin: Fraction,
     ) -> None:  # fmt: skip
-        n, (k, level, index) = field.n, place
-        h = funnel.t[k + 1] - funnel.t[k]
-
-        def in_time(points: Sequence[Fraction]) -> Polynomial:
-            return ring.bernstein(points, level, index)
-
-        x = [ring.variable(i) for i in range(n)]
-        start, end, rho = funnel.P[k], funnel.P[k + 1], in_time(funnel.rho[k : k + 2])
+        (k, level, index), x = place, ring.variables
+        h, start, end = funnel.t[k + 1] - funnel.t[k], funnel.P[k], funnel.P[k + 1]
+        in_time = partial(ring.bernstein, level=level, index=index)
+        rho = in_time(funnel.rho[k : k + 2])
         Px = [
-            ring.linear([in_time(ends) for ends in zip(*rows, strict=True)])
+            ring.dot([in_time(ends) for ends in zip(*rows, strict=True)], x)
             for rows in zip(start, end, strict=True)
         ]
-        W = [(-1, ring.times(a, b)) for a, b in zip(x, Px, strict=True)]
-        self.ring, self.gap = ring, ring.weighted([(1, rho), *W])
-        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
-        rest = [(Fraction(1), ring.constant(funnel.rho[k + 1] - funnel.rho[k])), (-margin * h, rho)]
         centres = list(zip(*funnel.x[k], strict=True))
-        for i, points in enumerate(centres):
-            rate = [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
-            bend = [ring.constant(b - a) for a, b in zip(start[i], end[i], strict=True)]
-            rest.append((Fraction(2), ring.times(Px[i], in_time(rate))))
-            rest.append((Fraction(-1), ring.times(x[i], ring.linear(bend))))
+        steps = [[(len(p) - 1) * (b - a) for a, b in pairwise(p)] or [Fraction(0)] for p in centres]
+        bend = [
+            [b - a for a, b in zip(*rows, strict=True)] for rows in zip(start, end, strict=True)
+        ]
+        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
+        rest = funnel.rho[k + 1] - funnel.rho[k] - margin * h * rho - ring.form(bend, x)
+        rest += 2 * ring.dot([in_time(points) for points in steps], Px)
         inputs, self.held = [], []
         for i, points in enumerate(zip(*policy.u[k], strict=True)):  # ũ = u₀ - Kx̄
-            gains = [in_time([gain[i][j] for gain in policy.K[k]]) for j in range(n)]
-            inputs.append(ring.minus(in_time(points), ring.linear(gains)))
+            gains = [in_time(rows) for rows in zip(*(K[i] for K in policy.K[k]), strict=True)]
+            inputs.append(in_time(points) - ring.dot(gains, x))
         for side, (i, (low, high)) in zip(mode, policy.limits.items(), strict=True):
-            above = ring.minus(inputs[i], ring.constant(low))
-            below = ring.minus(ring.constant(high), inputs[i])
-            held = ring.times(above, below) if side == 0 else [above, below][side > 0]
-            self.held.append(ring.scaled(held, 1 if side == 0 else -1))
+            wanted = inputs[i]
             if side:
-                inputs[i] = ring.constant(low if side < 0 else high)
-        forms = [in_time(funnel.t[k : k + 2])]
-        forms += [ring.sum([in_time(points), e]) for points, e in zip(centres, x, strict=True)]
-        growth = _growth(ring, field.equations[span], Px, [*forms, *inputs], 2 * h)
-        if kappa is not None:
-            for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=True)):
-                unit = tuple(int(i == j) for i in range(len(kappa)))
-                along = growth.get(unit, ring.constant(0))  # 2h x̄'Pg
-                half = (high - low) / 2
-                rest.append((-half * bound / (4 * h), ring.times(along, along)))
-                rest.append((-half * h / bound, ring.constant(1)))
-        self.rest, self.growth = ring.weighted(rest), growth
+                self.held.append(low - wanted if side < 0 else wanted - high)
+                inputs[i] = ring.made(low if side < 0 else high)
+            else:
+                self.held.append((high - wanted) * (wanted - low))
+        states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
+        forms = [in_time(funnel.t[k : k + 2]), *states, *inputs]
+        self.growth = _growth(ring, field.equations[span], Px, forms, 2 * h)
+        for j, (bound, (low, high)) in enumerate(zip(kappa or [], field.box, strict=False)):
+            unit = tuple(int(i == j) for i in range(len(field.box)))
+            along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
+            half = (high - low) / 2
+            rest -= half * bound / (4 * h) * (along * along) + half * h / bound
+        self.ring, self.rest, self.gap = ring, rest, rho - ring.dot(x, Px)
 
     def condition(
-        self, multiplier: list[list[int]], piece: dict[str, Node], stated: dict[str, Node],
+        self, multiplier: list[tuple[int, ...]], piece: dict[str, Node], stated: dict[str, Node],
         w: Sequence[Fraction],
     ) -> Polynomial:  # fmt: skip
         """c(s, x̄) of a piece at a vertex w."""
-        ring = self.ring
-        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
+        ring, size = self.ring, len(multiplier)
+        stated_mu = piece["mu"].members("shifts start end")
+        shifts = powers_of_two(stated_mu["shifts"], size)
+        ends = zip(stated_mu["start"].wholes(size), stated_mu["end"].wholes(size), strict=True)
+        lines = [
+            ring.bernstein(pair) * ring.monomial(row)
+            for pair, row in zip(ends, multiplier, strict=True)
+        ]
+        mu = ring.dot([Fraction(2) ** shift for shift in shifts], lines)
+        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest), (1, mu * self.gap)]
         for used, growth in self.growth.items():
             parts.append((-prod(value for value, e in zip(w, used, strict=True) if e), growth))
-        mu = piece["mu"].members("shifts start end")
-        shifts, *ends = (mu[key].wholes(len(multiplier)) for key in ("shifts", "start", "end"))
-        if any(abs(shift) > MAX_SHIFT for shift in shifts):
-            raise Rejected(f"{piece['mu'].where}: powers of two beyond 2^{MAX_SHIFT}")
-        lines = [
-            [Fraction(2) ** e * a, Fraction(2) ** e * (b - a)]
-            for e, a, b in zip(shifts, *ends, strict=True)
-        ]
-        parts.append((1, ring.times(ring.polynomial(multiplier, lines), self.gap)))
         taus = piece["tau"].items(len(self.held), len(self.held)) if self.held else []
         for node, held in zip(taus, self.held, strict=True):
-            tau = node.members("columns squares")
-            sides = read_basis(stated["sides"], tau["columns"], ring)
-            squares = expanded(read_squares(tau["squares"], sides), ring)
-            parts.append((-1, ring.times(squares, held)))
+            tau = node.members("columns squares") | {"basis": stated["sides"]}
+            parts.append((-1, expanded(read_squares(tau, ring), ring) * held))
         return ring.weighted(parts)
 
 
 def _growth(
-    ring: Ring, equations: list[list[tuple[list[int], Fraction]]], Px: list[Polynomial],
-    forms: list[Polynomial], scale: Fraction,
+    ring: Ring, equations: list[Terms], Px: list[Polynomial], forms: list[Polynomial],
+    scale: Fraction,
 ) -> dict[tuple[int, ...], Polynomial]:  # fmt: skip
     """scale x̄'Pf by its monomials in w, for the variables t, x, u as forms in x̄ and s."""
-    known = {(0,) * len(forms): ring.constant(1)}
-
-    def power(exponents: tuple[int, ...]) -> Polynomial:
-        if exponents not in known:
-            last = max(j for j, e in enumerate(exponents) if e)
-            lower = tuple(e - (j == last) for j, e in enumerate(exponents))
-            known[exponents] = ring.times(power(lower), forms[last])
-        return known[exponents]
-
-    growth: dict[tuple[int, ...], list[tuple[Fraction, Polynomial]]] = {}
-    for Px_i, equation in zip(Px, equations, strict=True):
-        rates: dict[tuple[int, ...], list[tuple[Fraction, Polynomial]]] = {}
-        for exponents, coefficient in equation:
-            value = power(tuple(exponents[: len(forms)]))
-            rates.setdefault(tuple(exponents[len(forms) :]), []).append((coefficient, value))
-        for used, terms in rates.items():
-            growth.setdefault(used, []).append((scale, ring.times(Px_i, ring.weighted(terms))))
-    return {used: ring.weighted(terms) for used, terms in growth.items()}
+    rates: dict[tuple[int, ...], list[Terms]] = {}
+    n, known = len(equations), len(forms)
+    for i, equation in enumerate(equations):
+        for e, c in equation:
+            rates.setdefault(e[known:], [[] for _ in range(n)])[i].append((e[:known], c))
+    found = ring.substituted([p for parts in rates.values() for p in parts], forms)
+    return {used: scale * ring.dot(found[n * i : n * i + n], Px) for i, used in enumerate(rates)}

@@ -18,6 +18,7 @@ from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Mismatch, Node, Read, Rejected, bound_files
 from .increments import Linear, Model, Signal, read_model
+from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**6
 MAX_NOMINAL = 10**7  # samples of the nominal times the square of the states: a minute
@@ -28,7 +29,8 @@ class Tube:
     """The numbers of a policy file and a funnel file; N nominal samples, n states, p outputs.
 
     x: (N, n), u: (N, 1), K: (1, n), L: (n, p). P: (n, n), R: (p, p), tau, half_widths: (p,).
-    trials: how many distinct ones the assumption was measured on.
+    measured_on, designed_on, fitted_to: what calibrated the assumption, designed the tube, made the
+    model.
     """
 
     x: Matrix
@@ -47,7 +49,9 @@ class Tube:
     samples: int
     measured: Fraction
     safety_factor: Fraction
-    trials: int
+    measured_on: list[Recorded]
+    designed_on: list[Recorded]
+    fitted_to: list[Recorded]
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -58,7 +62,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     linear = model.linear
     if linear is None:
         raise Rejected("a tube is decided for a model of kind difference_equation")
-    tube = _read(documents["policy"], documents["funnel"], model, digests)
+    fitted_to = read_trials(documents["model"].member("bags"))
+    tube = _read(documents["policy"], documents["funnel"], model, digests, fitted_to)
     slack = proof.members("slack")["slack"].number()
     if not 0 < slack < 1:
         raise Rejected("slack should be between 0 and 1")
@@ -110,8 +115,13 @@ def _check_assumption(tube: Tube, linear: Linear) -> None:
         tube.budget,
         "the budget is below safety_factor^2 x measured",
     )
-    if not tube.trials:
+    if not tube.measured_on:
         raise Rejected("the assumption was measured on no trial")
+    if shared(tube.measured_on, tube.designed_on):
+        raise Rejected(
+            "a trial that the assumption was measured on also designed the tube: the largest of "
+            "such trials says nothing of the next one"
+        )
     low, high = linear.input_range
     if any(not low <= entry <= high for (entry,) in tube.u):
         raise Rejected("a nominal input is outside the model's input range")
@@ -180,15 +190,16 @@ def _assumptions(model: Model, tube: Tube) -> tuple[str, ...]:
             f"E <= {budget} after each of {tube.samples} samples, E+ = {text.exact(tube.rho)} E + "
             f"{energy} from 0"
         )
-    trials = "1 distinct trial" if tube.trials == 1 else f"{tube.trials} distinct trials"
     return (
         start,
-        f"innovation energy: {bound} (largest of {trials} {text.above(tube.measured)}, safety "
-        f"factor {text.below(tube.safety_factor)} in amplitude)",
+        f"innovation energy: {bound} "
+        f"({calibration(tube.measured, tube.safety_factor, tube.measured_on, tube.fitted_to)})",
     )
 
 
-def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> Tube:
+def _read(
+    policy: Node, funnel: Node, model: Model, digests: dict[str, str], fitted_to: list[Recorded]
+) -> Tube:
     n, p = model.states, len(model.H)
     plan = _opened(policy, "nlsid/policy", "period K L u x", "policy", ("model",), digests)
     if plan["period"].number() != model.period:
@@ -200,10 +211,8 @@ def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> 
         raise Rejected(f"{len(u)} samples of {n} states take too long to decide")
     names = "rho P R level inlet tau half_widths assumption"
     parts = _opened(funnel, "nlsid/funnel", names, "funnel", ("model", "policy"), digests)
-    given = parts["assumption"].members("kind budget samples measured safety_factor measured_on")
-    trials = [trial.members("name digest") for trial in given["measured_on"].items()]
-    for trial in trials:
-        trial["name"].text()
+    names = "kind budget samples measured safety_factor measured_on designed_on"
+    given = parts["assumption"].members(names)
     tau = parts["tau"].array(p)
     if min(tau) <= 0:
         raise Rejected("tau should be positive")
@@ -215,7 +224,9 @@ def _read(policy: Node, funnel: Node, model: Model, digests: dict[str, str]) -> 
         assumption=given["kind"].text(), budget=given["budget"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES), measured=given["measured"].number(),
         safety_factor=given["safety_factor"].number(),
-        trials=len({trial["digest"].text() for trial in trials}),
+        measured_on=read_trials(given["measured_on"]),
+        designed_on=read_trials(given["designed_on"]),
+        fitted_to=fitted_to,
     )  # fmt: skip
 
 

@@ -11,22 +11,29 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
+from math import lcm
 from pathlib import Path
+from typing import Any
 
 MAX_BYTES = 32 * 2**20  # of one file; real proofs are a few MB
-MAX_TOTAL = 48 * 2**20  # of all files of a claim: reading takes a second a MB and 50 times that
+MAX_TOTAL = 48 * 2**20  # of all files of a claim: half a minute, and 50 times that in memory
 MAX_WHOLE = 2**53  # beyond it a float64 no longer holds every whole number
 MAX_DIGITS = 4000  # of one integer of a "p/q": bounds what one number can cost
 MAX_NAME = 200
 MAX_NUMBER = 60  # characters of a JSON number; a float64 needs at most 25
+MAX_DEGREE = 63  # of a monomial, all exponents together
+MAX_STATED = 20_000  # monomials of one list
+MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a matrix
+VERSION = 2  # of proofs and of all documents they are about
 
 _LABEL = re.compile(r"(?!e[-+0-9])(1/|[A-Za-z_/%°µ])[A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
+Terms = list[tuple[tuple[int, ...], Fraction]]  # of a polynomial: exponents and coefficients
 
 
 class Rejected(Exception):  # noqa: N818 - a verdict
@@ -35,6 +42,11 @@ class Rejected(Exception):  # noqa: N818 - a verdict
 
 class Mismatch(Rejected):
     """A file is not the one that the proof is about."""
+
+
+def by_degree(exponents: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+    """The order of monomials: by total degree, then by their exponents."""
+    return sum(exponents), exponents
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,12 @@ class Node:
             if name not in wanted and name not in allowed:
                 raise Rejected(f"{self.where}: unknown member {plain(name)!r}")
         return {name: Node(entry, f"{self.where} {name}") for name, entry in self.value.items()}
+
+    def member(self, name: str) -> "Node":
+        """One member of an object that may have others."""
+        if type(self.value) is not dict or name not in self.value:
+            raise Rejected(f"{self.where}: '{name}' is missing")
+        return Node(self.value[name], f"{self.where} {name}")
 
     def items(self, least: int = 0, most: int = 10**6) -> list["Node"]:
         """A list of `least` to `most` entries."""
@@ -99,13 +117,17 @@ class Node:
 
     def integers(self, least: int, most: int) -> tuple[int, ...]:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
-        entries = self.items(least, most) if type(self.value) is not list else self.value
-        if not least <= len(entries) <= most or not all(type(e) is int for e in entries):
-            numbers = [entry.rational() for entry in self.items(least, most)]
-            if any(number.denominator != 1 for number in numbers):
+        entries = self.value
+        if type(entries) is list and all(type(e) is int for e in entries):
+            numbers: list[int] = entries
+        else:
+            rationals = [entry.rational() for entry in self.items(least, most)]
+            if any(number.denominator != 1 for number in rationals):
                 raise Rejected(f"{self.where} should hold whole numbers only")
-            return tuple(number.numerator for number in numbers)
-        return tuple(entries)
+            numbers = [number.numerator for number in rationals]
+        if not least <= len(numbers) <= most:
+            raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
+        return tuple(numbers)
 
     def array(self, *shape: int | None) -> list:  # type: ignore[type-arg]
         """Nested lists of float64s of this shape, as Fractions; None: any length."""
@@ -127,6 +149,65 @@ class Node:
                     f"{self.where} should hold {'whole ' if kind is int else ''}numbers only"
                 )
         return list(value) if kind is int else [Fraction(entry) for entry in value]
+
+    def monomials(
+        self, count: int, degree: int = MAX_DEGREE, order: Callable[[Any], Any] | None = None
+    ) -> list[tuple[int, ...]]:
+        """Distinct rows of `count` exponents, of `degree` together at most; sorted by `order`."""
+        rows = [tuple(row) for row in self.wholes(None, count)]
+        if len(rows) > MAX_STATED:
+            raise Rejected(f"{self.where}: {len(rows)} terms; at most {MAX_STATED} are taken")
+        if any(e < 0 for row in rows for e in row):
+            raise Rejected(f"{self.where}: an exponent is negative")
+        if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
+            raise Rejected(f"{self.where}: monomials should be distinct, in increasing order")
+        if any(sum(row) > degree for row in rows):
+            raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
+        return rows
+
+    def polynomial(self, count: int, degree: int = MAX_DEGREE, order: Any = by_degree) -> Terms:
+        """`exponents` and `coefficients` of a polynomial: distinct sorted monomials, rationals."""
+        parts = self.members("exponents coefficients")
+        rows = parts["exponents"].monomials(count, degree, order)
+        values = [entry.rational() for entry in parts["coefficients"].items(len(rows), len(rows))]
+        common_denominator(values, self.where)
+        return list(zip(rows, values, strict=True))
+
+    def kind(self) -> str:
+        """The member `kind` of an object."""
+        if type(self.value) is not dict or "kind" not in self.value:
+            raise Rejected(f"{self.where} should be an object with a kind")
+        return Node(self.value["kind"], f"{self.where} kind").text()
+
+    def document(
+        self, form: str, names: str, kinds: str = "", *, optional: str = "",
+        made_for: Mapping[str, str] | None = None,
+    ) -> dict[str, "Node"]:  # fmt: skip
+        """The members of a document nlsid/`form`, of one of `kinds` if there are any.
+
+        made_for: the digests, by role, that it has to name; Mismatch if it names another.
+        """
+        required = f"format version {'kind' * bool(kinds)} {' '.join(made_for or ())} {names}"
+        parts = self.members(required, optional)
+        kind = parts["kind"].text() if kinds else ""
+        found = parts["format"].text(), parts["version"].whole(0), kind
+        if found not in [(f"nlsid/{form}", VERSION, known) for known in kinds.split() or [""]]:
+            wanted = f"nlsid/{form}, version {VERSION} {kinds}".rstrip()
+            raise Rejected(f"{self.where} should be of format {wanted}; it is of format {found}")
+        for role, made in (made_for or {}).items():
+            if parts[role].text() != made:
+                raise Mismatch(f"the {self.where} was made for another {role}")
+        return parts
+
+
+def common_denominator(values: Iterable[Fraction | int], where: str) -> int:
+    """The least one; Rejected if it would make every number long."""
+    common = 1
+    for denominator in {value.denominator for value in values}:
+        common = lcm(common, denominator)
+        if common.bit_length() > MAX_COMMON:
+            raise Rejected(f"{where}: denominators of more than {MAX_COMMON} bits together")
+    return common
 
 
 def parse(content: bytes, where: str) -> Node:

@@ -9,7 +9,6 @@ from fractions import Fraction
 from itertools import pairwise
 
 from . import text
-from .checking import opened
 from .continuous_funnel import Funnel, decide_funnel, inside
 from .decision import Decision
 from .files import Node, Read, Rejected, bound_files
@@ -29,10 +28,10 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     decisions, funnels, work = [], [], Work()
     for role in roles:
         try:
-            kind, stage, witnesses = opened(documents[role])
-            if kind != "continuous_funnel":
-                raise Rejected(f"a stage should claim a continuous_funnel, not {kind!r}")
-            decision, funnel = decide_funnel(stage, witnesses, read, work)
+            stage = documents[role].document("proof", "claim proof")
+            if stage["claim"].kind() != "continuous_funnel":
+                raise Rejected("a stage should claim a continuous_funnel")
+            decision, funnel = decide_funnel(stage["claim"], stage["proof"], read, work)
         except Rejected as refusal:
             raise type(refusal)(f"{role}: {refusal}") from refusal
         decisions.append(decision)

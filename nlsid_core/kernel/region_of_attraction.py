@@ -14,7 +14,7 @@ from .decision import Decision
 from .files import Node, Read, Rejected, bound_files
 from .polynomials import FREE_OF_S, MOST_WORK, Ring, Work, at_width
 from .positivity import expanded, positive_except_origin, read_witness
-from .terms import derivative, read_names, read_terms, shown, substituted
+from .terms import along, read_names, shown
 
 LEVEL_DIGITS = 12  # of the level in the sentence
 
@@ -25,42 +25,31 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     _, digests = bound_files(parts["about"], read, "")
     names = read_names(parts["variables"])
     n = len(names)
-    field = [read_terms(entry, n) for entry in parts["field"].items(n, n)]
-    V = read_terms(parts["V"], n)
+    field = [entry.polynomial(n) for entry in parts["field"].items(n, n)]
+    V = parts["V"].polynomial(n)
     level = parts["level"].rational() if "level" in parts else None
     if any(c and not any(e) for f in field for e, c in f):
         raise Rejected("the origin is not an equilibrium: f(0) is not zero")
     if level is not None and level <= 0:
         raise Rejected("the level should be positive")
-    witnesses = proof.members("V decrease" + (" multiplier" if level is not None else ""))
-    margin = Fraction(0)
+    witnesses = proof.members("V decrease" + " multiplier" * (level is not None))
 
-    def build(ring: Ring) -> None:
-        nonlocal margin
-        x = [ring.variable(i) for i in range(n)]
-        value = substituted(V, x, ring)
+    def build(ring: Ring) -> Fraction:
+        value, *f = ring.substituted([V, *field], ring.variables)
         positive_except_origin(value, read_witness(witnesses["V"], ring), ring, "V")
-        rate = [
-            ring.times(substituted(derivative(V, j), x, ring), substituted(f, x, ring))
-            for j, f in enumerate(field)
-        ]
-        terms = [ring.scaled(ring.sum(rate), -1)]
+        decrease = -1 * along([V], ring.variables, f, ring)[0]
         if level is not None:
-            sigma = expanded(read_witness(witnesses["multiplier"], ring), ring)
-            terms.append(ring.times(sigma, ring.minus(value, ring.constant(level))))
-        decrease = read_witness(witnesses["decrease"], ring)
-        margin = positive_except_origin(ring.sum(terms), decrease, ring, "the decrease of V")
+            decrease += expanded(read_witness(witnesses["multiplier"], ring), ring) * (
+                value - level
+            )
+        witness = read_witness(witnesses["decrease"], ring)
+        return positive_except_origin(decrease, witness, ring, "the decrease of V")
 
-    at_width(n, Work(MOST_WORK), build, first=FREE_OF_S)
-    dynamics = ", ".join(
-        f"d{name}/dt = {shown(f, names)}" for name, f in zip(names, field, strict=True)
-    )
-    if level is None:
-        return Decision(f"every solution of {dynamics} tends to the origin", margin, (), digests)
-    inside = f"{{{shown(V, names)} <= {text.below(level, LEVEL_DIGITS)}}}"
-    return Decision(
-        f"every solution of {dynamics} that starts in {inside} tends to the origin",
-        margin,
-        (),
-        digests,
-    )
+    margin = at_width(n, Work(MOST_WORK, FREE_OF_S), build)
+    rates = zip(names, field, strict=True)
+    dynamics = ", ".join(f"d{name}/dt = {shown(f, names)}" for name, f in rates)
+    start = ""
+    if level is not None:
+        start = f" that starts in {{{shown(V, names)} <= {text.below(level, LEVEL_DIGITS)}}}"
+    sentence = f"every solution of {dynamics}{start} tends to the origin"
+    return Decision(sentence, margin, (), digests)

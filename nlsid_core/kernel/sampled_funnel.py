@@ -10,35 +10,29 @@ For both chains of radii, the tube and the inlet, and at each step: `positive` p
 A trapezoidal model's f̄ is any root of its equation h(z, w) = 0 within the stated bound. For the
 form response, ξ has a root at most spread·|r| from that of ξ + r, by Brouwer's theorem: with
 M h = c + B z + C w + N(z, w) and N's stretch μ, the map w -> w - M h(ξ, w) takes that ball into
-itself. Source: docs/certificate_sampled_funnel.md.
+itself.
+Coordinates are stated: x̄ = T z, and for an implicit model v̄⁺ = T⁺w. Sizes are |S x̄| before the
+step and |S⁺x̄⁺| after it. A part p_m = Σ c_e z^e of degree m obeys |p_m(z)| <= γ|z|^m, and so does
+the symmetric m-linear map that it comes from, if γ²I - Σ c_e c_e' Π e_i!/m! ⪰ 0. Hence
+    |p(z + w) - p(z)| <= Σ_m γ_m ((|z| + |w|)^m - |z|^m) <= μ|w|.                  (`stretch`)
+Source: docs/certificate_sampled_funnel.md.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import comb
+from math import comb, factorial, prod
 
 from .decision import Decision
-from .exact import Matrix, at_most, combined, product, semidefinite, transposed
-from .files import Mismatch, Node, Read, Rejected, bound_files, label
-from .polynomials import FREE_OF_S, Polynomial, Ring, Work, at_width
-from .positivity import expanded, positive, read_basis, read_squares
-from .sampled_steps import (
-    Map,
-    Sample,
-    explicit_step,
-    implicit_step,
-    linear_part,
-    mapped,
-    prove_curvature,
-    prove_inverse,
-    prove_norm,
-    square,
-    stretch,
-)
+from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed
+from .files import Node, Read, Rejected, Terms, bound_files, label
+from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
+from .positivity import expanded, positive, powers_of_two, read_squares
 from .text import above, below
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
+STEP = 5_000  # of the work that a claim may take: what a step costs at the least
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
 
@@ -48,21 +42,19 @@ class Model:
     """A map (trapezoidal: of accelerations); signals: name, unit and box, states first."""
 
     trapezoidal: bool
-    map: Map
+    map: list[Terms]
     period: Fraction
     signals: list[tuple[str, str, Fraction, Fraction]]
     states: int
     bags: set[str]
 
-    @property
-    def variables(self) -> int:
-        """z, and of an implicit model w."""
-        return self.states + self.states // 2 * self.trapezoidal
-
 
 @dataclass(frozen=True)
 class Funnel:
-    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption."""
+    """Shapes, radii of both chains, half-widths of the tube, bounds of roots; the assumption.
+
+    widens: what the disturbance adds to a radius.
+    """
 
     S: list[Matrix]
     A: list[Matrix]
@@ -74,18 +66,26 @@ class Funnel:
     rate: Fraction
     gain: Fraction
     measured: str
+    widens: Fraction
 
-    @property
-    def widens(self) -> Fraction:
-        """What the disturbance adds to a radius."""
-        return Fraction(0) if self.form == "peak" else self.bound
+
+@dataclass(frozen=True)
+class Sample:
+    """A sample of a policy and the next state, with the shapes of both and A of the response."""
+
+    x: list[Fraction]
+    u: list[Fraction]
+    K: Matrix
+    x_next: list[Fraction]
+    S: Matrix
+    S_next: Matrix
+    A: Matrix
 
 
 @dataclass(frozen=True)
 class Link:
     """One step: S⁺x̄⁺, h (implicit models), |S T z|², and the step's verified bounds."""
 
-    ring: Ring
     rows: list[Polynomial]
     h: list[Polynomial]
     size: Polynomial
@@ -98,87 +98,80 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     about = claim.members("kind about")["about"]
     documents, digests = bound_files(about, read, "model policy funnel")
     model = _read_model(documents["model"])
-    x, u, K = _read_policy(documents["policy"], model, digests)
+    x, u, K = _read_policy(documents["policy"], model, digests["model"])
     funnel = _read_funnel(documents["funnel"], model, len(u), digests)
-    for k in range(len(x)):
-        _prove_box(model, funnel, k, x[k], u[k : k + 1], K[k : k + 1])
-    bases = proof.members(
-        "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
-    )
-    rooms: list[Fraction] = []
+    for k, (point, inputs, gain) in enumerate(zip(x, [*u, []], [*K, []], strict=True)):
+        _prove_box(model, funnel, k, [*point, *inputs], gain)
+    names = "basis ball_basis steps" + " roots_basis equation_basis" * model.trapezoidal
+    bases = proof.members(names)
 
-    def prove(ring: Ring) -> None:
-        rooms.clear()
+    def prove(ring: Ring) -> Fraction:
+        rooms: list[Fraction] = []
         for k, node in enumerate(bases["steps"].items(len(u), len(u))):
-            stated = node.members(
-                "T kappa curvature tube inlet"
-                + " T_next kappa_next inverse state rates direct through" * model.trapezoidal
-            )
             at = Sample(x[k], u[k], K[k], x[k + 1], funnel.S[k], funnel.S[k + 1], funnel.A[k])
+            ring.work.spend(STEP)
             step = Ring(ring.count, ring.width, ring.work)  # what a step holds is not kept
-            link = _link(stated, model, at, funnel.form, step)
+            stated, link = _link(node, model, at, funnel.form, step)
             rooms.extend([_prove_step(link, stated[c], bases, funnel, c, k) for c in CHAINS])
+        return min(rooms)
 
-    at_width(model.variables, Work(), prove, first=FREE_OF_S)
-    return Decision(
-        _sentence(model, funnel, len(u)), min(rooms), _assumptions(model, funnel), digests
-    )
+    margin = at_width(_variables(model), Work(width=FREE_OF_S), prove)
+    return Decision(_sentence(model, funnel, len(u)), margin, _assumptions(model, funnel), digests)
 
 
-def _link(stated: dict[str, Node], model: Model, at: Sample, form: str, ring: Ring) -> Link:
-    """The step's polynomials, and its stated bounds verified."""
-    n, d = model.states, model.states // 2
-    z = [ring.variable(i) for i in range(n)]
-    T = _triangular(stated["T"].array(n, n), stated["T"].where)
-    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
-    names = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
-    bounds = {name: _nonnegative(stated[name]) for name in names.split()}
+def _link(
+    node: Node, model: Model, at: Sample, form: str, ring: Ring
+) -> tuple[dict[str, Node], Link]:
+    """A step's members; its polynomials, and its stated bounds verified."""
+    norms = "kappa" + " kappa_next state rates direct through" * model.trapezoidal
+    more = " T_next inverse" * model.trapezoidal
+    stated = node.members(f"T curvature tube inlet {norms}{more}")
+    bounds = {name: _nonnegative(stated[name]) for name in norms.split()}
     curvature = [_nonnegative(entry) for entry in stated["curvature"].items(0, 64)]
-    size, where = square(mapped(ST, z, ring), ring), stated["T"].where
+    n, d, where = model.states, model.states // 2, stated["T"].where
+    T = _triangular(stated["T"].array(n, n), where)
+    ST, unit = product(at.S, T), product(at.S_next, product(at.A, T))
+    z = ring.variables[:n]
+    scaled = ring.product(ST, z)
     prove_inverse(ST, bounds["kappa"], f"{where}: kappa^2 (ST)'ST - 1")
+    h: list[Polynomial] = []
     if not model.trapezoidal:
-        rows = explicit_step(model.map, at, T, ring)
-        carried = mapped(unit, z, ring) if form == "response" else []
-        moved = [ring.minus(p, q) for p, q in zip(rows, carried, strict=True)] if carried else rows
-        prove_curvature(moved, curvature, ring, least=1)
-        return Link(ring, rows, [], size, bounds, curvature)
-    T_next = stated["T_next"].array(d, d)
-    S_rates = [row[d:] for row in at.S_next[d:]]
-    prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
-    rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
-    normal = mapped(stated["inverse"].array(d, d), h, ring)
-    B, C = _split(linear_part(normal, ring), n)
-    L_z, L_w = _split(linear_part(rows, ring), n)
-    identity = [[Fraction(i == j) for j in range(d)] for i in range(d)]
-    direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
-    for name, M in (
-        ("state", B),
-        ("rates", combined(C, identity, -1)),
-        ("direct", direct),
-        ("through", L_w),
-    ):
-        prove_norm(M, bounds[name], f"{where}: the bound {name}")
-    prove_curvature(normal, curvature, ring, least=2)
-    return Link(ring, rows, h, size, bounds, curvature)
+        rows = moved = explicit_step(model.map, at, T, ring)
+        if form == "response":
+            moved = [p - q for p, q in zip(rows, ring.product(unit, z), strict=True)]
+    else:
+        T_next = stated["T_next"].array(d, d)
+        S_rates = [row[d:] for row in at.S_next[d:]]
+        prove_inverse(product(S_rates, T_next), bounds["kappa_next"], f"{where}: kappa_next")
+        rows, h = implicit_step(model.map, at, T, T_next, model.period, ring)
+        moved = ring.product(stated["inverse"].array(d, d), h)
+        (B, C), (L_z, L_w) = (
+            ([row[:n] for row in M], [row[n:] for row in M])
+            for M in (linear_part(moved, ring), linear_part(rows, ring))
+        )
+        C = [[entry - (i == j) for j, entry in enumerate(row)] for i, row in enumerate(C)]
+        direct = combined(combined(L_z, product(L_w, B), -1), unit, -1)
+        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w)):
+            prove_norm(M, bounds[name], f"{where}: the bound {name}")
+    prove_curvature(moved, curvature, ring, least=1 + model.trapezoidal)
+    return stated, Link(rows, h, ring.dot(scaled, scaled), bounds, curvature)
 
 
 def _prove_step(
     link: Link, node: Node, bases: dict[str, Node], funnel: Funnel, chain: str, k: int
 ) -> Fraction:
     """Prove one step of one chain; the part of the next radius that it leaves free."""
-    ring, d, what = link.ring, len(link.h), f"{chain}, step {k}"
-    stated = node.members(
-        "reach columns squares ball"
-        + " roots equations" * bool(d)
-        + " spread extents" * (bool(d) and funnel.form == "response")
-    )
+    ring, d, what = link.size.ring, len(link.h), f"{chain}, step {k}"
+    names = "reach columns squares ball" + " roots equations" * bool(d)
+    names += " spread extents" * (bool(d) and funnel.form == "response")
+    stated = node.members(names)
     reach, (radius, following) = _nonnegative(stated["reach"]), funnel.radii[chain][k : k + 2]
-    parts = [ring.constant(reach**2), ring.scaled(square(link.rows, ring), -1)]
-    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size, ring))
+    parts = [reach**2 - ring.dot(link.rows, link.rows)]
+    parts.append(_ball(stated["ball"], bases["ball_basis"], radius, link.size))
     if d:
         far, added = _implicit_addition(link, stated, funnel, radius, reach, k, what)
-        size = square([ring.variable(i) for i in range(2 * d, 3 * d)], ring)
-        parts.append(_ball(stated["roots"], bases["roots_basis"], far, size, ring))
+        w = ring.variables[-d:]
+        parts.append(_ball(stated["roots"], bases["roots_basis"], far, ring.dot(w, w)))
         parts += _equations(stated["equations"], bases["equation_basis"], link)
     else:
         added = _explicit_addition(link, funnel, radius, what)
@@ -187,29 +180,25 @@ def _prove_step(
         following,
         f"{what}: reach {above(reach)} and disturbance {above(added)} exceed the next radius",
     )
-    squares = read_squares(stated["squares"], read_basis(bases["basis"], stated["columns"], ring))
+    squares = read_squares(stated | {"basis": bases["basis"]}, ring)
     positive(ring.sum(parts), squares, ring, f"{what}: reach", strict=False)
     return (following - reach - added) / following
 
 
-def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial, ring: Ring) -> Polynomial:
+def _ball(node: Node, basis: Node, radius: Fraction, size: Polynomial) -> Polynomial:
     """-σ (radius² - size), σ a sum of squares: not positive where size <= radius²."""
-    stated = node.members("columns squares")
-    squares = read_squares(stated["squares"], read_basis(basis, stated["columns"], ring))
-    return ring.times(expanded(squares, ring), ring.sum([size, ring.constant(-(radius**2))]))
+    squares = read_squares(node.members("columns squares") | {"basis": basis}, size.ring)
+    return expanded(squares, size.ring) * (size - radius**2)
 
 
-def _equations(node: Node, monomials: Node, link: Link) -> list[Polynomial]:
+def _equations(node: Node, basis: Node, link: Link) -> list[Polynomial]:
     """-ν_i h_i, zero at a root: ν_i = Σ_m rows[i][m] 2^columns[m] monomial_m."""
-    stated, ring = node.members("columns rows"), link.ring
-    basis = read_basis(monomials, stated["columns"], ring)
-    lowest, result = min(basis.columns), []
-    for row, h in zip(stated["rows"].wholes(len(link.h), len(basis.keys)), link.h, strict=True):
-        entries = [e << (shift - lowest) for e, shift in zip(row, basis.columns, strict=True)]
-        terms = dict(zip(basis.keys, entries, strict=True))
-        nu = Polynomial(terms, 1, basis.degree, 0, sum(map(abs, entries)))
-        result.append(ring.scaled(ring.times(nu, h), -(Fraction(2) ** lowest)))
-    return result
+    stated, ring = node.members("columns rows"), link.size.ring
+    monomials = [ring.monomial(row) for row in basis.monomials(ring.count)]
+    columns = powers_of_two(stated["columns"], len(monomials))
+    rows = stated["rows"].wholes(len(link.h), len(monomials))
+    nu = ([-e * Fraction(2) ** c for e, c in zip(row, columns, strict=True)] for row in rows)
+    return [ring.dot(row, monomials) * h for row, h in zip(nu, link.h, strict=True)]
 
 
 def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) -> Fraction:
@@ -226,14 +215,9 @@ def _explicit_addition(link: Link, funnel: Funnel, radius: Fraction, what: str) 
 
 
 def _implicit_addition(
-    link: Link,
-    stated: dict[str, Node],
-    funnel: Funnel,
-    radius: Fraction,
-    reach: Fraction,
-    k: int,
-    what: str,
-) -> tuple[Fraction, Fraction]:
+    link: Link, stated: dict[str, Node], funnel: Funnel, radius: Fraction, reach: Fraction,
+    k: int, what: str,
+) -> tuple[Fraction, Fraction]:  # fmt: skip
     """|w| that the reach has to be proved for, and what the disturbance adds to the reach."""
     b = link.bounds
     far = b["kappa_next"] * funnel.roots[k + 1]
@@ -249,9 +233,8 @@ def _implicit_addition(
     if b["rates"] >= 1 or mapped_to > spread:
         raise Rejected(f"{what}: two roots may differ by more than the stated spread")
     # From it Δ = -B r + (1 - C) Δ - (a change of N), and |w| <= kappa_next reach at the root of ξ.
-    at_most(
-        z**2 + (b["kappa_next"] * reach) ** 2, near**2, f"{what}: the second extent is too small"
-    )
+    own = b["kappa_next"] * reach
+    at_most(z**2 + own**2, near**2, f"{what}: the second extent is too small")
     mu = stretch(link.curvature, near, (1 + spread) * r, least=2)
     shrink = 1 - b["rates"] - mu
     if shrink > 0:
@@ -259,37 +242,114 @@ def _implicit_addition(
     return far, (b["direct"] + b["through"] * (b["rates"] * spread + mu * (1 + spread))) * r
 
 
-def _prove_box(
-    model: Model, funnel: Funnel, k: int, x: list[Fraction], u: Matrix, K: list[Matrix]
+def explicit_step(f: Sequence[Terms], at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+    """S⁺(f(x + Tz, u - K T z) - x⁺)."""
+    moved = ring.substituted(f, _state_and_input(at, T, ring))
+    return ring.product(at.S_next, [p - c for p, c in zip(moved, at.x_next, strict=True)])
+
+
+def implicit_step(
+    a: Sequence[Terms], at: Sample, T: Matrix, T_next: Matrix, period: Fraction, ring: Ring
+) -> tuple[list[Polynomial], list[Polynomial]]:
+    """S⁺x̄⁺ and h = v⁺ - v - period/2 (a(q, v, u) + a(q⁺, v⁺, u)), in z, then w.
+
+    v⁺ = v_{k+1} + T⁺w and q⁺ = q + period/2 (v + v⁺).
+    """
+    d, half = len(T_next), period / 2
+    here = _state_and_input(at, T, ring)
+    q, v, u = here[:d], here[d : 2 * d], here[2 * d :]
+    moved = ring.product(T_next, ring.variables[2 * d :])
+    rate = [p + c for p, c in zip(moved, at.x_next[d:], strict=True)]
+    place = [p + half * (s + r) for p, s, r in zip(q, v, rate, strict=True)]
+    pulls = ring.substituted(a, here), ring.substituted(a, [*place, *rate, *u])
+    h = [r - s - half * (b + c) for r, s, b, c in zip(rate, v, *pulls, strict=True)]
+    after = [p - c for p, c in zip([*place, *rate], at.x_next, strict=True)]
+    return ring.product(at.S_next, after), h
+
+
+def linear_part(p: Sequence[Polynomial], ring: Ring) -> Matrix:
+    """The coefficients of degree 1: a row for each polynomial."""
+    keys = [1 << (BITS * i) for i in range(ring.count)]
+    return [[Fraction(q.terms.get(key, 0), q.denominator) for key in keys] for q in p]
+
+
+def prove_curvature(
+    p: Sequence[Polynomial], gammas: Sequence[Fraction], ring: Ring, least: int
 ) -> None:
-    """At sample k both chains stay in the box of the data, inputs included; and the half-widths."""
+    """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
+    sizes: dict[int, Matrix] = {}
+    for key in set().union(*(q.terms for q in p)):
+        e = ring.exponents(key)
+        c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
+        outer = [[a * b for b in c] for a in c]
+        share = Fraction(prod(map(factorial, e)), factorial(m))
+        sizes[m] = combined(sizes.get(m, [[Fraction(0)] * len(c)] * len(c)), outer, share)
+    if max(sizes, default=0) >= least + len(gammas):
+        raise Rejected("curvature: a bound for every degree is needed")
+    for m, gamma in enumerate(gammas, start=least):
+        if m in sizes:
+            _at_most_square(sizes[m], gamma, f"curvature bound on degree {m}")
+
+
+def stretch(gammas: Sequence[Fraction], size: Fraction, step: Fraction, least: int) -> Fraction:
+    """μ with |p(z + w) - p(z)| <= μ|w| for |z| <= size, |w| <= step; degrees from `least` on."""
+    far, total = size + step, Fraction(0)
+    for m, gamma in enumerate(gammas, start=least):
+        total += gamma * sum((far**i * size ** (m - 1 - i) for i in range(m)), Fraction(0))
+    return total
+
+
+def prove_norm(M: Matrix, bound: Fraction, what: str) -> None:
+    """Raise Rejected unless |M v| <= bound |v| for every v."""
+    _at_most_square(product(M, transposed(M)), bound, what)
+
+
+def prove_inverse(M: Matrix, bound: Fraction, what: str) -> None:
+    """Raise Rejected unless |z| <= bound |M z| for every z."""
+    MM = product(transposed(M), M)
+    scaled = [[bound**2 * e - (i == j) for j, e in enumerate(row)] for i, row in enumerate(MM)]
+    semidefinite(scaled, what)
+
+
+def _at_most_square(MM: Matrix, bound: Fraction, what: str) -> None:
+    semidefinite(
+        [[bound**2 * (i == j) - e for j, e in enumerate(row)] for i, row in enumerate(MM)], what
+    )
+
+
+def _state_and_input(at: Sample, T: Matrix, ring: Ring) -> list[Polynomial]:
+    """x + T z and u - K T z."""
+    feedback = [[-entry for entry in row] for row in product(at.K, T)]
+    moved = ring.product([*T, *feedback], ring.variables[: len(T)])
+    return [p + c for p, c in zip(moved, [*at.x, *at.u], strict=True)]
+
+
+def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K: Matrix) -> None:
+    """At sample k both chains stay in the box of the data, inputs included; and the half-widths.
+
+    |g'x̄| <= room where |S x̄| <= radius if radius² g'(S'S)⁻¹g <= room².
+    """
+    n = model.states
     tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
-    rows = [[Fraction(i == j) for j in range(len(x))] for i in range(len(x))]
-    bounds = [
-        (row, tube, width, "its stated half-width")
-        for row, width in zip(rows, funnel.half_widths[k], strict=True)
-    ]
-    rows += [row for gain in K for row in gain]
-    centres = x + [entry for row in u for entry in row]
-    for row, centre, (_, _, low, high) in zip(rows, centres, model.signals, strict=False):
-        room = min(high - centre, centre - low)
-        bounds.append((row, max(tube, inlet), room, "the box of the model's data"))
-    square = product(transposed(funnel.S[k]), funnel.S[k])
-    for i, (row, radius, width, kept) in enumerate(bounds):
-        what = f"sample {k}: {model.signals[max(i - len(x), i % len(x))][0]} can leave {kept}"
-        # |row x̄| <= width where x̄'square x̄ <= radius²
-        edge = [radius * entry for entry in row]
-        bordered = [[*line, entry] for line, entry in zip(square, edge, strict=True)]
-        at_most(0, width, what)
-        semidefinite([*bordered, [*edge, width**2]], f"{what}: its room")
+    rows = [[Fraction(i == j) for j in range(n)] for i in range(n)] + K
+    forms = inverse_forms(product(transposed(funnel.S[k]), funnel.S[k]), rows, "S'S")
+    signals, stays = model.signals, "the box of the model's data"
+    rooms = [(tube, width, "its stated half-width") for width in funnel.half_widths[k]]
+    for centre, (_, _, low, high) in zip(centres, signals, strict=False):
+        rooms.append((max(tube, inlet), min(high - centre, centre - low), stays))
+    named = zip(rooms, [*forms[:n], *forms], [*signals[:n], *signals], strict=False)
+    for (radius, room, kept), form, (name, *_) in named:
+        if room < 0 or radius**2 * form > room**2:
+            raise Rejected(f"sample {k}: {name} can leave {kept}")
 
 
 def _read_model(node: Node) -> Model:
-    parts = node.members(
-        "format version kind equation period x u exponents coefficients x_range u_range noise "
-        "disturbance bags"
+    parts = node.document(
+        "model",
+        "equation period x u exponents coefficients x_range u_range noise disturbance bags",
+        "state_map trapezoidal",
     )
-    trapezoidal = _header(parts, "nlsid/model", "state_map", "trapezoidal") == "trapezoidal"
+    trapezoidal = parts["kind"].value == "trapezoidal"
     x, u = (parts[key].items(1, MAX_SIGNALS) for key in "xu")
     box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
     signals = []
@@ -297,27 +357,27 @@ def _read_model(node: Node) -> Model:
         named = entry.members("name unit path")
         name, unit = named["name"].text(), named["unit"].text()
         signals.append((label(name), label(unit) if unit else "", low, high))
-    exponents = [tuple(row) for row in parts["exponents"].wholes(None, len(signals))]
-    outputs = len(x) // 2 if trapezoidal else len(x)
-    degree, period = max(map(sum, exponents), default=0), parts["period"].number()
+    exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
     if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
         raise Rejected("a model needs a positive period, monomials, and a rate for each position")
-    if len(set(exponents)) != len(exponents) or min(map(min, exponents)) < 0:
-        raise Rejected("the model's monomials should be distinct, with exponents of 0 or more")
-    polynomials = Map(exponents, parts["coefficients"].array(len(exponents), outputs))
+    outputs = len(x) // 2 if trapezoidal else len(x)
+    columns = transposed(parts["coefficients"].array(len(exponents), outputs))
+    polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
     bags = set(_digests(parts["bags"]))
     model = Model(trapezoidal, polynomials, period, signals, len(x), bags)
-    if degree > MAX_MONOMIALS or comb(model.variables + degree, degree) > MAX_MONOMIALS:
-        raise Rejected(f"degree {degree} in {model.variables} variables is too large to decide")
+    degree, variables = max(map(sum, exponents)), _variables(model)
+    if comb(variables + degree, degree) > MAX_MONOMIALS:
+        raise Rejected(f"degree {degree} in {variables} variables is too large to decide")
     return model
 
 
-def _read_policy(
-    node: Node, model: Model, digests: dict[str, str]
-) -> tuple[Matrix, Matrix, list[Matrix]]:
-    parts = node.members("format version kind law model period L u x K")
-    _header(parts, "nlsid/policy", "sampled")
-    _same(parts["model"], digests["model"])
+def _variables(model: Model) -> int:
+    """z, and of an implicit model w."""
+    return model.states + model.states // 2 * model.trapezoidal
+
+
+def _read_policy(node: Node, model: Model, made_for: str) -> tuple[Matrix, Matrix, list[Matrix]]:
+    parts = node.document("policy", "law period L u x K", "sampled", made_for={"model": made_for})
     if parts["period"].number() != model.period:
         raise Rejected("the policy has another sample time than the model")
     n, p = model.states, len(model.signals) - model.states
@@ -329,14 +389,9 @@ def _read_policy(
 
 
 def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) -> Funnel:
-    parts = node.members(
-        "format version kind set model policy assumption tube inlet half_widths S A"
-        + " roots" * model.trapezoidal
-    )
-    _header(parts, "nlsid/funnel", "sampled")
-    for role in ("model", "policy"):
-        _same(parts[role], digests[role])
-    n = model.states
+    names = "set assumption tube inlet half_widths S A" + " roots" * model.trapezoidal
+    made_for = {role: digests[role] for role in ("model", "policy")}
+    parts, n = node.document("funnel", names, "sampled", made_for=made_for), model.states
     radii = {chain: parts[chain].array(steps + 1) for chain in CHAINS}
     roots = parts["roots"].array(steps + 1) if model.trapezoidal else []
     if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
@@ -355,19 +410,14 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
         raise Rejected(f"rate {above(rate)} or gain {above(gain)} is none of form {form}")
     at_most(1, factor, "the safety factor is below 1")
     at_most(factor * measured, bound, "the bound is below safety_factor x measured")
-    return Funnel(
-        [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)],
-        parts["A"].array(steps, n, n),
-        radii,
-        parts["half_widths"].array(steps + 1, n),
-        roots,
-        form,
-        bound,
-        rate,
-        gain,
+    runs_and_factor = (
         f"largest of {len(set(runs))} distinct commissioning runs {above(measured)}, safety factor "
-        f"{below(factor)}",
+        f"{below(factor)}"
     )
+    S = [_triangular(S, "S") for S in parts["S"].array(steps + 1, n, n)]
+    A, widths = parts["A"].array(steps, n, n), parts["half_widths"].array(steps + 1, n)
+    widens = Fraction(0) if form == "peak" else bound
+    return Funnel(S, A, radii, widths, roots, form, bound, rate, gain, runs_and_factor, widens)
 
 
 def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
@@ -416,19 +466,6 @@ def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
     return (*assumptions, f"{near}, {below(low)} to {above(high)}")
 
 
-def _header(parts: dict[str, Node], name: str, *kinds: str) -> str:
-    """The document's kind; Rejected unless its format, version and kind are as they should be."""
-    kind = parts["kind"].text()
-    if parts["format"].text() != name or parts["version"].whole(0) != 2 or kind not in kinds:
-        raise Rejected(f"expected a {name} of version 2 and kind {' or '.join(kinds)}")
-    return kind
-
-
-def _same(node: Node, digest: str) -> None:
-    if node.text() != digest:
-        raise Mismatch(f"{node.where}: made for another one")
-
-
 def _digests(node: Node) -> list[str]:
     """The digests of recordings."""
     return [entry.members("name digest")["digest"].text() for entry in node.items()]
@@ -445,7 +482,3 @@ def _triangular(M: Matrix, what: str) -> Matrix:
     if not all(M[i][i] for i in size) or any(M[i][j] for i in size for j in range(i)):
         raise Rejected(f"{what} should be upper triangular with a nonzero diagonal")
     return M
-
-
-def _split(M: Matrix, n: int) -> tuple[Matrix, Matrix]:
-    return [row[:n] for row in M], [row[n:] for row in M]

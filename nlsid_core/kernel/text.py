@@ -1,5 +1,6 @@
 """Numbers in sentences, rounded outward: no printed bound is better than the proved one."""
 
+from decimal import MAX_EMAX, MIN_EMIN, ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from fractions import Fraction
 from math import isqrt
 
@@ -8,12 +9,12 @@ DIGITS = 4  # significant
 
 def above(value: Fraction, digits: int = DIGITS) -> str:
     """A decimal number at least `value`."""
-    return _decimal(value, digits, up=True)
+    return _decimal(value, digits, ROUND_CEILING)
 
 
 def below(value: Fraction, digits: int = DIGITS) -> str:
     """A decimal number at most `value`."""
-    return _decimal(value, digits, up=False)
+    return _decimal(value, digits, ROUND_FLOOR)
 
 
 def exact(value: Fraction) -> str:
@@ -40,28 +41,10 @@ def root_above(value: Fraction, bits: int = 64) -> Fraction:
     return Fraction(root if root * root == scaled else root + 1, 1 << (shift // 2))
 
 
-def _decimal(value: Fraction, digits: int, *, up: bool) -> str:
-    if not value:
-        return "0"
-    up_in_size = up == (value > 0)
-    size = abs(value)
-    bits = size.numerator.bit_length() - size.denominator.bit_length()
-    exponent = bits * 30103 // 100000  # near log10(size)
-    while Fraction(10) ** (exponent + 1) <= size:
-        exponent += 1
-    while Fraction(10) ** exponent > size:
-        exponent -= 1
-    unit = Fraction(10) ** (exponent - digits + 1)
-    whole = -(-size // unit) if up_in_size else size // unit
-    if whole >= 10**digits:
-        whole, exponent = whole // 10, exponent + 1
-    sign = "-" if value < 0 else ""
-    text = str(whole)
-    if -4 <= exponent < digits + 3:
-        places = digits - 1 - exponent
-        if places <= 0:
-            return sign + text + "0" * -places
-        text = text.rjust(places + 1, "0")
-        return sign + (text[:-places] + "." + text[-places:]).rstrip("0").rstrip(".")
-    mantissa = (text[0] + "." + text[1:]).rstrip("0").rstrip(".")
-    return f"{sign}{mantissa}e{exponent:+03d}"
+def _decimal(value: Fraction, digits: int, rounding: str) -> str:
+    context = Context(prec=digits, rounding=rounding, Emax=MAX_EMAX, Emin=MIN_EMIN)
+    shown = context.divide(Decimal(value.numerator), Decimal(value.denominator)).normalize()
+    exponent = shown.adjusted()
+    if not shown or -4 <= exponent < digits + 3:
+        return f"{shown:f}"
+    return f"{shown.scaleb(-exponent):f}e{exponent:+03d}"

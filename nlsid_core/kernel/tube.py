@@ -19,26 +19,17 @@ from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Mismatch, Node, Read, Rejected, bound_files
 from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
+from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
-MAX_TRIALS = 10_000
-
-
-@dataclass(frozen=True)
-class Trials:
-    """What the numbers of an assumption come from: digests, how many are parts of a recording."""
-
-    designed_on: set[str]
-    measured_on: set[str]
-    windows: int
 
 
 @dataclass(frozen=True)
 class Tube:
     """One tube of a funnel file; n states, p outputs. samples: None is for ever.
 
-    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,).
+    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,). measured_on: the trials of `measured`.
     """
 
     rho: Fraction
@@ -52,7 +43,7 @@ class Tube:
     samples: int | None
     measured: Fraction
     safety_factor: Fraction
-    trials: Trials
+    measured_on: list[Recorded]
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -84,7 +75,9 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
             left = f"{signal.name} can leave the stated half-width {text.above(width)}"
             at_most(used, 1, left)
             margin = min(margin, 1 - used)
-    fitted = _fitted(documents["model"])
+    content = documents["model"].value
+    named = type(content) is dict and "bags" in content
+    fitted = read_trials(documents["model"].member("bags")) if named else []
     assumptions = [_start(model, tubes, funnel["settling"].whole(0, MAX_SAMPLES))]
     if "box" in funnel:
         assumptions.append(_inside(model, funnel["box"]))
@@ -125,7 +118,7 @@ def _read(node: Node, model: Model) -> Tube:
         inlet=parts["inlet"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
         measured=given["measured"].number(), safety_factor=given["safety_factor"].number(),
-        trials=_trials(given["designed_on"], given["measured_on"]),
+        measured_on=read_trials(given["measured_on"]),
     )  # fmt: skip
     if not 0 < tube.rho <= 1 or (kind == "energy") != (tube.rho == 1):
         raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
@@ -133,37 +126,13 @@ def _read(node: Node, model: Model) -> Tube:
         raise Rejected("tau and half-widths should be positive")
     if min(tube.inlet, tube.measured) < 0 or tube.safety_factor < 1:
         raise Rejected("inlet and measured should be 0 or more, the safety factor 1 or more")
+    if not tube.measured_on:
+        raise Rejected("the assumption was measured on no trial")
+    if shared(tube.measured_on, read_trials(given["designed_on"])):
+        raise Rejected("a trial that the tube was designed on cannot measure its assumption")
     least = tube.safety_factor**2 * tube.measured
     at_most(least, tube.level, "the level is below safety_factor^2 x measured")
     return tube
-
-
-def _trials(designed_on: Node, measured_on: Node) -> Trials:
-    """The trials by digest; none may be in both lists, and one or more is measured on."""
-    found: list[dict[str, str]] = []
-    for node in (designed_on, measured_on):
-        entries = {}
-        for trial in node.items(0, MAX_TRIALS):
-            parts = trial.members("name digest", "recording")
-            parts["name"].text()
-            digest = parts["digest"].text()
-            entries[digest] = parts["recording"].text() if "recording" in parts else digest
-        found.append(entries)
-    designed, measured = found
-    if not measured:
-        raise Rejected("the assumption was measured on no trial")
-    if set(designed) & set(measured):
-        raise Rejected("a trial that the tube was designed on cannot measure its assumption")
-    windows = sum(recording != digest for digest, recording in measured.items())
-    return Trials(set(designed), set(measured), windows)
-
-
-def _fitted(model: Node) -> set[str]:
-    """The digests of the recordings that the model was fitted on."""
-    if type(model.value) is not dict or "bags" not in model.value:
-        return set()
-    bags = Node(model.value["bags"], f"{model.where} bags")
-    return {bag.members("name digest")["digest"].text() for bag in bags.items(0, MAX_TRIALS)}
 
 
 def _statement(model: Model, tubes: list[Tube]) -> str:
@@ -203,7 +172,7 @@ def _inside(model: Model, box: Node) -> str:
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 
 
-def _assumption(model: Model, tube: Tube, fitted: set[str]) -> str:
+def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded]) -> str:
     # One output and R = 1: V and E carry its unit squared.
     unit, energy = "", "e'Re"
     if len(model.y) == 1:
@@ -214,14 +183,5 @@ def _assumption(model: Model, tube: Tube, fitted: set[str]) -> str:
     bound = f"E <= {level} after every sample, E+ = {text.exact(tube.rho)} E + {energy} from 0"
     if tube.samples is not None:
         bound = f"sum of {energy} <= {level} over {tube.samples} samples"
-    m = len(tube.trials.measured_on)
-    known = len(tube.trials.measured_on & fitted)
-    said = f"{known} of which the model was fitted on, " if known else ""
-    if tube.trials.windows:
-        said += "windows of one recording, which are hardly exchangeable, "
-    return (
-        f"innovation energy: {bound} (largest of {m} distinct trial{'s' * (m > 1)}, {said}"
-        f"{text.above(tube.measured)}, safety factor {text.below(tube.safety_factor)} in "
-        "amplitude; a trial exchangeable with them exceeds their largest with probability "
-        f"1/{m + 1} at most)"
-    )
+    worth = calibration(tube.measured, tube.safety_factor, tube.measured_on, fitted_to)
+    return f"innovation energy: {bound} ({worth})"

@@ -147,7 +147,9 @@ class DifferenceEquation:
         files.header(document, FORMAT, source=source)
         kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+            raise DocumentError(
+                f"{source}: kind is '{kind}', expected '{KIND}', which `model: linear` identifies"
+            )
         a = files.array(document, "a", (None,), source=source)
         lo, hi = files.array(document, "u_range", (2,), source=source)
         bags = files.member(document, "bags", list, source=source)

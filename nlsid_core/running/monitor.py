@@ -19,7 +19,8 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.protocol import AnyFunnel, Funnel
 from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.models import DifferenceEquation
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.protocol import AnyPolicy, Policy
 from nlsid_core.running.comparison import (
@@ -31,12 +32,13 @@ from nlsid_core.running.comparison import (
 )
 from nlsid_core.running.grid import Grid
 from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.tubes import TubeRun
 
 OVER = "the proof covers"  # how the reason of every reading after the end begins
 INSIDE, TUBE = Status.INSIDE, Level.TUBE
 TREND = 10  # samples over which the margin's fall is taken
 
-Dynamics: TypeAlias = DifferenceEquation | MeasuredState | VectorField
+Dynamics: TypeAlias = StableModel | MeasuredState | VectorField
 
 
 class Monitor:
@@ -46,9 +48,10 @@ class Monitor:
     input applied from t on (the latest command with a stamp not after t); it may be None at the
     last sample. centre: of a linear tube. period: s between samples, of a continuous funnel only.
 
-    A run starts with the first sample, or at the stamp given to `restart`. It ends at the first
-    sample that is missing, not finite or off the grid of the start, and where the proof ends; after
-    that every reading is unknown until `restart`.
+    Tubes around a model's simulation need no policy, and are held for ever: see `TubeRun`. Of the
+    other kinds, a run starts with the first sample, or at the stamp given to `restart`. It ends at
+    the first sample that is missing, not finite or off the grid of the start, and where the proof
+    ends; after that every reading is unknown until `restart`.
 
     Raises CertificateMismatch if the parts do not belong together, DataError if the funnel cannot
     be monitored in float64.
@@ -57,7 +60,7 @@ class Monitor:
     def __init__(
         self,
         model: Dynamics,
-        policy: AnyPolicy,
+        policy: AnyPolicy | None,
         funnel: AnyFunnel,
         *,
         centre: Centre = Centre.COMMAND,
@@ -68,12 +71,12 @@ class Monitor:
     @classmethod
     def of_several(
         cls,
-        model: DifferenceEquation,
-        pairs: Sequence[tuple[AnyPolicy, AnyFunnel]],
+        model: StableModel,
+        pairs: Sequence[tuple[AnyPolicy | None, AnyFunnel]],
         *,
         centre: Centre = Centre.COMMAND,
     ) -> "Monitor":
-        """One robot against several linear tubes of its model at once; see `readings`.
+        """One robot against several linear funnels, or tubes, of its model at once; see `readings`.
 
         Ten cost little more than one.
         """
@@ -96,14 +99,15 @@ class Monitor:
             raise DataError("no stage to hold the state against")
         monitor = cls.__new__(cls)
         fields: list[Dynamics] = [field for field, _, _ in stages]
-        policies, funnels = [policy for _, policy, _ in stages], [funnel for _, _, funnel in stages]
+        policies: list[AnyPolicy | None] = [policy for _, policy, _ in stages]
+        funnels = [funnel for _, _, funnel in stages]
         monitor._hold(fields, policies, funnels, Centre.PROFILE, period)
         return monitor
 
     def _hold(
         self,
         models: list[Dynamics],
-        policies: list[AnyPolicy],
+        policies: list[AnyPolicy | None],
         funnels: list[AnyFunnel],
         centre: Centre,
         period: float | None,
@@ -111,6 +115,14 @@ class Monitor:
         for parts in zip(models, policies, funnels, strict=True):
             refuse_mismatch(*parts)
         self.funnels = tuple(funnels)
+        tubes = [funnel for funnel in funnels if isinstance(funnel, TubeFunnel)]
+        # Whether a sample that is missing is only that, and no end of the run.
+        self.goes_on = len(tubes) == len(funnels)
+        if self.goes_on:
+            model: Any = models[0]
+            self._tubes = TubeRun(model, tubes)
+            self.lags = self._tubes.lags
+            return
         self._comparison = _comparison(models, policies, funnels, centre, period)
         comparison = self._comparison
         self.lags = comparison.lags  # samples before an announced start that the observer needs
@@ -125,6 +137,9 @@ class Monitor:
         start: s, the stamp of sample 0 if it is known; otherwise the run starts with the first
         sample, and a sample that was lost before it cannot be noticed.
         """
+        if self.goes_on:
+            self._tubes.restart()
+            return
         self._grid.begin(start)
         self._comparison.restart()
         self._ended = ""
@@ -136,7 +151,12 @@ class Monitor:
         return Reading(t, Status.UNKNOWN, measured=_numbers(y), reason=reason)
 
     def missing(self, t: float, reason: str) -> Reading:
-        """End the run because the state is missing or stale at time t (s): unknown from here on."""
+        """End the run because the state is missing or stale at time t (s): unknown from here on.
+
+        Tubes around a simulation go on with the next sample.
+        """
+        if self.goes_on:
+            return self._tubes.missing(t, reason)
         self._ended = self._ended or reason
         return Reading(t, Status.UNKNOWN, reason=self._ended)
 
@@ -146,6 +166,8 @@ class Monitor:
 
     def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
         """`update` for every funnel."""
+        if self.goes_on:
+            return self._tubes.readings(t, y, u)
         comparison, grid = self._comparison, self._grid
         y, u, measured = comparison.read(y, u)
         if self._ended:
@@ -219,9 +241,15 @@ class Monitor:
         return said
 
 
-def refuse_mismatch(model: Dynamics, policy: Policy, funnel: Funnel) -> None:
+def refuse_mismatch(model: Dynamics, policy: Policy | None, funnel: Funnel | TubeFunnel) -> None:
     """CertificateMismatch if the funnel was not made for this policy, or either for this model."""
     digest = files.digest(model.document())
+    if isinstance(funnel, TubeFunnel):
+        if funnel.model != digest:
+            raise CertificateMismatch("the funnel was made for another model")
+        return
+    if policy is None:
+        raise CertificateMismatch("this kind of funnel is about a policy")
     if funnel.made_for[0] != digest or policy.made_for != digest:
         raise CertificateMismatch("policy or funnel was made for another model")
     if funnel.made_for[1] != files.digest(policy.document()):

@@ -101,6 +101,10 @@ def test_trials_to_choose_by_are_left_whole() -> None:
     assert trials.train.names == trials.test.names == data.names[1:]
     with pytest.raises(DataError, match="all of the bags are validation trials"):
         cut(data, 0.25, validation=data.names)
+    scaling = cut(data, 0.25, calibration=[name])
+    assert scaling.calibration is not None
+    assert [len(trial) for trial in scaling.calibration] == [80]
+    assert scaling.train.names == data.names[1:]
 
 
 def test_a_configuration_names_test_bags_or_a_share_but_not_both(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The chain on the shipped F1TENTH bags, through the command line, with the promised figures."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,9 @@ from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from bags.signals.signal import SignalPath
+from nlsid_core import files
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Status
 
 CONFIG = config_file("f1tenth.yaml")
@@ -59,7 +60,10 @@ def trial(name: str) -> Path:
 
 
 def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Path) -> None:
-    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    """On the trials for which they were first measured, all but the test trials."""
+    split = config.split.model_copy(update={"calibration": ()})
+    everything = config.model_copy(update={"split": split})
+    result = identify_bags(f1tenth(), everything, tmp_path, progress=lambda _w, _f: None)
     errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     assert errors["least_squares"] == pytest.approx(11.7, abs=0.05)
     assert errors["sem"] == pytest.approx(8.5, abs=0.05)
@@ -67,6 +71,18 @@ def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Pat
     assert result.fit.chosen.proof is not None
     assert set(result.test.names) == {f"trial_{k}" for k in TEST}
     assert len(result.train) == 33
+
+
+def test_errors_without_the_calibration_trials_are_as_documented(
+    config: Config, tmp_path: Path
+) -> None:
+    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
+    assert errors["least_squares"] == pytest.approx(11.52, abs=0.05)
+    assert errors["rse_first"] == pytest.approx(12.60, abs=0.05)
+    assert errors["rse"] == pytest.approx(8.00, abs=0.05)
+    assert errors["sem"] == pytest.approx(8.00, abs=0.05)
+    assert len(result.train) == 17
 
 
 def test_test_trials_do_not_influence_the_model(
@@ -82,11 +98,125 @@ def test_test_trials_do_not_influence_the_model(
 def test_the_model_names_the_bags_it_was_fitted_to(chain: Path) -> None:
     model = documents.load_model(chain / documents.MODEL)
     names = [name for name, _ in model.bags]
-    assert len(names) == 33
+    assert len(names) == 17
     assert not {f"trial_{k}" for k in TEST} & set(names)
     assert all(digest.startswith("sha256:") for _, digest in model.bags)
     train = load_training(chain / documents.TRAINING, digest=model.training)
     assert train.names == tuple(names)
+
+
+def test_the_trials_that_scale_the_tube_made_neither_model_nor_observer(
+    config: Config, chain: Path
+) -> None:
+    model = documents.load_model(chain / documents.MODEL)
+    proved = documents.load_proved_funnel(chain / documents.FUNNEL)
+    assumption = proved.design.funnel.assumption
+    assert {name for name, _ in assumption.measured_on} == set(config.split.calibration)
+    assert set(assumption.designed_on) == set(model.bags)
+    assert not {d for _, d in assumption.measured_on} & {d for _, d in model.bags}
+    assert "exceeds their largest with probability at most 1/17)" in proved.verdict.assumptions[1]
+
+
+def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path: Path) -> None:
+    out, model = str(tmp_path / "again"), str(chain / documents.MODEL)
+    made = CliRunner().invoke(
+        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", out]
+    )
+    said = " ".join(made.output.replace("│", " ").split())
+    assumption = documents.load_proved_funnel(chain / documents.FUNNEL).design.funnel.assumption
+    budget, measured = re.search(r"e\^2 <= (\S+) .* taken whole, (\S+), safety", said).groups()  # type: ignore[union-attr]
+    assert 0.999 * assumption.budget < float(budget) <= assumption.budget
+    assert assumption.measured <= float(measured) < 1.001 * assumption.measured
+    assert "probability at most 1/17" in said
+
+
+def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: Path) -> None:
+    """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
+    out = tmp_path / "copy"
+    shutil.copytree(chain, out)
+    model = str(out / documents.MODEL)
+    arguments = ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
+    made = CliRunner().invoke(app, arguments)
+    assert made.exit_code == 0, made.output
+    lines = {line[:20].strip(): line[20:].split() for line in made.output.splitlines()}
+    assert lines["untouched"] == ["0", "0", "0", "-", "0", "-", "0", "-", "0", "-"]
+    for fault in ("sensor x 0.6", "sensor x 0.8", "actuator x 0.8"):
+        assert int(lines[fault][0]) + int(lines[fault][1]) == 8
+        assert lines[fault][5] == "8", "CUSUM"
+    assert lines["5 samples lost"][:4] == ["0", "0", "8", "-"]
+    assert lines["bias, 10 % of range"][:2] == ["0", "0"]
+    assert lines["bias, 10 % of range"][4] == "8", "where CUSUM catches more the table shows it"
+    assert "0.61 of its range" in made.output
+    assert "warning: the half-width of speed, 0.236 m/s, is 0.606 of its range" in made.output
+    assert "trial_12 sets the level" in made.output
+    page = (out / documents.REPORT).read_text()
+    assert page.count("The funnel: what it can catch") == 1, "replaced, not added again"
+    cells = re.search(r"<td>sensor x 0.8</td>(.*?)</tr>", page).group(1)  # type: ignore[union-attr]
+    said = re.findall("<td>(.*?)</td>", cells)
+    assert said[:3] == lines["sensor x 0.8"][:3]
+    assert said[4] == f"8, {lines['sensor x 0.8'][6]} s"
+    assert "trial_12 sets the level" in page
+    assert (out / documents.CATCHING_PLOT).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("require", "status"), [("0.61", 0), ("0.6", 1)])
+def test_a_tube_wider_than_required_ends_with_status_1(
+    chain: Path, tmp_path: Path, require: str, status: int
+) -> None:
+    model, out = str(chain / documents.MODEL), str(tmp_path)
+    made = CliRunner().invoke(
+        app,
+        ["funnel", "--model", model, "--config", str(CONFIG), "--out", out, "--require", require],
+    )
+    assert made.exit_code == status
+    assert ("error: the half-width of speed" in made.output) == bool(status)
+    assert "warning" not in made.output
+
+
+def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
+    chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING):
+        shutil.copy(chain / name, tmp_path)
+    yaml_file = edited(tmp_path, split__calibration=[])
+    arguments = ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(yaml_file)]
+    made = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path)])
+    assert made.exit_code == 0, made.output
+    assert "what it catches is not known" in made.output
+    required = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--require", "0.9"])
+    assert required.exit_code == 2, "not measured is neither yes nor no"
+
+
+def test_a_model_of_another_class_is_named_as_configurations_name_it(
+    chain: Path, config: Config, tmp_path: Path
+) -> None:
+    model = json.loads((chain / documents.MODEL).read_text()) | {"kind": "implicit"}
+    files.write_document(tmp_path / documents.MODEL, model)
+    with pytest.raises(DataError, match=r"kind is 'implicit', expected .* `model: linear`"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+
+
+def test_a_tube_is_not_scaled_on_training_trials_where_calibration_trials_are_named(
+    config: Config, chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING):
+        shutil.copy(chain / name, tmp_path)
+    with pytest.raises(DataError, match=r"split\.calibration names bags, and held_back\.npz"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+
+
+def test_trials_held_back_from_another_model_are_refused(
+    config: Config, chain: Path, tmp_path: Path
+) -> None:
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+        shutil.copy(chain / name, tmp_path)
+    model = json.loads((tmp_path / documents.MODEL).read_text())
+    files.write_document(tmp_path / documents.MODEL, model | {"c": 0.0})
+    with pytest.raises(DataError, match="not trials held back from this model"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+    (tmp_path / documents.HELD_BACK).write_bytes(b"PK")
+    with pytest.raises(DataError, match="not trials held back"):
+        design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
 
 
 def test_check_prints_proved_for_both_proofs(chain: Path) -> None:
@@ -96,6 +226,10 @@ def test_check_prints_proved_for_both_proofs(chain: Path) -> None:
     lines = [line for line in done.output.splitlines() if not line.startswith(" ")]
     assert len(lines) == 2
     assert all(line.startswith("PROVED ") and " margin " in line for line in lines)
+    said = [line.removeprefix("PROVED ").split(": ")[0] for line in lines]
+    assert said == proofs, "of several files each is named"
+    alone = CliRunner().invoke(app, ["check", proofs[1]])
+    assert alone.output.startswith("PROVED tube: ")
 
 
 def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_path: Path) -> None:
@@ -105,17 +239,40 @@ def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_pat
     (tmp_path / documents.MODEL).write_text(text.replace('"period": 0.025', '"period": 0.026'))
     done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
     assert done.exit_code == 1
-    assert done.output.startswith("REJECTED")
+    assert done.output.startswith(f"REJECTED {tmp_path / documents.FUNNEL_PROOF}: ")
     assert "model.json is not the model this proof is about" in done.output
 
 
-def test_a_prediction_tube_needs_no_profile(chain: Path, tmp_path: Path) -> None:
-    path = edited(tmp_path, funnel__policy="none", funnel__profile=None)
-    found = design_funnel_files(chain / documents.MODEL, load_config(path), tmp_path / "out")
-    assert not found.policy.K.any()
-    replayed = replay(tmp_path / "out", trial("05"))
+def test_without_a_profile_the_tube_is_around_the_models_simulation(
+    chain: Path, tmp_path: Path
+) -> None:
+    path = edited(tmp_path, funnel={"safety_factor": 1.5})
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
+        shutil.copy(chain / name, tmp_path)
+    done = CliRunner().invoke(
+        app,
+        ["funnel", "--model", str(tmp_path / documents.MODEL), "--config", str(path),
+         "--out", str(tmp_path)],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "for ever" in done.output
+    assert not (tmp_path / documents.POLICY).exists()
+    done = CliRunner().invoke(app, ["check", str(tmp_path / documents.FUNNEL_PROOF)])
+    assert done.exit_code == 0, done.output
+    bags = [str(trial("05")), str(trial("11"))]
+    held = ["monitor", *bags, "--replay", "--funnel", str(tmp_path / documents.FUNNEL)]
+    done = CliRunner().invoke(app, held)
+    assert done.exit_code == 0, done.output
+    proved = documents.load_proved(tmp_path / documents.FUNNEL)
+    replayed = replay_bag(proved, trial("05"), centre=Centre.COMMAND)
     assert replayed.verdict == Status.INSIDE.value
-    assert len(replayed.judged) > 100
+    assert replayed.judged_span == pytest.approx(replayed.span)
+    assert replayed.span > 2.0
+    write_faulty_copy(
+        trial("05"), tmp_path / "bag", "/odom:twist.twist.linear.x", FAULTS["zero after 1 s"]
+    )
+    done = CliRunner().invoke(app, [held[0], str(tmp_path / "bag"), *held[3:]])
+    assert done.exit_code == 1, done.output
 
 
 def test_a_command_is_held_as_long_by_the_monitor_as_by_identification(
@@ -149,7 +306,7 @@ def replay(chain: Path, bag: Path) -> Replay:
 
 
 def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
-    split = config.split.model_copy(update={"test": ("trial_05", "trial_5")})
+    split = config.split.model_copy(update={"test": ("trial_05", "trial_5"), "calibration": ()})
     bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
     given = config.model_copy(update={"split": split})
     trials = read_trials(bags, given, progress=lambda _w, _f: None)
@@ -157,22 +314,23 @@ def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
 
 
 def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Path) -> None:
-    whole = replay(chain, trial("05"))
+    whole = replace(replay(chain, trial("05")), period=0.0)  # these stamps are not of one run
     waiting, inside = whole.readings[0], whole.readings[-1]
     nan = inside._replace(status=Status.UNKNOWN, reason="speed is nan at t = 2 s")
     outside = inside._replace(status=Status.OUTSIDE, reason="left")
-    past = nan._replace(reason=f"{OVER} 117 samples; they are over")
+    past = nan._replace(reason="the proof covers 117 samples; they are over")
     assert "waiting" in waiting.reason
     for readings, verdict, reason in (
         ((waiting, inside, nan, nan), Status.UNKNOWN, nan.reason),
-        ((waiting, inside, past, waiting, inside), Status.INSIDE, ""),
+        ((waiting, inside, past, past, waiting, inside), Status.UNKNOWN, past.reason),
+        ((waiting, inside, inside), Status.INSIDE, ""),
         ((waiting, nan), Status.UNKNOWN, nan.reason),
         ((waiting, outside, nan), Status.OUTSIDE, "left"),
     ):
         found = replace(whole, readings=readings)
         assert (found.verdict, found.reason) == (verdict.value, reason)
-        assert found.over is None
-    assert replace(whole, readings=(inside, past, past)).over is past
+    parts = replace(whole, readings=(waiting, inside, past, past, nan))
+    assert parts.unjudged == (past, nan)
 
 
 @pytest.mark.parametrize("name", TEST)
@@ -242,7 +400,7 @@ def test_monitor_command_ends_with_status_1_if_a_bag_is_not_inside(
 
 def test_the_report_is_one_file_with_its_pictures(chain: Path) -> None:
     page = (chain / documents.REPORT).read_text()
-    assert page.count("<svg") == 4  # trials, residuals, poles, the search
+    assert page.count("<svg") == 5  # trials, residuals, poles, the search, what the funnel catches
     assert "src=" not in page
     assert 'href="http' not in page
     assert "decided exactly" in page
@@ -255,9 +413,10 @@ def test_with_policy_none_the_funnel_is_a_prediction_tube(
     prediction = config.model_copy(
         update={"funnel": config.funnel.model_copy(update={"policy": None})}
     )
-    for name in (documents.MODEL, documents.TRAINING):
+    for name in (documents.MODEL, documents.TRAINING, documents.HELD_BACK):
         shutil.copy(chain / name, tmp_path)
     design = design_funnel_files(tmp_path / documents.MODEL, prediction, tmp_path)
+    assert design.policy is not None
     assert not design.policy.K.any()
     verdict = documents.load_proved_funnel(tmp_path / documents.FUNNEL).verdict
     assert "no feedback" in verdict.statement
@@ -280,8 +439,8 @@ def edited(tmp_path: Path, **changes: object) -> Path:
 
     content = yaml.safe_load(CONFIG.read_text())
     for dotted, value in changes.items():
-        section, key = dotted.split("__")
-        content[section][key] = value
+        section, _, key = dotted.partition("__")
+        content[section] = content[section] | {key: value} if key else value
     path = tmp_path / "config.yaml"
     path.write_text(json.dumps(content))
     return path

@@ -163,7 +163,7 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
         ({"split": {"test": ["a"], "validation": ["a"]}}, "'a' is named for test and for"),
         ({"inputs": 2}, "identification.model: a LinearClass has one response and one excitation"),
         ({"identification": {"model": "monotone", "lags": 2},
-          "funnel": {"horizon": 1.0, "policy": "none"}}, "funnel: a tube is designed for"),
+          "funnel": {"horizon": 1.0, "profile": [[0, 0], [1, 1]]}}, "a plan is tracked by"),
         ({"identification": {"model": "state_affine", "lags": 2, "input_range": [[0, 1], [0, 2]]}},
          "input_range: 2 pairs .* needs 1"),
         ({"select": {"lags": [1, 0]}}, r"select\.lags: .*\(found 0\)"),

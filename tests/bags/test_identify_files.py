@@ -336,6 +336,16 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
         split(Dataset(tuple(trials)), test=["a"], validation=["d"])
     with pytest.raises(DataError, match="all of the bags are test or validation"):
         split(Dataset(tuple(trials)), test=["a", "c"], validation=["b"])
+    kept = split(Dataset(tuple(trials)), test=["b"], calibration=["a", "no such bag"])
+    assert kept.calibration is not None
+    assert (kept.calibration.names, kept.train.names) == (("a.1", "a.2"), ("c",))
+    assert split(Dataset(tuple(trials)), test=["b"], calibration=["none"]).calibration is None
+    with pytest.raises(DataError, match="'b' is named for test and for calibration"):
+        split(Dataset(tuple(trials)), test=["b"], calibration=["b"])
+    with pytest.raises(DataError, match="'c' is named for validation and for calibration"):
+        split(Dataset(tuple(trials)), test=["b"], validation=["c"], calibration=["c"])
+    with pytest.raises(DataError, match="all of the bags are test or calibration"):
+        split(Dataset(tuple(trials)), test=["b"], calibration=["a", "c"])
 
 
 # -- models without a proof ---------------------------------------------------------------------

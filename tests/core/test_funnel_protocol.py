@@ -8,15 +8,19 @@ import pytest
 from nlsid_core import files
 from nlsid_core.design import TubeDesign
 from nlsid_core.errors import DocumentError
+from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
-from nlsid_core.funnels.protocol import AnyFunnel, Funnel, load_funnel
+from nlsid_core.funnels.protocol import Funnel, load_funnel
+from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.policies.protocol import AnyPolicy, Policy, load_policy
 from tests.continuous_stage import stage
 from tests.tracked import designed
 
 
-def pairs(linear: TubeDesign) -> list[tuple[AnyPolicy, AnyFunnel]]:
-    """One of each kind."""
+def pairs(
+    linear: TubeDesign,
+) -> list[tuple[AnyPolicy, LinearFunnel | SampledFunnel | ContinuousFunnel]]:
+    """One of each kind that has a policy."""
     sampled, (_, policy, funnel) = designed(), stage()
     return [
         (linear.policy, linear.funnel),

@@ -10,7 +10,7 @@ from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
-from nlsid_core.kernel.positivity import expanded, positive, read_basis, read_squares
+from nlsid_core.kernel.positivity import expanded, positive, read_witness
 from nlsid_core.polynomial import constant, monomials, variables
 from nlsid_core.sos import Program, SumOfSquares, solve
 from nlsid_core.sos.program import Identity
@@ -26,9 +26,8 @@ def cubic(spurious: float, bound: float = 1.5) -> ImplicitStep:
         (0, 3): Fraction(-1 / spurious**2),
         (1, 0): Fraction(-DECAY),
     }
-    z, w = ring.variable(0), ring.variable(1)
-    size = ring.times(z, z)
-    return ImplicitStep(ring, [w], [closed_loop.polynomial(h, ring)], size, 1.0, bound)
+    z, w = ring.variables
+    return ImplicitStep(ring, [w], [closed_loop.polynomial(h, ring)], z * z, 1.0, bound)
 
 
 def farthest_root_within(spurious: float, bound: float) -> float:
@@ -75,20 +74,15 @@ def prove(level: float, spurious: float, identity: Identity) -> None:
     at = [inner.tolist().index(row) for row in found.basis.tolist()]
     sigma[np.ix_(at, at)] = found.Q
     stated, _ = closed_loop.stated_multiplier(inner, sigma, scale, ring)
-    read = read_basis(Node(inner.tolist(), "inner"), Node(stated["columns"], "columns"), ring)
-    multiplier = expanded(read_squares(Node(stated["squares"], "squares"), read), ring)
+    stated["basis"] = inner.tolist()
+    multiplier = expanded(read_witness(Node(stated, "multiplier"), ring), ring)
     nu = {tuple(e): Fraction(float(c)) for e, c in identity.equality_multipliers[0].terms()}
-    parts = [
-        ring.constant(Fraction(level)),
-        ring.scaled(ring.times(ring.variable(1), ring.variable(1)), -1),
-        ring.scaled(ring.times(closed_loop.polynomial(nu, ring), step.h[0]), -1),
-        ring.times(multiplier, ring.minus(step.size, ring.constant(1))),
-    ]
-    basis = identity.gram.basis
-    c = ring.sum(parts)
+    basis, w = identity.gram.basis, ring.variables[1]
+    c = Fraction(level) - w * w - closed_loop.polynomial(nu, ring) * step.h[0]
+    c += multiplier * (step.size - 1)
     squares = closed_loop.stated_squares(c, basis, identity.gram.Q, scale, ring)
-    read = read_basis(Node(basis.tolist(), "basis"), Node(squares["columns"], "columns"), ring)
-    positive(c, read_squares(Node(squares["squares"], "squares"), read), ring, "reach")
+    squares["basis"] = basis.tolist()
+    positive(c, read_witness(Node(squares, "reach"), ring), ring, "reach")
 
 
 def test_a_bound_that_lets_the_spurious_roots_in_does_not_prove_the_small_reach() -> None:

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, ShapeError, SolverError
-from nlsid_core.identification import LinearClass, identify, prove_stability
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.identification import CertifiedSem, LinearClass, identify, prove_stability
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.linear import (
@@ -23,8 +24,9 @@ from nlsid_core.identification.newton import minimise
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import Bound, robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
+from nlsid_core.identification.starts import reduced_poles, reflected
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
-from nlsid_core.identification.validation import simulation_percent
+from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
@@ -247,13 +249,74 @@ def test_the_identification_error_has_no_weights() -> None:
         robust_identification_error(weighted)
 
 
-def test_a_start_whose_simulation_overflows_is_refused_with_a_reason() -> None:
-    """An unstable model over a long trial: its derivatives are no numbers."""
-    rng = np.random.default_rng(0)
-    u = rng.standard_normal(4000)
-    y = np.cumsum(u) * 1e-3
-    data = Dataset((Trajectory(t=0.01 * np.arange(4000.0), y=y, u=u, name="long"),))
-    regression = build_regression(data, 2)
-    start = replace(least_squares(regression), a=np.array([1.9, -0.7]))
-    with pytest.raises(SolverError, match=r"grows beyond all numbers|J is infinite"):
-        minimise_simulation_error(regression, start)
+def two_resonances(seed: int, *, noise: float) -> Dataset:
+    """1024 samples at 500 Hz of two lightly damped modes under steps, as of a flexible arm."""
+    rng = np.random.default_rng(seed)
+    poles = [r * np.exp(s * 1j * a) for r, a in ((0.995, 0.06), (0.98, 0.6)) for s in (1, -1)]
+    b = np.concatenate([[0.0], 0.1 * rng.normal(size=4)])
+    u = np.repeat(rng.normal(size=128), 8)
+    y = lfilter(b, np.poly(poles).real, u)
+    y += noise * np.std(y) * rng.normal(size=len(u))
+    return Dataset((Trajectory(t=np.arange(len(u)) * 0.002, y=y, u=u, name="arm"),))
+
+
+@pytest.mark.parametrize(
+    ("seed", "noise", "lags", "stuck", "reached"),
+    [
+        (3, 0.02, 2, 90.0, 6.5),
+        (4, 0.1, 2, 90.0, 18.0),
+        (8, 0.1, 2, 35.0, 18.0),
+        (1, 0.1, 4, 20.0, 18.0),
+    ],
+)
+def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_minimum(
+    seed: int, noise: float, lags: int, stuck: float, reached: float
+) -> None:
+    data = two_resonances(seed, noise=noise)
+    regression = build_regression(data, lags)
+    *_, last = robust_simulation_error(regression.rows)
+    assert simulation_percent(regression.model(last.theta, last.p), data) > stuck
+    fit = identify(data, LinearClass(lags), method=CertifiedSem())
+    errors = fit.errors["train"]
+    assert errors["rse"] < reached
+    assert errors["sem_certified"] <= errors["sem"] * (1 + 1e-3) < reached
+    assert errors["sem_certified"] <= errors["rse"] * (1 + 1e-9)
+    assert all(candidate.proof is not None for candidate in fit.candidates)
+
+
+def test_reflected_poles_are_inside_and_the_others_stay() -> None:
+    theta = np.poly([0.9, 1.25, -2.0, 0.5]).real
+    assert np.sort(np.roots(reflected(theta)).real) == pytest.approx([-0.5, 0.5, 0.8, 0.9])
+    on_the_circle = reflected(np.poly([1.0, 0.0, 0.0]).real)
+    assert np.max(np.abs(np.roots(on_the_circle))) < 1.0
+    assert len(on_the_circle) == 4
+
+
+def test_a_longer_model_is_reduced_to_the_poles_it_has() -> None:
+    """Extra poles that zeros cancel do not show in the impulse response."""
+    data = two_resonances(0, noise=0.0)
+    short = least_squares(build_regression(data, 4))
+    extra = np.poly([0.7, -0.6]).real
+    a = -np.convolve(np.concatenate([[1.0], -short.a]), extra)[1:]
+    longer = replace(short, a=a, b=np.convolve(short.b, extra))
+    poles = reduced_poles(longer, 4)
+    assert np.sort_complex(poles) == pytest.approx(
+        np.sort_complex(np.roots(np.concatenate([[1.0], -short.a]))), abs=1e-6
+    )
+
+
+def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
+    stacked = problem(model_class=StateAffineClass(1, input_range=((-0.5, 0.5),)))
+    *_, last = robust_simulation_error(stacked.rows, iterations=3)
+    model = stacked.model(last.theta, last.p)
+    scores = validate(model, stacked.dataset)
+    u = np.concatenate([trial.u for trial in stacked.dataset])
+    assert scores.clipped_percent > 1
+    assert scores.clipped_percent == pytest.approx(100 * np.mean(np.abs(u) > 0.5))
+    assert "which the model clips" in str(scores)
+    ((_, rms, _),) = scores.output_rms
+    left = [
+        (model.simulate(trial.u, trial.y[: len(model)]) - trial.y)[len(model) :]
+        for trial in stacked.dataset
+    ]
+    assert rms == pytest.approx(np.sqrt(np.mean(np.square(np.concatenate(left)))))

@@ -1,7 +1,6 @@
 """Float Gram matrices become whole numbers that the kernel accepts, and rebuilds exactly."""
 
 from fractions import Fraction
-from math import comb
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
-from nlsid_core.kernel.polynomials import Polynomial as Exact
 from nlsid_core.kernel.polynomials import Ring, Work, at_width
-from nlsid_core.kernel.positivity import positive, read_basis, read_squares
+from nlsid_core.kernel.positivity import positive, read_witness
 from nlsid_core.polynomial import monomials
 from nlsid_core.sos.witness import exact_witness, expanded, multiplier, witness
 
@@ -24,29 +22,8 @@ def decide(c: Coefficients, squares: Any, *, strict: bool = True) -> None:
     count = len(squares["basis"][0])
 
     def build(ring: Ring) -> None:
-        parts: list[Exact] = []
-        for exponents, control in c.items():
-            J = len(control) - 1
-            powers = [
-                sum(
-                    (
-                        Fraction((-1) ** (k - j) * comb(J, k) * comb(k, j)) * control[j]
-                        for j in range(k + 1)
-                    ),
-                    Fraction(0),
-                )
-                for k in range(J + 1)
-            ]
-            x = Exact({ring.key(exponents): 1}, 1, sum(exponents), 0, 1)
-            parts.append(ring.times(ring.in_s(powers), x))
-        basis = read_basis(Node(squares["basis"], "basis"), Node(squares["columns"], "c"), ring)
-        positive(
-            ring.sum(parts),
-            read_squares(Node(squares["squares"], "squares"), basis),
-            ring,
-            "c",
-            strict=strict,
-        )
+        parts = [ring.bernstein(control) * ring.monomial(e) for e, control in c.items()]
+        positive(ring.sum(parts), read_witness(Node(squares, "c"), ring), ring, "c", strict=strict)
 
     at_width(count, Work(), build)
 

@@ -12,7 +12,7 @@ from nlsid_core.design.sampled import closed_loop
 from nlsid_core.design.sampled.implicit_step import ImplicitStep
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.states import identify_states
-from nlsid_core.kernel.sampled_steps import Sample, implicit_step, square
+from nlsid_core.kernel.sampled_funnel import Sample, implicit_step
 from nlsid_core.models.measured_state import read_measured_state
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from tests.implicit_pendulum import EXPONENTS, PERIOD, PHYSICS, truth
@@ -124,7 +124,8 @@ def test_the_proved_reach_of_an_implicit_step_bounds_the_models_own_steps() -> N
     rows, h = implicit_step(
         closed_loop.map_of(model), at, T, [[Fraction(3)]], Fraction(PERIOD), ring
     )
-    ball = square([ring.variable(0), ring.variable(1)], ring)
+    z0, z1, _ = ring.variables
+    ball = z0 * z0 + z1 * z1
     step = ImplicitStep(ring, rows, h, ball, 1.0, 1.0)
     reach = step.reach()
     rng = np.random.default_rng(0)

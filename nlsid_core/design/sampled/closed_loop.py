@@ -15,8 +15,9 @@ from numpy.typing import ArrayLike
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.kernel import text
+from nlsid_core.kernel.files import Terms
 from nlsid_core.kernel.polynomials import Polynomial, Ring, Work
-from nlsid_core.kernel.sampled_steps import Map, Sample
+from nlsid_core.kernel.sampled_funnel import Sample
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.sos.witness import expanded, multiplier, witness
@@ -56,10 +57,10 @@ def floats(M: Sequence[Sequence[Fraction]]) -> FloatArray:
     return np.array([[float(entry) for entry in row] for row in M])
 
 
-def map_of(model: MeasuredState) -> Map:
+def map_of(model: MeasuredState) -> list[Terms]:
     """The model's map, exactly."""
     exponents = [tuple(row) for row in model.exponents.tolist()]
-    return Map(exponents, exact(model.coefficients))
+    return [list(zip(exponents, column, strict=True)) for column in exact(model.coefficients.T)]
 
 
 def ring_of(variables: int) -> Ring:
@@ -96,7 +97,7 @@ def norm_bound(M: Sequence[Sequence[Fraction]]) -> float:
 
 
 def curvature_bounds(p: Sequence[Polynomial], ring: Ring, least: int) -> list[float]:
-    """γ_m of the parts of degree m = least, least + 1, … of p; see the kernel's `sampled_steps`."""
+    """γ_m of the parts of degree m = least, least + 1, … of p; as in the kernel."""
     columns: dict[int, list[list[float]]] = {}
     rows = [terms(q, ring) for q in p]
     for e in set().union(*rows):
@@ -133,11 +134,7 @@ def stated_squares(
 
 def polynomial(values: Mapping[tuple[int, ...], Fraction], ring: Ring) -> Polynomial:
     """The kernel's polynomial with these coefficients."""
-    parts = [
-        ring.scaled(Polynomial({ring.key(e): 1}, 1, sum(e), 0, 1), value)
-        for e, value in values.items()
-    ]
-    return ring.sum(parts)
+    return ring.weighted([(value, ring.monomial(e)) for e, value in values.items()])
 
 
 def half_widths(S: FloatArray, radius: FloatArray, widens: float) -> FloatArray:

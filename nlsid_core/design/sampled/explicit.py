@@ -12,7 +12,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.kernel.exact import Matrix, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
-from nlsid_core.kernel.sampled_steps import explicit_step, mapped, square
+from nlsid_core.kernel.sampled_funnel import explicit_step
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.policies.sampled import SampledPolicy
 
@@ -47,17 +47,18 @@ class ExplicitStep:
         n, sample, T = len(model), norms.sample(policy, k), closed_loop.exact(norms.T[k])
         ring = closed_loop.ring_of(n)
         rows = explicit_step(closed_loop.map_of(model), sample, T, ring)
-        z = [ring.variable(i) for i in range(n)]
         ST: Matrix = product(sample.S, T)
+        scaled = ring.product(ST, ring.variables)
         moved = rows
         if assumption.form == "response":
-            carried = mapped(product(sample.S_next, product(sample.A, T)), z, ring)
-            moved = [ring.minus(p, q) for p, q in zip(rows, carried, strict=True)]
+            unit = product(sample.S_next, product(sample.A, T))
+            carried = ring.product(unit, ring.variables)
+            moved = [p - q for p, q in zip(rows, carried, strict=True)]
         return cls(
             T=norms.T[k],
             ring=ring,
             rows=rows,
-            size=square(mapped(ST, z, ring), ring),
+            size=ring.dot(scaled, scaled),
             degree=max(1, int(np.max(model.exponents.sum(axis=1)))),
             kappa=closed_loop.inverse_bound(ST),
             curvature=closed_loop.curvature_bounds(moved, ring, 1),

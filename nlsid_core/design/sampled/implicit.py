@@ -14,7 +14,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.sampled import DisturbanceAssumption
 from nlsid_core.kernel.exact import Matrix, combined, product
 from nlsid_core.kernel.polynomials import Polynomial, Ring
-from nlsid_core.kernel.sampled_steps import implicit_step, linear_part, mapped, square
+from nlsid_core.kernel.sampled_funnel import implicit_step, linear_part
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.sampled import SampledPolicy
 
@@ -175,12 +175,12 @@ def _loop(
     rows, h = implicit_step(
         closed_loop.map_of(model), sample, T, after, Fraction(model.period), ring
     )
-    z = [ring.variable(i) for i in range(n)]
     ST = product(sample.S, T)
+    scaled = ring.product(ST, ring.variables[:n])
     unit = product(sample.S_next, product(sample.A, T))
     slope = closed_loop.floats([row[n:] for row in linear_part(h, ring)])
     inverse = np.linalg.inv(slope)
-    normal = mapped(closed_loop.exact(inverse), h, ring)
+    normal = ring.product(closed_loop.exact(inverse), h)
     parts = linear_part(normal, ring)
     B: Matrix = [row[:n] for row in parts]
     C = [[c - (i == j) for j, c in enumerate(row[n:])] for i, row in enumerate(parts)]
@@ -192,7 +192,7 @@ def _loop(
         ring=ring,
         rows=rows,
         h=h,
-        size=square(mapped(ST, z, ring), ring),
+        size=ring.dot(scaled, scaled),
         T_next=T_next,
         kappa=closed_loop.inverse_bound(ST),
         kappa_next=closed_loop.inverse_bound(product(S_rates, after)),

@@ -20,8 +20,7 @@ from nlsid_core.kernel import Rejected
 from nlsid_core.kernel.files import Node
 from nlsid_core.kernel.polynomials import Polynomial as Exact
 from nlsid_core.kernel.polynomials import Ring
-from nlsid_core.kernel.positivity import positive, read_basis, read_squares
-from nlsid_core.kernel.sampled_steps import square
+from nlsid_core.kernel.positivity import positive, read_squares
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.sos import Program, SumOfSquares, solve
 from nlsid_core.sos.program import Identity
@@ -125,17 +124,16 @@ class ImplicitStep:
         Raises Infeasible if the identity leaves no room for its rounding.
         """
         ring, bases, parts = self.ring, self.bases(), []
-        w = [ring.variable(i) for i in range(self.states, ring.count)]
-        balls = (("ball", self.radius, self.size), ("roots", self.far, square(w, ring)))
+        w = ring.variables[self.states :]
+        balls = (("ball", self.radius, self.size), ("roots", self.far, ring.dot(w, w)))
         entry: Json = {"reach": bound}
         for (name, radius, size), gram in zip(balls, identity.multipliers, strict=True):
             basis = bases[f"{name}_basis"]
             Q = (unit / radius) ** 2 * _full(positive_semidefinite(gram), basis)
             entry[name], sigma = closed_loop.stated_multiplier(basis, Q, self.scale, ring)
-            rest = ring.sum([size, ring.constant(-(Fraction(radius) ** 2))])
-            parts.append(ring.times(sigma, rest))
+            parts.append(sigma * (size - Fraction(radius) ** 2))
         entry["equations"], multiplied = self._equations(identity, unit, sizes)
-        parts += [ring.constant(Fraction(bound) ** 2), ring.scaled(square(self.rows, ring), -1)]
+        parts.append(Fraction(bound) ** 2 - ring.dot(self.rows, self.rows))
         c = ring.sum(parts + multiplied)
         Q = unit**2 * _full(identity.gram, bases["basis"])
         entry |= closed_loop.stated_squares(c, bases["basis"], Q, self.scale, ring)
@@ -162,15 +160,15 @@ class ImplicitStep:
                 tuple(e): -entry * Fraction(2) ** int(shift)
                 for e, entry, shift in zip(basis.tolist(), row, columns, strict=True)
             }
-            products.append(self.ring.times(closed_loop.polynomial(terms, self.ring), h))
+            products.append(closed_loop.polynomial(terms, self.ring) * h)
         return {"columns": columns.tolist(), "rows": rows.tolist()}, products
 
     def _judge(self, c: Exact, entry: Json) -> None:
         """Raise Infeasible unless the kernel finds c >= 0 by the entry's squares."""
-        basis = Node(self.bases()["basis"].tolist(), "basis")
+        stated = {**entry, "basis": self.bases()["basis"].tolist()}
+        parts = {name: Node(stated[name], name) for name in ("basis", "columns", "squares")}
         try:
-            read = read_basis(basis, Node(entry["columns"], "columns"), self.ring)
-            squares = read_squares(Node(entry["squares"], "squares"), read)
+            squares = read_squares(parts, self.ring)
             positive(c, squares, self.ring, "reach", strict=False)
         except (Rejected, CertificateRejected) as refusal:
             raise Infeasible(str(refusal)) from refusal

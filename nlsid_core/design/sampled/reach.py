@@ -18,7 +18,6 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design.sampled import closed_loop
 from nlsid_core.kernel.polynomials import Polynomial as Exact
 from nlsid_core.kernel.polynomials import Ring
-from nlsid_core.kernel.sampled_steps import square
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.sos import Compiled, Program, SumOfSquares, compile_program, template
 
@@ -42,13 +41,7 @@ class Reach:
         scale = [self.radius] * n
         ball, sigma = closed_loop.stated_multiplier(inner, self.sigma / self.radius**2, scale, ring)
         b, s = closed_loop.exact([self.bound, self.radius])
-        c = ring.sum(
-            [
-                ring.constant(b**2),
-                ring.scaled(square(rows, ring), -1),
-                ring.times(sigma, ring.sum([size, ring.constant(-(s**2))])),
-            ]
-        )
+        c = b**2 - ring.dot(rows, rows) + sigma * (size - s**2)
         squares = closed_loop.stated_squares(c, basis, self.Q, scale, ring)
         return {"reach": self.bound, **squares, "ball": ball}
 

@@ -20,7 +20,12 @@ import numpy as np
 from nlsid_core import files, kernel
 from nlsid_core.arrays import Json
 from nlsid_core.kernel import Rejected
-from tests.core.kernel import oracle_polynomial, oracle_stability, oracle_tube
+from tests.core.kernel import (
+    oracle_composition,
+    oracle_polynomial,
+    oracle_stability,
+    oracle_tube,
+)
 
 CORPUS = Path(__file__).parent / "corpus"
 PROOF = "claim.proof.json"
@@ -31,6 +36,7 @@ ORACLES: dict[str, Callable[[Json, Mapping[str, Json]], bool]] = {
     "stable_set": oracle_polynomial.agrees,
     "stability": oracle_stability.agrees,
     "tube": oracle_tube.agrees,
+    "funnel_composition": oracle_composition.agrees,
 }
 WILD: tuple[Any, ...] = (
     0, -0.0, 1, -1, 1e-300, 5e-324, 1e300, 1.7976931348623157e308, 2**53, 1e-12, True, None, "1/3",
@@ -57,10 +63,8 @@ def corpus() -> tuple[Case, ...]:
     cases = []
     for path in sorted(CORPUS.glob(f"*/*/{PROOF}")):
         document = files.load_document(path)
-        about = {
-            binding["file"]: files.load_document(path.parent / binding["file"])
-            for binding in document["claim"]["about"].values()
-        }
+        others = sorted(set(path.parent.glob("*.json")) - {path})
+        about = {other.name: files.load_document(other) for other in others}
         cases.append(Case(path.parent.parent.name, path.parent.name, document, about))
     return tuple(cases)
 
@@ -87,20 +91,24 @@ def mutant(case: Case, rng: np.random.Generator) -> Case:
         _change(parts[rng.integers(len(parts))], rng)
         if case.kind in ORACLES and rng.random() < 0.05:
             _exchange_files(forged, rng)
-    _bind_again(forged)
+    bind_again(forged)
     return forged
 
 
-def _bind_again(forged: Case) -> None:
-    """The digests inside policy and funnel, then those of the claim, as an adversary would."""
-    inside = [("policy.json", "model"), ("funnel.json", "model"), ("funnel.json", "policy")]
-    for name, role in inside if forged.kind == "tube" else []:
-        with contextlib.suppress(ValueError, TypeError, KeyError):
-            forged.about[name][role] = files.digest(forged.about[f"{role}.json"])
-    bindings = forged.document["claim"].get("about")
-    for binding in bindings.values() if isinstance(bindings, dict) else ():
-        if isinstance(binding, dict) and binding.get("file") in forged.about:
-            with contextlib.suppress(ValueError, TypeError):
+def bind_again(forged: Case) -> None:
+    """The digests inside policies and funnels, then those of the claims, as an adversary would."""
+    prefixes = {name.removesuffix("funnel.json") for name in forged.about if "funnel" in name}
+    for prefix in sorted(prefixes) if forged.kind in ("tube", "funnel_composition") else []:
+        of = "vector_field" if f"{prefix}vector_field.json" in forged.about else "model"
+        for name, role in (("policy", of), ("funnel", of), ("funnel", "policy")):
+            with contextlib.suppress(ValueError, TypeError, KeyError):
+                document = forged.about[f"{prefix}{name}.json"]
+                document[role] = files.digest(forged.about[f"{prefix}{role}.json"])
+    for document in (*forged.about.values(), forged.document):
+        claim = document.get("claim")
+        bindings = claim.get("about") if isinstance(claim, dict) else None
+        for binding in bindings.values() if isinstance(bindings, dict) else ():
+            with contextlib.suppress(ValueError, TypeError, KeyError):
                 binding["digest"] = files.digest(forged.about[binding["file"]])
 
 

@@ -70,7 +70,11 @@ def is_proved(documents: Json, slack: float) -> bool:
         return False
     if min(inlet, budget, measured) < 0 or factor < 1 or budget < factor**2 * measured:
         return False
-    if not given["measured_on"]:
+    if not given["measured_on"] or any(
+        overlap(span(a["digest"]), span(b["digest"]))
+        for a in given["measured_on"]
+        for b in given["designed_on"]
+    ):
         return False
     A, B, f, _, _ = parts(model)
     q = Fraction(0)
@@ -82,6 +86,21 @@ def is_proved(documents: Json, slack: float) -> bool:
         q += len(u) * V(P, d)
     s = inlet + budget
     return level - s - q >= 0 and (level - s - q) ** 2 >= 4 * s * q
+
+
+def span(digest: str) -> tuple[str, float, float]:
+    """The recording of a trial, its first sample and the one after its last."""
+    recording, _, window = digest.partition("[")
+    if "[" not in digest:
+        return recording, 0, float("inf")
+    first, end = window.removesuffix("]").split(":")
+    if not window.endswith("]") or not int(first) < int(end) < 10**12:
+        raise ValueError(digest)
+    return recording, int(first), int(end)
+
+
+def overlap(a: tuple[str, float, float], b: tuple[str, float, float]) -> bool:
+    return a[0] == b[0] and max(a[1], b[1]) < min(a[2], b[2])
 
 
 def between(left: list[Fraction], P: Rows, right: list[Fraction]) -> Fraction:

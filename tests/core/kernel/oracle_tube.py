@@ -240,8 +240,11 @@ def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
             return False
         if inlet < 0 or measured < 0 or factor < 1 or level < factor**2 * measured:
             return False
-        before, on = ({t["digest"] for t in given[k]} for k in ("designed_on", "measured_on"))
-        if not on or before & on:
+        before, on = (
+            [oracle_driven_tube.span(t["digest"]) for t in given[k]]
+            for k in ("designed_on", "measured_on")
+        )
+        if not on or any(oracle_driven_tube.overlap(a, b) for a, b in product(before, on)):
             return False
         if not holds(F, H, m, tube, tree, (box, ray, hull)):
             return False

@@ -68,8 +68,9 @@ def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) 
         f"the observer starts with V = xbar'P xbar <= {down(funnel['inlet'])} (m/s)^2, xbar its "
         "state minus the trajectory's",
         f"innovation energy: sum of e^2 <= {down(assumption['budget'])} (m/s)^2 over {samples} "
-        f"samples (largest of {len(assumption['measured_on'])} distinct trials "
-        f"{up(assumption['measured'])}, safety factor 1.5 in amplitude)",
+        f"samples (largest of {len(assumption['measured_on'])} distinct trials, each taken whole, "
+        f"{up(assumption['measured'])}, safety factor 1.5 in amplitude; no probability is "
+        "stated of a next trial, as the model was fitted to 3 of them)",
     )
     assert verdict.margin == 5e-6
 
@@ -119,9 +120,78 @@ def test_repeated_trials_count_once_and_no_trial_measures_nothing(
     once = documents["funnel"]["assumption"]["measured_on"][0]
     again = {"name": "the same under another name", "digest": once["digest"]}
     documents["funnel"] = assuming(documents["funnel"], measured_on=[once, again, once])
-    assert "largest of 1 distinct trial " in decide(documents).assumptions[1]
+    assert "largest of 1 distinct trial, " in decide(documents).assumptions[1]
     documents["funnel"] = assuming(documents["funnel"], measured_on=[])
     with pytest.raises(CertificateRejected, match="measured on no trial"):
+        decide(documents)
+
+
+def trials(*digests: str) -> list[Json]:
+    return [{"name": f"trial {i}", "digest": digest} for i, digest in enumerate(digests)]
+
+
+def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
+    return bound(documents | {"model": documents["model"] | {"bags": trials(*digests)}})
+
+
+@pytest.mark.parametrize(
+    ("measured_on", "fitted", "said"),
+    [
+        (("a", "b", "c"), ("d",), "exceeds their largest with probability at most 1/4)"),
+        (("a", "a", "b", "b"), ("d",), "exceeds their largest with probability at most 1/3)"),
+        (("a", "b", "c"), ("b", "a", "d", "b"), "as the model was fitted to 2 of them)"),
+        (("a", "b"), ("b[3:4]",), "as the model was fitted to 1 of them)"),
+        (("a[0:9]", "b"), (), "as windows of one recording are hardly exchangeable)"),
+    ],
+)
+def test_a_probability_is_stated_only_of_trials_that_made_nothing(
+    documents: dict[str, Json], measured_on: tuple[str, ...], fitted: tuple[str, ...], said: str
+) -> None:
+    changed = assuming(
+        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials("e", "a[9:10]")
+        if measured_on[0] == "a[0:9]" else trials("e"),
+    )  # fmt: skip
+    verdict = decide(fitted_to(documents | {"funnel": changed}, *fitted))
+    assert verdict.assumptions[1].endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("measured_on", "designed_on", "allowed"),
+    [
+        (("a", "b"), ("c", "d"), True),
+        (("a", "b"), ("c", "b"), False),
+        (("a",), ("a[5:6]",), False),
+        (("a[5:6]",), ("b", "a"), False),
+        (("a[0:10]",), ("a[10:20]", "a[30:31]"), True),
+        (("a[10:20]",), ("a[0:11]", "a[2:3]"), False),
+        (("a[10:20]",), ("a[0:30]", "a[1:2]", "a[3:5]"), False),
+        (("a[10:20]", "a[40:50]"), ("a[49:60]",), False),
+    ],
+)
+def test_no_sample_designs_a_tube_and_scales_it(
+    documents: dict[str, Json],
+    measured_on: tuple[str, ...],
+    designed_on: tuple[str, ...],
+    allowed: bool,
+) -> None:
+    changed = assuming(
+        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials(*designed_on)
+    )
+    documents["funnel"] = changed
+    assert oracle.is_proved(documents, 5e-6) is allowed
+    if allowed:
+        decide(documents)
+    else:
+        with pytest.raises(CertificateRejected, match="also designed the tube"):
+            decide(documents)
+
+
+@pytest.mark.parametrize("window", ["[", "[]", "[1:1]", "[2:1]", "[-1:2]", "[0:1", "[0:1]x",
+                                    "[0:9999999999999]", "[0:1000000000000]x",
+                                    "[٠:١]"])  # fmt: skip
+def test_a_window_that_is_none_is_rejected(documents: dict[str, Json], window: str) -> None:
+    documents["funnel"] = assuming(documents["funnel"], measured_on=trials("a" + window))
+    with pytest.raises(CertificateRejected, match="a window should be"):
         decide(documents)
 
 

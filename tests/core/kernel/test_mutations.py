@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from tests.core.kernel import mutations
+from tests.core.kernel import mutations, oracle_composition
 from tests.core.kernel.mutations import CORPUS, ORACLES, PROOF, Case, corpus
 
 CASES = pytest.mark.parametrize("case", corpus(), ids=lambda case: f"{case.kind}/{case.name}")
@@ -36,6 +36,47 @@ def test_a_false_neighbour_is_refused(name: str) -> None:
     forged.document["claim"][member] = value
     assert mutations.decide(forged) == "rejected"
     assert not ORACLES[forged.kind](forged.document, forged.about)
+
+
+def composed() -> Case:
+    return next(case for case in corpus() if case.kind == "funnel_composition").copied()
+
+
+def bound_again(forged: Case) -> str:
+    """What the kernel decides of it, all digests fresh."""
+    mutations.bind_again(forged)
+    return mutations.decide(forged)
+
+
+@pytest.mark.parametrize("share", [0.95, 0.985, 0.989, 1.0])
+def test_a_stage_that_starts_narrower_than_the_one_before_ends_is_refused(share: float) -> None:
+    """Stage 1 ends at 0.9901 of where stage 2 starts: below that its ends are outside."""
+    forged = composed()
+    before, after = (forged.about[f"stage{i}.funnel.json"] for i in (1, 2))
+    after["rho"][0] *= share
+    is_true = oracle_composition.worst_step(before, after) <= 1
+    assert is_true == (share == 1.0)
+    assert bound_again(forged) == ("proved" if is_true else "rejected")
+    assert ORACLES[forged.kind](forged.document, forged.about) == is_true
+
+
+@pytest.mark.parametrize("when", [0.25 - 2.0**-54, 0.25 + 2.0**-54])
+def test_stages_meet_at_one_time_exactly(when: float) -> None:
+    forged = composed()
+    for name in ("stage2.funnel.json", "stage2.policy.json"):
+        forged.about[name]["t"][0] = when
+    assert bound_again(forged) == "rejected"
+    assert not ORACLES[forged.kind](forged.document, forged.about)
+
+
+@pytest.mark.parametrize("multiplier", [-1.0, 0.0, 0.99, 0.9902, 1.0, 1.0000001])
+def test_the_multiplier_of_a_step_is_decided_as_the_page_says(multiplier: float) -> None:
+    """Around one centre λP/ρ - Q/σ >= 0 and 1 - λ >= 0: λ from 0.99010 to 1."""
+    forged = composed()
+    forged.document["proof"]["multipliers"] = [multiplier]
+    is_proved = 0.9901 < multiplier <= 1.0
+    assert bound_again(forged) == ("proved" if is_proved else "rejected")
+    assert ORACLES[forged.kind](forged.document, forged.about) == is_proved
 
 
 def test_no_mutant_is_wrongly_proved() -> None:

@@ -21,16 +21,16 @@ def decide(c: Claim, witness: Any, how: Any = positive, **options: Any) -> Any:
     found: list[Any] = []
 
     def build(ring: Ring) -> None:
-        x = [ring.variable(i) for i in range(ring.count)]
         parts: list[Polynomial] = []
-        for power, p in enumerate(c):
-            in_s = ring.in_s([Fraction(0)] * power + [Fraction(1)])
+        power = ring.made(1)
+        for p in c:
             for exponents, value in p.terms.items():
-                term = ring.scaled(in_s, value)
-                for variable, e in zip(x, exponents, strict=True):
+                term = value * power
+                for variable, e in zip(ring.variables, exponents, strict=True):
                     for _ in range(e):
-                        term = ring.times(term, variable)
+                        term = term * variable
                 parts.append(term)
+            power = power * ring.bernstein([Fraction(0), Fraction(1)])
         squares = read_witness(Node(witness, "witness"), ring)
         found.append(how(ring.sum(parts), squares, ring, "c", **options))
 

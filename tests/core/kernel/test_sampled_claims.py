@@ -262,7 +262,7 @@ def test_repeated_monomials_are_refused() -> None:
 def test_a_policy_that_the_funnel_was_not_made_for_is_a_mismatch() -> None:
     claim = true_claim()
     other = claim.documents()["policy"] | {"law": "another"}
-    with pytest.raises(CertificateMismatch, match="funnel policy: made for another"):
+    with pytest.raises(CertificateMismatch, match="the funnel was made for another policy"):
         claim.decide(policy=other)
 
 

@@ -1,0 +1,189 @@
+"""Tolerances for what already watches robots, each from a proved claim: YAML files and a table.
+
+A proved half-width bounds how far an output is from what a claim is about. So a check with at least
+this tolerance, on the same difference, does not stop a robot that keeps what the claim assumes.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+from nlsid_core import designs, files
+from nlsid_core.errors import DataError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.kernel import Verdict, text
+from nlsid_core.models.signal import Signal
+
+CONTROLLER, VALIDATOR, TABLE = (
+    "joint_trajectory_controller.yaml",
+    "validator.yaml",
+    "tolerances.txt",
+)
+POSITIONS, VELOCITIES = ("rad", "m"), ("rad/s", "m/s")
+NAMED = re.compile(r"\[name=([^\]]+)\]")  # an element of a message that is found by its name
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Of one signal: path, the most at any sample of the claim; goal, the most at its last sample.
+
+    Both in the signal's unit, as decimal numbers rounded up. Raises DataError if one is 0, which
+    readers of these files take for "not checked".
+    """
+
+    signal: Signal
+    path: str
+    goal: str
+
+    def __post_init__(self) -> None:
+        if not (float(self.path) > 0.0 and float(self.goal) > 0.0):
+            raise DataError(
+                f"the tolerances of {self.signal.name} are {self.path} and {self.goal}; a "
+                "tolerance of 0 would be no check at all"
+            )
+
+    @property
+    def joint(self) -> str:
+        """What the path says the signal's element is called, else the signal's name."""
+        named = NAMED.search(self.signal.path)
+        return named[1] if named else self.signal.name.replace(" ", "_")
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What a proved funnel says of every signal.
+
+    about: what the signals are compared with. verdict: the claim that each number comes from.
+    """
+
+    entries: tuple[Tolerance, ...]
+    about: str
+    verdict: Verdict
+
+    def write(self, folder: Path) -> list[Path]:
+        """The table, and the files that these signals have entries in."""
+        contents = {
+            CONTROLLER: self.controller(),
+            VALIDATOR: self.validator(),
+            TABLE: str(self) + "\n",
+        }
+        written = []
+        for name, content in contents.items():
+            if content:
+                files.write_atomically(folder / name, content.encode())
+                written.append(folder / name)
+        return written
+
+    def controller(self) -> str:
+        """Constraints of ros2_control's joint_trajectory_controller; empty without a position."""
+        positions = self._of(POSITIONS)
+        if not positions:
+            return ""
+        lines = [*self._source(), "joint_trajectory_controller:", "  ros__parameters:"]
+        lines.append("    constraints:")
+        rates = self._of(VELOCITIES)
+        if rates:
+            widest = max(rates, key=lambda entry: float(entry.goal))
+            said = f"{widest.signal.unit}, {widest.signal.name} at the last sample, the widest"
+            lines.append(f"      stopped_velocity_tolerance: {_float(widest.goal)}  # {said}")
+        joints = [entry.joint for entry in positions]
+        if len(set(joints)) < len(joints):  # elements called alike in two messages
+            joints = [entry.signal.name for entry in positions]
+        for joint, entry in zip(joints, positions, strict=True):
+            unit = entry.signal.unit
+            lines += [
+                f"      {json.dumps(joint)}:",
+                f"        trajectory: {_float(entry.path)}  # {unit}, at any sample of the claim",
+                f"        goal: {_float(entry.goal)}  # {unit}, at its last sample",
+            ]
+        return "\n".join(lines) + "\n"
+
+    def validator(self) -> str:
+        """Thresholds of Autoware's control and planning validators; empty without m or m/s.
+
+        Of one signal each, the widest, as a validator has one threshold.
+        """
+        speeds, distances = self._of(["m/s"]), self._of(["m"])
+        if not speeds and not distances:
+            return ""
+        lines = [*self._source(), "/**:", "  ros__parameters:", "    thresholds:"]
+        if speeds:
+            widest = max(speeds, key=lambda entry: float(entry.path))
+            lines += [
+                "      over_velocity_ratio: 0.0  # the offset is all: |v| > |target| + offset",
+                f"      over_velocity_offset: {_float(widest.path)}  # m/s, {widest.signal.name}",
+                f"      velocity_deviation: {_float(widest.path)}  # m/s, {widest.signal.name}",
+            ]
+        if distances:
+            widest = max(distances, key=lambda entry: float(entry.path))
+            lines.append(
+                f"      distance_deviation: {_float(widest.path)}  # m, {widest.signal.name}"
+            )
+        return "\n".join(lines) + "\n"
+
+    def __str__(self) -> str:
+        names = ["signal", *(entry.signal.name for entry in self.entries)]
+        width = max(map(len, names))
+        lines = [f"{'signal':{width}}  {'path':>10}  {'goal':>10}  unit"]
+        lines += [
+            f"{e.signal.name:{width}}  {e.path:>10}  {e.goal:>10}  {e.signal.unit}".rstrip()
+            for e in self.entries
+        ]
+        return "\n".join([*lines, "", *self._claim()])
+
+    def _of(self, units: Sequence[str]) -> list[Tolerance]:
+        return [entry for entry in self.entries if entry.signal.unit in units]
+
+    def _claim(self) -> list[str]:
+        return [
+            *str(self.verdict).splitlines(),
+            f"proof {self.verdict.digests['proof']}",
+            f"Compare with {self.about}.",
+        ]
+
+    def _source(self) -> list[str]:
+        said = ["Every number is a bound of this claim, rounded up:", *self._claim()]
+        return [f"# {line}" for line in said]
+
+
+def tolerances(folder: Path | str) -> Tolerances:
+    """Of the design in a folder, its proof checked.
+
+    Raises CertificateRejected if nothing is proved, DataError if its claim bounds no signal.
+    """
+    design = designs.load_design(folder)
+    funnel: Any = design.funnel
+    if isinstance(funnel, ContinuousFunnel):
+        raise DataError(
+            f"{folder}: a funnel of given equations has sets of states and no signals; tolerances "
+            "are written of funnels of identified models"
+        )
+    if isinstance(funnel, SampledFunnel):
+        signals = design.model.x
+        path, goal = funnel.half_widths.max(axis=0), funnel.half_widths[-1]
+        about = (
+            "the plan in policy.json, sample by sample; the claim is about the observer's estimate "
+            "of the state, which a measurement can be off by its noise"
+        )
+    else:
+        given = design.model.y
+        signals = (given,) if isinstance(given, Signal) else given
+        path = goal = funnel.half_widths
+        about = "what the model simulates from the commands that were sent, not with the commands"
+        if not isinstance(funnel, TubeFunnel):
+            about += "; or with the plan in policy.json where the policy drives"
+    rows = zip(signals, path.tolist(), goal.tolist(), strict=True)
+    entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)
+    return Tolerances(tuple(entries), about, design.verdict)
+
+
+def _float(number: str) -> str:
+    """The decimal number so that YAML and ROS read a float: 2 is 2.0, 1e-05 is 1.0e-05."""
+    mantissa, e, exponent = number.partition("e")
+    return (mantissa if "." in mantissa else f"{mantissa}.0") + e + exponent

@@ -1,0 +1,355 @@
+"""What a monitor catches: sabotaged copies of trials, and what other detectors make of them.
+
+The trials are those that were held back from the model and from the tube. Every copy goes through
+the same `Monitor` as a bag or a live robot.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError, SolverError
+from nlsid_core.kernel import text
+from nlsid_core.models import StableModel
+from nlsid_core.running.detectors import DETECTORS, Detector, Residuals
+from nlsid_core.running.monitor import OVER, Monitor
+from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.stepping import Stepper
+
+UNTOUCHED = "untouched"
+BIAS = 0.1  # of the range of each output
+DELAY = 5  # samples
+LOST = 5  # samples
+WIDE = 0.5  # of the range: a tube of a larger half-width says little
+OUTLIER = 4.0  # times the median trial's share of the level: twice its amplitude
+
+
+TINY = float(np.finfo(float).tiny)
+
+
+@dataclass(frozen=True, eq=False)
+class Copy:
+    """What is recorded of a trial: y (N, p), what was commanded, and when the fault sets in.
+
+    lost: samples that are not there.
+    """
+
+    t: FloatArray
+    y: FloatArray
+    u: FloatArray
+    onset: int = 0
+    lost: frozenset[int] = frozenset()
+
+
+Fault = Callable[[Trajectory, FloatArray, StableModel], Copy]  # of a trial, its outputs' ranges
+
+
+def _scaled(factor: float) -> Fault:
+    return lambda trial, _range, _model: Copy(trial.t, factor * trial.y, trial.u)
+
+
+def _stuck(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
+    return Copy(trial.t, np.tile(trial.y[0], (len(trial), 1)), trial.u)
+
+
+def _biased(trial: Trajectory, ranges: FloatArray, _model: StableModel) -> Copy:
+    return Copy(trial.t, trial.y + BIAS * ranges, trial.u)
+
+
+def _delayed(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
+    first = np.tile(trial.y[0], (min(DELAY, len(trial)), 1))
+    return Copy(trial.t, np.vstack([first, trial.y])[: len(trial)], trial.u)
+
+
+def _weak(trial: Trajectory, _range: FloatArray, model: StableModel) -> Copy:
+    """What the model says the output would have been, had 0.8 of the command arrived."""
+    lags = Stepper(model).lags
+    full, less = (_simulated(model, trial, gain) for gain in (1.0, 0.8))
+    y = trial.y.copy()
+    y[lags:] += less - full
+    return Copy(trial.t, y, trial.u)
+
+
+def _simulated(model: StableModel, trial: Trajectory, gain: float) -> FloatArray:
+    stepper = Stepper(model)
+    n = stepper.lags
+    x = stepper.begin(trial.y[:n], trial.u[:n])[None, :]
+    outputs = []
+    for u in trial.u[n:]:
+        y, x = stepper.advance(x, gain * u)
+        outputs.append(y[0])
+    return np.array(outputs)
+
+
+def _dropped(trial: Trajectory, _range: FloatArray, _model: StableModel) -> Copy:
+    onset = len(trial) // 2
+    return Copy(trial.t, trial.y, trial.u, onset, frozenset(range(onset, onset + LOST)))
+
+
+SABOTAGES: tuple[tuple[str, Fault], ...] = (
+    ("stuck at first value", _stuck),
+    ("sensor x 0.6", _scaled(0.6)),
+    ("sensor x 0.8", _scaled(0.8)),
+    (f"bias, {100 * BIAS:.0f} % of range", _biased),
+    (f"late by {DELAY} samples", _delayed),
+    ("actuator x 0.8", _weak),
+    (f"{LOST} samples lost", _dropped),
+)
+
+
+@dataclass(frozen=True)
+class Caught:
+    """In how many of the trials, by which status, and s from the fault to the alarm (median).
+
+    unjudged: trials of which a part is unknown and nothing bad was seen. after: NaN if none was
+    caught.
+    """
+
+    outside: int = 0
+    violated: int = 0
+    unjudged: int = 0
+    after: float = float("nan")
+
+    @property
+    def count(self) -> int:
+        """How many were caught, in either way."""
+        return self.outside + self.violated
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of sabotage; others: by the name of a detector. refused: why it was not tried."""
+
+    fault: str
+    funnel: Caught
+    others: dict[str, Caught]
+    refused: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Width:
+    """One output's half-width beside its range, and its largest error on the calibration trials.
+
+    range: of the trials given, in the output's unit as are the others. error: of the simulation.
+    """
+
+    name: str
+    unit: str
+    half_width: float
+    range: float
+    error: float
+
+    @property
+    def said(self) -> str:
+        """The half-width with its unit, rounded up."""
+        return f"{_up(self.half_width)} {self.unit}".strip()
+
+    @property
+    def share(self) -> float:
+        """The half-width as a part of the range; inf if the output was constant."""
+        return self.half_width / self.range if self.range > 0.0 else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class Catching:
+    """What is known before anyone trusts a funnel.
+
+    trials: how many were held back. shares: of each calibration trial, the part of what the funnel
+    assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
+    (N, p).
+    """
+
+    widths: tuple[Width, ...]
+    rows: tuple[Row, ...]
+    trials: int
+    factor: float
+    shares: tuple[tuple[str, float], ...]
+    errors: tuple[tuple[FloatArray, FloatArray], ...]
+
+    @property
+    def widest(self) -> Width:
+        """The output whose half-width is the largest part of its range."""
+        return max(self.widths, key=lambda width: width.share)
+
+    def warnings(self, most: float = WIDE) -> list[str]:
+        """What to know of a tube whose half-width is more than `most` of the range."""
+        said = []
+        for width in self.widths:
+            if not width.share <= most:
+                said.append(
+                    f"the half-width of {width.name}, {width.said}, is {_up(width.share)} of its "
+                    f"range, {width.range:.3g} {width.unit}; more than {most:g} says little of "
+                    "where the robot is"
+                )
+                said += [f"  {cause}" for cause in self._causes(width, most)]
+        return said
+
+    def _causes(self, width: Width, most: float) -> list[str]:
+        """Which trial sets the level, and whether model or assumption is what is wide."""
+        said = []
+        names, parts = zip(*self.shares, strict=True)
+        typical = median(parts)
+        if len(parts) > 1 and parts[0] > OUTLIER * typical:
+            said.append(
+                f"{names[0]} sets the level: it uses {parts[0] / typical:.3g} times as much of it "
+                f"as the median of {len(parts)} calibration trials, {names[1]} as the next "
+                f"{parts[1] / typical:.3g} times. Look at it: fit the model to trials like it too, "
+                "or leave it out of split.calibration if it is not what the robot does"
+            )
+        needed = self.factor * width.error
+        off = (
+            f"the simulation is off by up to {_up(width.error)} {width.unit} on the calibration "
+            f"trials, {_up(needed)} {width.unit} with the safety factor"
+        )
+        if needed > most * width.range:
+            said.append(f"{off}: try more lags, another class of models, or more training trials")
+        else:
+            said.append(
+                f"{off}, and the half-width is {width.half_width / max(needed, TINY):.3g} times "
+                "that: what is assumed of the innovations is wider than the model's error. Try a "
+                "shorter funnel.horizon, or a smaller funnel.inlet"
+            )
+        return said
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """The judged part of a run: when each sample was, what is bad first, and the residuals."""
+
+    t: FloatArray
+    bad: Reading | None
+    lost: bool
+    residuals: Residuals
+    share: float
+
+
+def what_it_catches(
+    monitor: Monitor,
+    model: StableModel,
+    half_widths: Sequence[float],
+    *,
+    held_back: Dataset,
+    calibration: Dataset,
+    ranges: FloatArray,
+    factor: float,
+) -> Catching:
+    """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
+
+    half_widths, ranges: (p,) of each output, in its unit. factor: the safety factor, which the
+    thresholds of the detectors have too. A detector that alarms in more of the untouched trials
+    than the monitor gets its threshold raised until it does not.
+    """
+    p = len(ranges)
+    first = held_back.trajectories[0]
+    scaling = [_run(monitor, _untouched(trial), p) for trial in calibration]
+    clean = [_run(monitor, _untouched(trial), p) for trial in held_back]
+    judged = [run.residuals for run in scaling if len(run.t)]
+    if not judged or not any(len(run.t) for run in clean):
+        raise DataError("the monitor judges no sample of the trials; are they shorter than lags?")
+    false_alarms = sum(run.bad is not None for run in clean)
+    untouched = [run.residuals for run in clean if len(run.t)]
+    detectors = [
+        Detector.calibrated(name, judged, factor).quieter(untouched, false_alarms)
+        for name in DETECTORS
+    ]
+    rows = [_row(UNTOUCHED, clean, [0] * len(clean), detectors)]
+    for name, fault in SABOTAGES:
+        try:
+            copies = [fault(trial, ranges, model) for trial in held_back]
+        except (DataError, SolverError) as reason:
+            rows.append(Row(name, Caught(), {}, str(reason)))
+            continue
+        runs = [_run(monitor, copy, p) for copy in copies]
+        onsets = [float(copy.t[copy.onset]) for copy in copies]
+        rows.append(_row(name, runs, onsets, detectors))
+    errors = np.max([np.abs(run.error).max(axis=0) for run in judged], axis=0)
+    named = zip(first.y_names, first.y_units, half_widths, ranges, errors, strict=True)
+    shares = {trial.name: run.share for trial, run in zip(calibration, scaling, strict=True)}
+    return Catching(
+        tuple(Width(n, u, float(w), float(r), float(e)) for n, u, w, r, e in named),
+        tuple(rows),
+        len(held_back),
+        factor,
+        tuple(sorted(shares.items(), key=lambda entry: -entry[1])),
+        tuple((run.t, run.residuals.error) for run in clean),
+    )
+
+
+def _up(value: float) -> str:
+    """Rounded up."""
+    return text.above(Fraction(value), 3) if value < float("inf") else "inf"
+
+
+def _untouched(trial: Trajectory) -> Copy:
+    return Copy(trial.t, trial.y, trial.u)
+
+
+def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
+    """The copy's samples through the monitor, as a bag's are."""
+    monitor.restart()
+    single = copy.y.shape[1] == copy.u.shape[1] == 1
+    times: list[float] = []
+    innovation: list[Sequence[float]] = []
+    error: list[FloatArray] = []
+    bad, lost, share = None, False, 0.0
+    for k, (t, y, u) in enumerate(zip(copy.t.tolist(), copy.y, copy.u, strict=True)):
+        if k in copy.lost:
+            continue
+        sample: tuple[Any, Any] = (float(y[0]), float(u[0])) if single else (y, u)
+        reading = monitor.update(t, *sample)
+        if reading.status is Status.UNKNOWN:
+            lost = lost or (bool(times) and not reading.reason.startswith(OVER))
+            continue
+        times.append(t)
+        innovation.append(reading.deviation[-p:])
+        error.append(np.subtract(reading.measured, reading.nominal))
+        share = max(share, reading.assumption)
+        if bad is None and reading.status is not Status.INSIDE:
+            bad = reading
+    residuals = Residuals(np.reshape(innovation, (-1, p)), np.reshape(error, (-1, p)))
+    return _Run(np.array(times), bad, lost, residuals, share)
+
+
+def _row(
+    fault: str,
+    runs: Sequence[_Run],
+    onsets: Sequence[float],
+    detectors: Sequence[Detector],
+) -> Row:
+    """Counts and delays; an alarm counts from the fault on, or from the first judged sample."""
+    statuses = [run.bad.status for run in runs if run.bad is not None]
+    starts = [
+        max(onset, float(run.t[0])) if len(run.t) else onset
+        for run, onset in zip(runs, onsets, strict=True)
+    ]
+    alarms = [None if run.bad is None else run.bad.t for run in runs]
+    funnel = Caught(
+        statuses.count(Status.OUTSIDE),
+        statuses.count(Status.ASSUMPTION_VIOLATED),
+        sum(run.lost and run.bad is None for run in runs),
+        _delay(alarms, starts),
+    )
+    others = {}
+    for detector in detectors:
+        times = [_alarm(detector, run) for run in runs]
+        caught = sum(t is not None for t in times)
+        others[detector.name] = Caught(violated=caught, after=_delay(times, starts))
+    return Row(fault, funnel, others)
+
+
+def _alarm(detector: Detector, run: _Run) -> float | None:
+    """When the detector alarms first."""
+    found = detector.alarm(run.residuals) if len(run.t) else None
+    return None if found is None else float(run.t[found])
+
+
+def _delay(alarms: Sequence[float | None], starts: Sequence[float]) -> float:
+    """The median of s from the first faulty sample that is judged to the alarm; NaN if none."""
+    delays = [t - start for t, start in zip(alarms, starts, strict=True) if t is not None]
+    return float(median(delays)) if delays else float("nan")

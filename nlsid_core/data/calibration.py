@@ -1,0 +1,105 @@
+"""Which trials design a tube, and which others scale its level.
+
+Let s be a number of a trial, fixed before m calibration trials are seen that are exchangeable with
+the next one. Then P(s of the next > the largest of the m) <= 1/(m + 1): the largest of m + 1
+exchangeable numbers is the last with probability at most 1/(m + 1). Nothing like it holds where the
+same trials choose what s is. Source: V. Vovk, A. Gammerman, G. Shafer, Algorithmic Learning in a
+Random World, Section 2.2.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import DataError
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationTrials:
+    """The trials that design a tube, and those that scale it: different recordings, or windows.
+
+    cut: whether they are windows of one recording, which are hardly exchangeable.
+    """
+
+    design: Dataset
+    calibration: Dataset
+    cut: bool = False
+
+    @property
+    def designed_on(self) -> tuple[tuple[str, str], ...]:
+        """(name, digest) of the trials of the design."""
+        return _named(self.design)
+
+    @property
+    def measured_on(self) -> tuple[tuple[str, str], ...]:
+        """(name, digest) of the trials of the calibration."""
+        return _named(self.calibration)
+
+
+def calibration_trials(
+    train: Dataset, calibration: Dataset | None = None, *, least: int
+) -> CalibrationTrials:
+    """`train` designs and `calibration` scales; without the latter every second recording does.
+
+    That is the 2nd, 4th, ... of the distinct recordings in `train`. If there is but one, it is cut
+    into windows of `least` samples, and every second window scales. Raises DataError if a recording
+    is on both sides, or if there are not two windows.
+    """
+    if calibration is not None:
+        twice = {recording(trial) for trial in train} & {recording(trial) for trial in calibration}
+        for trial in calibration:
+            if recording(trial) in twice:
+                raise DataError(
+                    f"{trial.name}: this recording is for the design and for the calibration; the "
+                    "largest of trials that designed the tube says nothing of the next one"
+                )
+        return CalibrationTrials(train, calibration)
+    recordings = list(dict.fromkeys(recording(trial) for trial in train))
+    if len(recordings) == 1:
+        cut = windows(train, least)
+        if len(cut) < 2:
+            raise DataError(
+                f"one recording, from which {len(cut)} windows of {least} samples can be cut; a "
+                "tube is designed on one trial and its level measured on another: record more"
+            )
+        return CalibrationTrials(Dataset(cut[::2]), Dataset(cut[1::2]), cut=True)
+    scaling = set(recordings[1::2])
+    return CalibrationTrials(
+        Dataset(tuple(trial for trial in train if recording(trial) not in scaling)),
+        Dataset(tuple(trial for trial in train if recording(trial) in scaling)),
+    )
+
+
+def windows(trials: Iterable[Trajectory], samples: int) -> tuple[Trajectory, ...]:
+    """The trials of one recording cut into windows of so many samples, what is left over dropped.
+
+    A window's digest is the recording's with `[first:end]`, samples counted through all its trials.
+    """
+    cut, before = [], 0
+    for trial in trials:
+        for first in range(0, len(trial) - samples + 1, samples):
+            part = slice(first, first + samples)
+            where = f"[{before + first}:{before + first + samples}]"
+            cut.append(
+                replace(
+                    trial,
+                    t=trial.t[part], y=trial.y[part], u=trial.u[part],
+                    x=None if trial.x is None else trial.x[part],
+                    name=trial.name + where, digest=recording(trial) + where,
+                )
+            )  # fmt: skip
+        before += len(trial)
+    return tuple(cut)
+
+
+def recording(trial: Trajectory) -> str:
+    """The digest of the recording that a trial came from; of its samples if it names none."""
+    if trial.digest:
+        return trial.digest
+    content = b"".join(values.tobytes() for values in (trial.t, trial.y, trial.u))
+    return f"sha256:{hashlib.sha256(content).hexdigest()}"
+
+
+def _named(trials: Dataset) -> tuple[tuple[str, str], ...]:
+    return tuple((trial.name, recording(trial)) for trial in trials)

@@ -1,0 +1,286 @@
+"""`TubeRun`: a robot held against tubes around its model's own simulation, for as long as it runs.
+
+Each tube has an observer, x̂⁺ = f(x̂, w) + L e, and a number, E⁺ = ρE + e'Re; the simulation x⁺ =
+f(x, w) is common to them. A sample without a measurement is a step with e = 0, and nothing is said
+of it; nothing ends a run but an input that the model refuses or a box that is left, after which it
+starts anew. Source: TUBES, section 8; docs/certificate_tube.md.
+"""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import DataError, SolverError
+from nlsid_core.funnels.factor import UNIT
+from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.models import StableModel
+from nlsid_core.running.grid import TOLERANCE
+from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.stepping import Stepper
+
+TREND = 10  # samples over which the margin's fall is taken
+FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
+LONGEST_GAP = 10_000  # samples without a measurement that are stepped through; then a new start
+ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
+STARTING = "waiting for the first"
+
+
+class TubeRun:
+    """Samples (t, y, u) of one run against funnels of one model; `readings` once per sample.
+
+    lags: samples that start a run. Raises DataError if the funnels start in different ways.
+    """
+
+    def __init__(self, model: StableModel, funnels: Sequence[TubeFunnel]) -> None:
+        self._stepper = Stepper(model)
+        self.period, self.lags = model.period, funnels[0].settling
+        if any(funnel.settling != self.lags for funnel in funnels):
+            raise DataError("the funnels start after different numbers of samples")
+        if self.lags < self._stepper.lags:
+            raise DataError(f"a run of this model starts after {self._stepper.lags} samples")
+        self._funnels = tuple(funnels)
+        tubes = [tube for funnel in funnels for tube in funnel.tubes]
+        self._tubes = tubes
+        self._owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
+        p, n = len(self._stepper.y), self._stepper.order
+        if any(tube.L.shape != (n, p) for tube in tubes):
+            raise DataError("the funnel is not one of this model")
+        # Products and sums are rounded up, so that E is never below its exact value.
+        self._rho = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
+        self._R = np.array([tube.R for tube in tubes])
+        spread = max(
+            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
+        )
+        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
+        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
+        self._L = np.array([tube.L for tube in tubes])
+        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
+        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
+        self._samples = [tube.samples for tube in tubes]
+        self._names = [signal.name for signal in self._stepper.y]
+        boxed = [f for f in funnels if f.y_box is not None and f.u_box is not None]
+        self._boxes = [
+            (np.array(f.y_box).T, np.array(f.u_box).T, np.tile(np.array(f.y_box), (n // p, 1)).T)
+            for f in boxed
+        ]
+        self._assuming = [_assumption(funnel.tubes) for funnel in funnels]
+        self.restart()
+
+    def restart(self) -> None:
+        """A new run."""
+        self._due = math.nan
+        self._begin()
+
+    def _begin(self) -> None:
+        """Collect a start again; the grid of time goes on."""
+        self._start: list[tuple[FloatArray, FloatArray]] = []
+        self._x: FloatArray | None = None
+        self._spent = np.zeros(len(self._tubes))
+        self._k = 0
+        self._u: FloatArray | None = None
+        self._fall: list[deque[tuple[float, float]]] = [deque(maxlen=TREND) for _ in self._funnels]
+
+    def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
+        """What is said of the sample at t (s): outputs y (p,) and inputs u (n_u,), or numbers.
+
+        NaN, or None for u, is a sample without a measurement.
+        """
+        measured = np.atleast_1d(np.asarray(y, dtype=np.float64))
+        if u is None:
+            u = np.full(len(self._stepper.u), np.nan)
+        applied = np.atleast_1d(np.asarray(u, dtype=np.float64))
+        fault = self._take(t)
+        if fault:
+            return self._unknown(t, measured, fault)
+        fault = self._fault(t, measured, applied)
+        if fault:
+            return self._unknown(t, measured, self._without(applied) or fault)
+        self._u = applied
+        if self._x is None:
+            return self._collect(t, measured, applied)
+        return self._judge(t, measured, applied)
+
+    def missing(self, t: float, reason: str) -> Reading:
+        """The reading at t (s) where no sample came; the run goes on with the next one."""
+        return Reading(t, Status.UNKNOWN, reason=reason)
+
+    def _take(self, t: float) -> str:
+        """Count the sample stamped t and step through those before it that did not come."""
+        if not math.isfinite(t):
+            return f"stamp is {t}"
+        if math.isnan(self._due):
+            self._due = t
+        late = (t - self._due) / self.period
+        lost = round(late)
+        if lost < 0:
+            return f"the sample at t = {t:g} s came a second time, or time went back"
+        if abs(late - lost) > TOLERANCE:
+            self._begin()
+            self._due = t + self.period
+            return (
+                f"the sample at t = {t:g} s is {late - lost:+.2g} periods of {self.period:g} s off "
+                f"the grid; {TOLERANCE:g} are allowed; a new run starts"
+            )
+        self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
+        if lost > LONGEST_GAP:
+            self._begin()
+        for _ in range(lost):
+            if self._without(None):
+                break
+        return ""
+
+    def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
+        if y.shape != (len(self._names),) or u.shape != (len(self._stepper.u),):
+            return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
+        for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
+            for value, signal in zip(values.tolist(), signals, strict=True):
+                if not math.isfinite(value):
+                    return f"no {signal.name} at t = {t:g} s (it is {value}): nothing is claimed"
+        return ""
+
+    def _without(self, u: FloatArray | None) -> str:
+        """A step with e = 0, under the input u if it is known, else the one before.
+
+        Why that ends the run, empty if it does not.
+        """
+        known = u is not None and u.shape == (len(self._stepper.u),) and np.isfinite(u).all()
+        if known:
+            self._u = u
+        if self._x is None or self._u is None:
+            self._begin()
+            return ""
+        _, after, refused = self._advance(self._u)
+        if refused:
+            self._begin()
+            return refused
+        self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
+        return ""
+
+    def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
+        self._start.append((y, u))
+        if len(self._start) >= self.lags:
+            ys, us = (np.array(part) for part in zip(*self._start, strict=True))
+            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))
+            self._start = []
+        return self._unknown(t, y, f"{STARTING} {self.lags} samples")
+
+    def _advance(self, u: FloatArray) -> tuple[FloatArray, FloatArray, str]:
+        """Outputs and next states, and why there are none or nothing is known of them."""
+        x = self._x
+        assert x is not None
+        try:
+            outputs, after = self._stepper.advance(x, u)
+        except (DataError, SolverError) as error:
+            return x, x, str(error)
+        for (y_low, y_high), (u_low, u_high), (x_low, x_high) in self._boxes:
+            inside = (
+                ((y_low <= outputs) & (outputs <= y_high)).all()
+                and ((u_low <= u) & (u <= u_high)).all()
+                and ((x_low <= x) & (x <= x_high)).all()
+            )
+            if not inside:
+                return outputs, after, "outside the box in which the tube is proved"
+        return outputs, after, ""
+
+    def _judge(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
+        outputs, after, refused = self._advance(u)
+        if refused:
+            self._begin()
+            return self._unknown(t, y, f"{refused}, at t = {t:g} s; a new run starts")
+        e = y - outputs[:-1]
+        simulated = outputs[-1]
+        if self._single_R is not None:
+            used = self._single_R * (e[:, 0] * e[:, 0])
+            after[:-1] += self._L[:, :, 0] * e
+        else:
+            used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
+            after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
+        self._spent = self._rho * self._spent + used
+        self._x, self._k = after, self._k + 1
+        deviation = y - simulated
+        sizes = np.abs(deviation) / self._widths
+        spent = self._spent / self._level
+        if not (np.isfinite(spent).all() and np.isfinite(after).all()):
+            self._begin()
+            return self._unknown(t, y, f"the model's state is not finite at t = {t:g} s")
+        measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
+        away, innovations = deviation.tolist(), e.tolist()
+        return [
+            self._reading(
+                i,
+                t,
+                sizes,
+                spent.tolist(),
+                nominal,
+                measured,
+                away + innovations[self._owner.index(i)],
+            )
+            for i in range(len(self._funnels))
+        ]
+
+    def _reading(
+        self,
+        i: int,
+        t: float,
+        sizes: FloatArray,
+        spent: list[float],
+        nominal: tuple[float, ...],
+        measured: tuple[float, ...],
+        away: list[float],
+    ) -> Reading:
+        """Of funnel i: the narrowest margin and the most that is used over the tubes that last.
+
+        away: the output error, then the innovation of the funnel's first observer.
+        """
+        lasting = [
+            j for j, owner in enumerate(self._owner)
+            if owner == i and (self._samples[j] is None or self._k <= (self._samples[j] or 0))
+        ]  # fmt: skip
+        if not lasting:
+            tube = self._tubes[self._owner.index(i)]
+            return Reading(
+                t, Status.UNKNOWN, measured=measured,
+                reason=f"the proof covers {tube.samples} samples; they are over",
+            )  # fmt: skip
+        rows = sizes[lasting]
+        place = int(rows.argmax())
+        size = float(rows.flat[place])
+        margin = 1.0 - size
+        most = max(lasting, key=spent.__getitem__)
+        reason = ""
+        status = Status.INSIDE
+        if not spent[most] <= 1.0:
+            status = Status.ASSUMPTION_VIOLATED
+            reason = (
+                f"innovation energy {self._spent[most]:.4g} above the level "
+                f"{self._tubes[most].level:.4g} at t = {t:g} s"
+            )
+        if not size <= 1.0:
+            status = Status.OUTSIDE
+            kept = "although the assumption was kept: what runs is not what was proved"
+            reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+        return Reading(
+            t, status, margin, spent[most], self._exit(i, t, margin),
+            self._names[place % rows.shape[1]], nominal, measured,
+            Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i], away,
+        )  # fmt: skip
+
+    def _exit(self, i: int, t: float, margin: float) -> float:
+        """S until the margin is 0 if it goes on falling as over the last samples."""
+        before, earlier = self._fall[i][0] if self._fall[i] else (t, margin)
+        self._fall[i].append((t, margin))
+        if not margin > 0.0:
+            return 0.0
+        return margin * (t - before) / (earlier - margin) if earlier > margin else math.inf
+
+    def _unknown(self, t: float, y: FloatArray, reason: str) -> list[Reading]:
+        measured = tuple(y.tolist())
+        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * len(self._funnels)
+
+
+def _assumption(tubes: Sequence[Tube]) -> str:
+    return "; ".join(tube.assumption for tube in tubes)

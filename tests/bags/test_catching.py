@@ -1,0 +1,227 @@
+"""What a tube catches: every count, delay, share and warning against an independent computation."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from bags.commands import show
+from bags.monitoring.catching import (
+    DELAY,
+    LOST,
+    SABOTAGES,
+    UNTOUCHED,
+    Catching,
+    Caught,
+    Row,
+    Width,
+    what_it_catches,
+)
+from bags.pictures.catching_plots import catching as draw
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.calibration import calibration_trials
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import TubeDesign
+from nlsid_core.design.linear import innovations
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
+from tests.conftest import PERIOD, synthetic_dataset
+
+FACTOR = 1.5
+
+
+@pytest.fixture(scope="module")
+def held_back() -> Dataset:
+    """Ten trials like those of training, recorded later."""
+    many = synthetic_dataset(0.01, trials=16).trajectories
+    return Dataset(many[6:])
+
+
+@pytest.fixture(scope="module")
+def found(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+    return catches(design, train, held_back)
+
+
+def catches(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+    return what_it_catches(
+        Monitor(design.model, design.policy, design.funnel, centre=Centre.COMMAND),
+        design.model,
+        design.funnel.half_widths.tolist(),
+        held_back=held_back,
+        calibration=calibration_trials(train, least=72).calibration,
+        ranges=np.array([np.ptp(np.concatenate([trial.y for trial in train]))]),
+        factor=FACTOR,
+    )
+
+
+def row(found: Catching, fault: str) -> Row:
+    return next(row for row in found.rows if row.fault == fault)
+
+
+def energies(design: TubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray:
+    e = innovations(design.model, design.policy.L[None, :], replace(trial, y=y))[:, 0]
+    return np.cumsum(e**2)[: design.funnel.assumption.samples]
+
+
+def first_bad(design: TubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
+    """The first judged sample after which the energy or the command is beyond what is assumed."""
+    n, (low, high) = len(design.model), design.model.u_range
+    spent = energies(design, trial, y)
+    u = trial.u[n : n + len(spent), 0]
+    beyond = (spent > design.funnel.assumption.budget) | (u < low) | (u > high)
+    return int(np.flatnonzero(beyond)[0]) if beyond.any() else None
+
+
+@pytest.mark.parametrize("factor", [0.6, 0.8])
+def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
+    design: TubeDesign, found: Catching, held_back: Dataset, factor: float
+) -> None:
+    bad = [first_bad(design, trial, factor * trial.y) for trial in held_back]
+    delays = [PERIOD * k for k in bad if k is not None]
+    caught = row(found, f"sensor x {factor}").funnel
+    assert caught.count == len(delays) > 0
+    assert caught.outside + caught.violated == caught.count
+    assert caught.after == pytest.approx(np.median(delays))
+
+
+def test_untouched_trials_are_false_alarms_and_others_have_no_more(
+    design: TubeDesign, found: Catching, held_back: Dataset
+) -> None:
+    untouched = row(found, UNTOUCHED)
+    assert untouched.fault == found.rows[0].fault
+    budget = design.funnel.assumption.budget
+    assert all(energies(design, trial, trial.y)[-1] <= budget for trial in held_back)
+    exceeded = sum(first_bad(design, trial, trial.y) is not None for trial in held_back)
+    assert untouched.funnel.violated == exceeded == 1, "a command beyond the fitted range"
+    assert all(other.count <= exceeded for other in untouched.others.values())
+    assert found.trials == 10
+    assert [row.fault for row in found.rows] == [UNTOUCHED, *(name for name, _ in SABOTAGES)]
+
+
+def test_lost_samples_are_unknown_and_no_catch(found: Catching, held_back: Dataset) -> None:
+    lost = row(found, f"{LOST} samples lost").funnel
+    assert (lost.count, lost.unjudged) == (0, len(held_back))
+    assert np.isnan(lost.after)
+
+
+def test_detectors_are_named_beside_each_sabotage_and_catch_what_they_should(
+    found: Catching,
+) -> None:
+    assert set(found.rows[0].others) == {"CUSUM", "3σ", "box"}
+    assert row(found, "sensor x 0.6").others["CUSUM"].count > 0
+    assert row(found, "sensor x 0.6").others["box"].count > 0
+
+
+def test_copies_are_what_their_names_say(design: TubeDesign, held_back: Dataset) -> None:
+    trial, faults = held_back.trajectories[0], dict(SABOTAGES)
+    made = {name: fault(trial, np.array([2.0]), design.model) for name, fault in faults.items()}
+    y = trial.y
+    np.testing.assert_array_equal(made["stuck at first value"].y, np.full_like(y, y[0, 0]))
+    np.testing.assert_array_equal(made["sensor x 0.6"].y, 0.6 * y)
+    np.testing.assert_array_equal(made["bias, 10 % of range"].y, y + 0.2)
+    late = made[f"late by {DELAY} samples"].y
+    np.testing.assert_array_equal(late[DELAY:], y[:-DELAY])
+    np.testing.assert_array_equal(late[:DELAY], np.full((DELAY, 1), y[0, 0]))
+    lost = made[f"{LOST} samples lost"]
+    assert lost.lost == frozenset(range(len(y) // 2, len(y) // 2 + LOST))
+    assert all(np.array_equal(copy.u, trial.u) for copy in made.values()), "what was commanded"
+
+
+def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: TubeDesign) -> None:
+    """On a trial that the model itself made, it is the model's own response to 0.8 u."""
+    u = np.repeat(np.array([0.0, 0.6, 0.2, 0.5]), 20)
+    full, weak = (_simulated(design, gain * u, u) for gain in (1.0, 0.8))
+    trial = Trajectory(t=PERIOD * np.arange(len(u)), y=full, u=u)
+    copy = dict(SABOTAGES)["actuator x 0.8"](trial, np.ones(1), design.model)
+    np.testing.assert_allclose(copy.y[:, 0], weak, atol=1e-12)
+
+
+def _simulated(design: TubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
+    """By the difference equation: n zeros under the full input, then the model under `applied`."""
+    model, n = design.model, len(design.model)
+    y, u = np.zeros(len(applied)), applied.copy()
+    u[:n] = first[:n]
+    for t in range(n, len(y)):
+        y[t] = model.a @ y[t - n : t][::-1] + model.b @ u[t - n : t + 1][::-1] + model.c
+    return y
+
+
+def test_widths_and_shares_are_measured_on_the_calibration_trials(
+    design: TubeDesign, train: Dataset, found: Catching
+) -> None:
+    (width,) = found.widths
+    assert width.half_width == design.funnel.half_width
+    assert width.share == width.half_width / np.ptp(np.concatenate([trial.y for trial in train]))
+    assert width.said.endswith(" m/s")
+    budget, samples = design.funnel.assumption.budget, design.funnel.assumption.samples
+    for name, share in found.shares:
+        trial = train.select([name]).trajectories[0]
+        assert share == pytest.approx(energies(design, trial, trial.y)[-1] / budget, rel=1e-9)
+    assert [share for _, share in found.shares] == sorted((s for _, s in found.shares))[::-1]
+    n = len(design.model)
+    errors = []
+    for name, _ in found.shares:
+        trial = train.select([name]).trajectories[0]
+        y = trial.y[:, 0].copy()
+        for t in range(n, len(y)):
+            past = y[t - n : t][::-1], trial.u[t - n : t + 1, 0][::-1]
+            y[t] = design.model.a @ past[0] + design.model.b @ past[1] + design.model.c
+        errors.append(np.abs(trial.y[:, 0] - y)[n : n + samples].max())
+    assert width.error == pytest.approx(max(errors), rel=1e-9)
+
+
+def wide(found: Catching, share: float, error: float, shares: tuple[float, ...]) -> Catching:
+    width = Width("speed", "m/s", share, 1.0, error)
+    named = tuple((f"trial {i}", part) for i, part in enumerate(shares))
+    return replace(found, widths=(width,), shares=named)
+
+
+def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
+    assert wide(found, 0.5, 0.1, (0.4,)).warnings() == []
+    poor = wide(found, 0.5625, 0.375, (0.44, 0.05, 0.04)).warnings()
+    assert "is 0.563 of its range, 1 m/s; more than 0.5 says little" in poor[0]
+    assert "trial 0 sets the level: it uses 8.8 times as much" in poor[1]
+    assert "median of 3 calibration trials, trial 1 as the next 1 times" in poor[1]
+    assert "off by up to 0.375 m/s" in poor[2]
+    assert "0.563 m/s with the safety factor" in poor[2]
+    assert "try more lags, another class" in poor[2]
+    loose = wide(found, 3.0, 0.1, (0.4, 0.3, 0.3)).warnings()
+    assert len(loose) == 2
+    assert "the half-width is 20 times that" in loose[1]
+    assert "shorter funnel.horizon" in loose[1]
+    assert len(wide(found, 0.3, 0.1, (0.4,)).warnings(0.2)) == 2
+    constant = replace(found, widths=(Width("speed", "m/s", 0.1, 0.0, 0.05),))
+    assert "is inf of its range" in constant.warnings()[0]
+
+
+def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
+    found: Catching,
+) -> None:
+    worse = Row("made up", Caught(outside=1, violated=2, unjudged=3, after=0.25),
+                {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(),
+                 "box": Caught()})  # fmt: skip
+    refused = Row("refused", Caught(), {}, "no such input")
+    table = show.catching_table(replace(found, rows=(*found.rows, worse, refused)))
+    console = Console(width=80, record=True, file=None, force_terminal=False)
+    with console.capture() as said:
+        console.print(table)
+    line = next(line for line in said.get().splitlines() if "made up" in line)
+    assert line.split() == ["made", "up", "1", "2", "3", "0.25", "s", "9", "0.50", "s", "0", "-",
+                            "0", "-"]  # fmt: skip
+    assert table.rows[-2].style == "dark_orange3"
+    assert table.rows[0].style == ""
+    assert (
+        next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 7
+    )
+    with console.capture() as said:
+        show.say_catching(console, replace(found, rows=(*found.rows, refused)), None)
+    assert "refused was not tried: no such input" in said.get()
+
+
+def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> None:
+    figure = draw(found)
+    (errors,), (caught,) = (part.axes for part in figure.subfigs)
+    assert len(errors.lines) == found.trials + 2
+    assert len(caught.patches) == len(found.rows) * (3 + 3)
+    assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in found.rows]

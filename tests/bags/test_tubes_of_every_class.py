@@ -1,0 +1,89 @@
+"""Every class that identify offers ends in a proved tube that a bag is held against to its end."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.chain.config import load_config
+from bags.chain.joint_bags import write_joint_bag
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.monitoring.replay import replay_bag
+from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.proofs import check
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
+from tests.identified_bags import PERIOD, write_config, write_coupled_bags, write_saturating_bags
+
+FUNNEL: dict[str, Any] = {"funnel": {"safety_factor": 1.5}}
+ONE: dict[str, dict[str, Any]] = {
+    "linear": {"model": "linear", "lags": 3, "iterations": 3},
+    "block_cascade": {"model": "block_cascade", "orders": [2, 1], "phases": [1],
+                      "intervals": [8], "starts": 4, "transient": 60},
+    "monotone": {"model": "monotone", "lags": 2, "method": "rie"},
+    "implicit": {"model": "implicit", "lags": 2},
+}  # fmt: skip
+TWO: dict[str, dict[str, Any]] = {
+    "state_affine": {"model": "state_affine", "lags": 2, "iterations": 2, "leading_degree": 0},
+    "linear_states": {"model": "linear_states"},
+}
+RUNS = 6
+
+
+def quiet(_what: str, _fraction: float) -> None:
+    """Progress that nobody sees."""
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_saturating_bags(tmp_path_factory.mktemp("one"))
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_coupled_bags(tmp_path_factory.mktemp("two"))
+
+
+@pytest.mark.parametrize("name", [*ONE, *TWO])
+def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
+    name: str, one: Path, two: Path, tmp_path: Path
+) -> None:
+    folder, counts = (one, {}) if name in ONE else (two, {"outputs": 2, "inputs": 2})
+    path = write_config(tmp_path / "config.yaml", (ONE | TWO)[name], **counts, **FUNNEL)
+    config, out = load_config(path), tmp_path / "out"
+    bags = [folder / f"run_{k}" for k in range(RUNS)]
+    identify_bags(bags, config, out, progress=quiet)
+    design_funnel_files(out / documents.MODEL, config, out)
+    assert "for ever" in check(out / documents.FUNNEL_PROOF).statement
+    proved = documents.load_proved(out / documents.FUNNEL)
+    replayed = replay_bag(proved, bags[5], centre=Centre.COMMAND)
+    assert replayed.judged_span == pytest.approx(replayed.span)
+    assert replayed.span > 1.5
+    assert replayed.verdict == Status.INSIDE.value
+    assert Status.OUTSIDE not in {r.status for r in replayed.readings}
+
+
+def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
+    one: Path, tmp_path: Path
+) -> None:
+    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
+    config, out = load_config(path), tmp_path / "out"
+    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=quiet)
+    design_funnel_files(out / documents.MODEL, config, out)
+    kept = np.setdiff1d(np.arange(300), [100, 101, 102])
+    y = np.zeros((300, 2))
+    y[:, 0] = 0.01 * np.random.default_rng(0).standard_normal(300)
+    gap = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gap")
+    bag = write_joint_bag(tmp_path, gap)
+    held = ["monitor", "--replay", "--funnel", str(out / documents.FUNNEL), str(bag)]
+    done = CliRunner().invoke(app, held)
+    assert done.exit_code == 2, done.output
+    assert "not judged from 1.000 s on: 3 samples are missing" in done.output
+    replayed = replay_bag(documents.load_proved(out / documents.FUNNEL), bag, centre=Centre.COMMAND)
+    assert replayed.verdict == Status.UNKNOWN.value
+    assert replayed.span - replayed.judged_span == pytest.approx(0.03)
+    assert {r.status for r in replayed.readings[100:]} == {Status.INSIDE}

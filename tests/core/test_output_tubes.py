@@ -1,0 +1,208 @@
+"""Running against tubes around a model's simulation: for ever, over gaps, several at once."""
+
+import tracemalloc
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design import OutputTube, design_output_tube
+from nlsid_core.design.tube import energy, innovations
+from nlsid_core.errors import CertificateMismatch, DataError, OptionError
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.identification.prediction import history, simulate_trial
+from nlsid_core.models import BlockCascade
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.stepping import Stepper
+from tests.core.kernel.tube_claims import MODELS, dataset, design
+
+EVERY = pytest.mark.parametrize("name", MODELS)
+
+
+def run(monitor: Monitor, trial: Trajectory) -> list[Reading]:
+    rows = zip(trial.t, trial.y, trial.u, strict=True)
+    return [monitor.update(float(t), y, u) for t, y, u in rows]
+
+
+def monitor_of(name: str) -> Monitor:
+    made = design(name)
+    return Monitor(made.model, None, made.funnel)
+
+
+def trial_of(name: str, samples: int = 300, seed: int = 300) -> Trajectory:
+    return dataset(MODELS[name](), seed, 1, samples).trajectories[0]
+
+
+@EVERY
+def test_the_steps_of_every_class_are_those_of_its_simulation(name: str) -> None:
+    model, trial = MODELS[name](), trial_of(name, 80)
+    stepper = Stepper(model)
+    lags = history(model) if isinstance(model, BlockCascade) else stepper.lags
+    expected = simulate_trial(model, trial)
+    y = expected if isinstance(model, BlockCascade) else trial.y
+    lags = max(lags, stepper.lags)
+    x = stepper.begin(y[:lags], trial.u[:lags])[None]
+    for t in range(lags, len(trial)):
+        found, x = stepper.advance(x, trial.u[t])
+        assert found[0] == pytest.approx(expected[t], abs=1e-9)
+
+
+@EVERY
+def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -> None:
+    made, trial = design(name), trial_of(name)
+    tube, settling = made.funnel.tubes[0], made.funnel.settling
+    readings = run(monitor_of(name), trial)
+    assert all(r.status is Status.UNKNOWN for r in readings[:settling])
+    judged = readings[settling:]
+    assert all(r.status is not Status.UNKNOWN for r in judged)
+    E = energy(innovations(made.model, tube.L[None], trial, settling)[:, 0], tube)
+    used = np.array([r.assumption for r in judged])
+    if len(made.funnel.tubes) == 1:
+        assert used == pytest.approx(E / tube.level, rel=1e-6)
+        assert (used >= E / tube.level).all(), "rounded up"
+    else:
+        assert (used >= E / tube.level * (1 - 1e-9)).all(), "the most of several"
+    widths = made.funnel.half_widths
+    for k, r in enumerate(judged):
+        deviation = np.abs(np.array(r.nominal) - trial.y[settling + k])
+        assert 1.0 - r.margin >= (deviation / tube.half_widths).max() * (1 - 1e-12)
+        assert (r.status is Status.OUTSIDE) == (r.margin < 0.0)
+        assert (deviation <= widths).all() or r.status is not Status.INSIDE
+
+
+def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
+    monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
+    run(monitor, trial)
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    for lap in range(1, 21):
+        readings = run(monitor, replace(trial, t=trial.t + lap * 25.0))
+        assert all(r.status is not Status.UNKNOWN for r in readings)
+    grown = tracemalloc.get_traced_memory()[0] - before - 1_000_000
+    tracemalloc.stop()
+    assert grown < 0
+
+
+def test_a_missing_sample_is_a_step_without_injection_and_nothing_is_claimed_of_it() -> None:
+    trial = trial_of("linear", 200)
+    said, stamps = {}, trial.t
+    for kind in ("nan", "absent"):
+        monitor, readings = monitor_of("linear"), {}
+        for k, (t, y, u) in enumerate(zip(stamps, trial.y, trial.u, strict=True)):
+            gap = 52 <= k < 55
+            if gap and kind == "absent":
+                continue
+            readings[k] = monitor.update(float(t), np.array([np.nan]) if gap else y, u)
+        said[kind] = readings
+    for k in (52, 53, 54):
+        assert said["nan"][k].status is Status.UNKNOWN
+        assert "nothing is claimed" in said["nan"][k].reason
+    assert all(said["absent"][k].status is Status.INSIDE for k in range(55, 200))
+    # absent samples take the input before them, the others their own; steps of 10 hide it here
+    for k in range(55, 200):
+        assert said["nan"][k].margin == said["absent"][k].margin
+        assert said["nan"][k].assumption == said["absent"][k].assumption
+    whole = run(monitor_of("linear"), trial)
+    assert whole[60].nominal == said["nan"][60].nominal, "the simulation goes on"
+
+
+def test_a_drifting_clock_stays_on_the_grid_and_a_shifted_one_starts_a_new_run() -> None:
+    trial = trial_of("linear", 2000)
+    drifting = replace(trial, t=trial.t * 1.001)
+    assert sum(r.status is Status.UNKNOWN for r in run(monitor_of("linear"), drifting)) == 3
+    monitor = monitor_of("linear")
+    shifted = [float(t) + (0.4 * 0.025 if k >= 100 else 0.0) for k, t in enumerate(trial.t)]
+    readings = [monitor.update(t, y, u) for t, y, u in zip(shifted, trial.y, trial.u, strict=True)]
+    assert "off the grid" in readings[100].reason
+    assert [r.status is Status.UNKNOWN for r in readings[99:106]] == [0, 1, 1, 1, 1, 0, 0]
+    again = monitor.update(shifted[-1], trial.y[-1], trial.u[-1])
+    assert again.status is Status.UNKNOWN
+    assert "second time" in again.reason
+
+
+def test_an_input_that_the_model_refuses_or_a_box_that_is_left_is_not_judged() -> None:
+    monitor, trial = monitor_of("implicit_box"), trial_of("implicit_box", 100)
+    readings = []
+    for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True)):
+        readings.append(monitor.update(float(t), y, np.array([40.0]) if k == 50 else u))
+    assert readings[49].status is Status.INSIDE
+    assert "outside the box" in readings[50].reason
+    assert readings[50].status is readings[51].status is Status.UNKNOWN
+    assert readings[60].status is Status.INSIDE
+
+
+@EVERY
+def test_a_stuck_sensor_is_caught(name: str) -> None:
+    trial = trial_of(name, 300)
+    stuck = trial.y.copy()
+    stuck[100:] = stuck[100] + 0.8 * np.ptp(trial.y, axis=0)
+    readings = run(monitor_of(name), replace(trial, y=stuck))
+    bad = [r for r in readings[100:] if r.status in (Status.OUTSIDE, Status.ASSUMPTION_VIOLATED)]
+    assert bad
+    assert "innovation energy" in bad[0].reason
+    assert "what runs is not" not in bad[0].reason
+
+
+def test_an_energy_is_over_and_the_fading_tube_lasts() -> None:
+    made, trial = design("linear"), trial_of("linear", 100)
+    lasting, ending = (replace(made.funnel, tubes=(tube,)) for tube in made.funnel.tubes)
+    both = Monitor.of_several(made.model, [(None, lasting), (None, ending)])
+    rows = zip(trial.t, trial.y, trial.u, strict=True)
+    readings = [both.readings(float(t), y, u) for t, y, u in rows]
+    assert all(first.status is Status.INSIDE for first, _ in readings[3:])
+    assert readings[42][1].status is Status.INSIDE
+    assert readings[43][1].status is Status.UNKNOWN
+    assert "covers 40 samples" in readings[43][1].reason
+    alone = run(Monitor(made.model, None, lasting), trial)
+    assert [first for first, _ in readings] == alone, "the same bit for bit beside another"
+
+
+def test_a_funnel_of_another_model_is_refused() -> None:
+    with pytest.raises(CertificateMismatch, match="another model"):
+        Monitor(MODELS["monotone"](), None, design("linear").funnel)
+
+
+def test_a_funnel_reads_back_as_it_was_written() -> None:
+    for name in ("two_outputs", "implicit_box"):
+        funnel = design(name).funnel
+        assert TubeFunnel.from_document(funnel.document()).document() == funnel.document()
+
+
+# -- design ----------------------------------------------------------------------------------
+
+
+def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() -> None:
+    model = MODELS["linear"]()
+    made = design_output_tube(model, dataset(model, 0, 6))
+    tube = made.funnel.tubes[0]
+    assert [name for name, _ in tube.designed_on] == ["trial 0", "trial 2", "trial 4"]
+    assert [name for name, _ in tube.measured_on] == ["trial 1", "trial 3", "trial 5"]
+    with pytest.raises(DataError, match="for the design and for the calibration"):
+        design_output_tube(model, dataset(model, 0, 3), dataset(model, 2, 3))
+    single = design_output_tube(model, dataset(model, 0, 1, 1200))
+    assert "windows of one recording are hardly exchangeable" in str(single.verdict)
+
+
+def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says() -> None:
+    """Of 40 next trials, each beside 9 of its own: a tenth, within three standard deviations."""
+    model, exceeded = MODELS["linear"](), 0
+    tube = design("linear").funnel.tubes[0]
+    trials = dataset(model, 1000, 400, 60).trajectories
+    e = [innovations(model, tube.L[None], t, 3)[:, 0] for t in trials]
+    most = np.array([energy(part, tube).max() for part in e])
+    for k in range(40):
+        group = most[10 * k : 10 * k + 10]
+        exceeded += int(group[-1] > group[:-1].max())
+    assert exceeded <= 4 + 3 * np.sqrt(40 * 0.1 * 0.9)
+
+
+@pytest.mark.parametrize(
+    "options", [{"safety_factor": 0.5}, {"reaction_time": 0.0}, {"horizon": -1.0}]
+)
+def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None:
+    model = MODELS["linear"]()
+    with pytest.raises(OptionError):
+        OutputTube(model, Dataset(dataset(model, 0, 2).trajectories), **options)
