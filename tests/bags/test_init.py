@@ -227,7 +227,7 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("robot", "seconds"),
     [
-        ("ur10_panda/ur10_exciting_trajectory.db3", 5.5),
+        ("ur10_panda/ur10_exciting_trajectory.db3", 5.51),
         ("ur10_panda/panda_exciting_trajectory.db3", 4.8),
         ("cougars_auv/SO_lastbag_mcap", 24.0),
     ],
