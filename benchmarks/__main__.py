@@ -74,6 +74,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "robots": Benchmark("robots", data="."),
         "rwse_scaling": Benchmark("rwse_scaling"),
         "satellite": Benchmark("satellite"),
+        "tubes": Benchmark("tubes", data="."),
         "wiener_hammerstein": Benchmark("wiener_hammerstein", data="wh2009"),
         "wiener_hammerstein_cascade": Benchmark("wiener_hammerstein_cascade", data="wh2009"),
     }

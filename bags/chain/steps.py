@@ -301,8 +301,10 @@ def what_a_funnel_catches(
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
     if isinstance(design.funnel, TubeFunnel):
         factor = design.funnel.tubes[0].safety_factor
+        remedy = "another funnel.reaction_time, or a model that leaves less in its residual"
     else:
         factor = design.funnel.assumption.safety_factor
+        remedy = "a shorter funnel.horizon, or a smaller funnel.inlet"
     return what_it_catches(
         Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
         model,
@@ -311,6 +313,7 @@ def what_a_funnel_catches(
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
         factor=factor,
+        remedy=remedy,
     )
 
 

@@ -22,7 +22,7 @@ from nlsid_core.errors import DataError, percent
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.kernel import text
-from nlsid_core.models import Signal, StableModel
+from nlsid_core.models import Signal
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -147,30 +147,30 @@ def stability(candidate: Candidate[Model]) -> str:
 def funnel_table(design: TubeDesign | OutputTubeDesign) -> Table:
     """What the tube promises and on what."""
     if isinstance(design.funnel, TubeFunnel):
-        return _output_tubes(design.model, design.funnel)
+        return _output_tubes(design)
     return _driven_tube(design)
 
 
-def _output_tubes(model: StableModel, funnel: TubeFunnel) -> Table:
+def _output_tubes(design: OutputTubeDesign) -> Table:
+    model, funnel = design.model, design.funnel
     table = Table(title="proved tube", title_justify="left", show_header=False)
     table.add_column(style="dim")
     table.add_column()
     table.add_row("around", "the model's simulation under the inputs it receives; no policy")
     signals = (model.y,) if isinstance(model.y, Signal) else model.y
     for tube in funnel.tubes:
-        widths = zip(tube.half_widths, signals, strict=True)
         lasting = "for ever"
         if tube.samples is not None:
-            lasting = f"for {(tube.samples - 1) * model.period:g} s"
-        said = ", ".join(f"{width:g} {signal.unit} of {signal.name}" for width, signal in widths)
-        table.add_row("half-width", f"{said}, {lasting}")
-        table.add_row(
-            "assuming",
-            f"{tube.assumption}\n"
-            f"largest of {len(tube.measured_on)} calibration trials {tube.measured:.4g}, safety "
-            f"factor {tube.safety_factor:g} in amplitude",
+            span = (tube.samples - 1) * Fraction(model.period)
+            lasting = f"for {tube.samples} samples, which span {text.below(span)} s"
+        widths = zip(tube.half_widths.tolist(), signals, strict=True)
+        said = ", ".join(
+            f"{text.above(Fraction(width))} {signal.unit} of {signal.name}"
+            for width, signal in widths
         )
-    table.add_row("starts", f"after {funnel.settling} samples")
+        table.add_row("half-width", f"{said}, {lasting}")
+    for line in design.verdict.assumptions:
+        table.add_row("assuming", escape(line))
     return table
 
 
@@ -194,8 +194,9 @@ def _driven_tube(design: TubeDesign) -> Table:
 def catching_table(catching: Catching) -> Table:
     """What the funnel and other detectors catch of every sabotage, and how soon."""
     detectors = list(catching.rows[0].others)
+    plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trials, and how soon (median)",
+        title=f"caught of {catching.trials} held-back trial{plural}, and how soon (median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
@@ -251,11 +252,7 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
 
 def width_lines(catching: Catching) -> list[str]:
     """Every output's half-width beside its range."""
-    return [
-        f"half-width of {width.name}: {width.said}, {width.share:.2f} of its range, "
-        f"{width.range:.3g} {width.unit}"
-        for width in catching.widths
-    ]
+    return [f"half-width of {width.name}: {width.said}, {width.part}" for width in catching.widths]
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -151,6 +151,11 @@ class Width:
         return f"{_up(self.half_width)} {self.unit}".strip()
 
     @property
+    def part(self) -> str:
+        """Of which part of the range the half-width is, rounded up, and the range."""
+        return f"{_up(self.share)} of its range, {self.range:.3g} {self.unit}".strip()
+
+    @property
     def share(self) -> float:
         """The half-width as a part of the range; inf if the output was constant."""
         return self.half_width / self.range if self.range > 0.0 else float("inf")
@@ -162,7 +167,7 @@ class Catching:
 
     trials: how many were held back. shares: of each calibration trial, the part of what the funnel
     assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
-    (N, p).
+    (N, p). remedy: what to try where the assumption is what is wide.
     """
 
     widths: tuple[Width, ...]
@@ -171,6 +176,7 @@ class Catching:
     factor: float
     shares: tuple[tuple[str, float], ...]
     errors: tuple[tuple[FloatArray, FloatArray], ...]
+    remedy: str
 
     @property
     def widest(self) -> Width:
@@ -183,9 +189,8 @@ class Catching:
         for width in self.widths:
             if not width.share <= most:
                 said.append(
-                    f"the half-width of {width.name}, {width.said}, is {_up(width.share)} of its "
-                    f"range, {width.range:.3g} {width.unit}; more than {most:g} says little of "
-                    "where the robot is"
+                    f"the half-width of {width.name}, {width.said}, is {width.part}; more than "
+                    f"{most:g} says little of where the robot is"
                 )
                 said += [f"  {cause}" for cause in self._causes(width, most)]
         return said
@@ -212,8 +217,8 @@ class Catching:
         else:
             said.append(
                 f"{off}, and the half-width is {width.half_width / max(needed, TINY):.3g} times "
-                "that: what is assumed of the innovations is wider than the model's error. Try a "
-                "shorter funnel.horizon, or a smaller funnel.inlet"
+                "that: what is assumed of the innovations is wider than the model's error. Try "
+                f"{self.remedy}"
             )
         return said
 
@@ -238,12 +243,13 @@ def what_it_catches(
     calibration: Dataset,
     ranges: FloatArray,
     factor: float,
+    remedy: str,
 ) -> Catching:
     """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
 
     half_widths, ranges: (p,) of each output, in its unit. factor: the safety factor, which the
-    thresholds of the detectors have too. A detector that alarms in more of the untouched trials
-    than the monitor gets its threshold raised until it does not.
+    thresholds of the detectors have too. remedy: see `Catching`. A detector that alarms in more of
+    the untouched trials than the monitor gets its threshold raised until it does not.
     """
     p = len(ranges)
     first = held_back.trajectories[0]
@@ -278,6 +284,7 @@ def what_it_catches(
         factor,
         tuple(sorted(shares.items(), key=lambda entry: -entry[1])),
         tuple((run.t, run.residuals.error) for run in clean),
+        remedy,
     )
 
 

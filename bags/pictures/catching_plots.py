@@ -42,9 +42,7 @@ def _errors(axes: Axes, found: Catching, j: int) -> None:
     most = 1.15 * max(width.half_width, width.range / 2)
     axes.set_ylim(-most, 1.35 * most)
     axes.set_ylabel(f"error of {width.name} [{width.unit}]", fontsize=8)
-    axes.set_title(
-        f"half-width {width.said}: {width.share:.2f} of the range", fontsize=9, loc="left"
-    )
+    axes.set_title(f"half-width {width.said}: {width.part}", fontsize=9, loc="left")
     axes.legend(frameon=False, fontsize=7, loc="upper right", ncols=3)
 
 

@@ -98,9 +98,7 @@ def _catching(catching: Catching, drawn: str) -> str:
                    "unknown", "after", *detectors))  # fmt: skip
     rows = "".join(_catching_row(row, detectors) for row in catching.rows)
     widths = "; ".join(
-        f"{escape(w.name)} {escape(w.said)}, {w.share:.2f} of its range, {w.range:.3g} "
-        f"{escape(w.unit)}"
-        for w in catching.widths
+        f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
     )
     wide = "".join(f'<p class="not">{escape(line)}</p>' for line in catching.warnings())
     return f"""

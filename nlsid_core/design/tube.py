@@ -83,15 +83,15 @@ def design_output_tube(
     found = [_best(form, gains, e, amplitudes, samples, form.fading())]
     lasting: list[int | None] = [None]
     if horizon is not None:
-        found.append(_best(form, gains, e, amplitudes, samples, [1.0]))
-        lasting.append(max(1, round(horizon / model.period)))
+        lasting.append(length := max(1, round(horizon / model.period)))
+        found.append(_best(form, gains, e, amplitudes, length, [1.0]))
     tubes = []
-    for design, length in zip(found, lasting, strict=True):
+    for design, samples_left in zip(found, lasting, strict=True):
         tube = Tube(
             rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
             half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
             safety_factor=safety_factor, designed_on=trials.designed_on,
-            measured_on=trials.measured_on, samples=length,
+            measured_on=trials.measured_on, samples=samples_left,
         )  # fmt: skip
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
     funnel = TubeFunnel(

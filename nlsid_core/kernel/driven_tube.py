@@ -16,7 +16,7 @@ from fractions import Fraction
 from . import text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
-from .files import Mismatch, Node, Read, Rejected, bound_files
+from .files import Node, Read, Rejected, bound_files
 from .increments import Linear, Model, Signal, read_model
 from .trials import Recorded, calibration, read_trials, shared
 
@@ -201,7 +201,8 @@ def _read(
     policy: Node, funnel: Node, model: Model, digests: dict[str, str], fitted_to: list[Recorded]
 ) -> Tube:
     n, p = model.states, len(model.H)
-    plan = _opened(policy, "nlsid/policy", "period K L u x", "policy", ("model",), digests)
+    made_for = {"model": digests["model"]}
+    plan = policy.document("policy", "period K L u x", "linear", made_for=made_for)
     if plan["period"].number() != model.period:
         raise Rejected("the policy's period is not the model's")
     u = plan["u"].array(None, 1)
@@ -210,7 +211,8 @@ def _read(
     if len(u) * n**2 > MAX_NOMINAL:
         raise Rejected(f"{len(u)} samples of {n} states take too long to decide")
     names = "rho P R level inlet tau half_widths assumption"
-    parts = _opened(funnel, "nlsid/funnel", names, "funnel", ("model", "policy"), digests)
+    made_for["policy"] = digests["policy"]
+    parts = funnel.document("funnel", names, "linear", made_for=made_for)
     names = "kind budget samples measured safety_factor measured_on designed_on"
     given = parts["assumption"].members(names)
     tau = parts["tau"].array(p)
@@ -228,18 +230,3 @@ def _read(
         designed_on=read_trials(given["designed_on"]),
         fitted_to=fitted_to,
     )  # fmt: skip
-
-
-def _opened(
-    node: Node, form: str, names: str, owner: str, roles: tuple[str, ...], digests: dict[str, str]
-) -> dict[str, Node]:
-    """The members of a policy or a funnel of kind linear that was made for these files."""
-    parts = node.members(f"format version kind {' '.join(roles)} {names}")
-    if parts["format"].text() != form or parts["version"].whole(0) != 2:
-        raise Rejected(f"the {owner} should be of format {form}, version 2")
-    if parts["kind"].text() != "linear":
-        raise Rejected(f"the {owner}'s kind is {parts['kind'].text()!r}, expected 'linear'")
-    for role in roles:
-        if parts[role].text() != digests[role]:
-            raise Mismatch(f"the {owner} was made for another {role}")
-    return parts

@@ -189,11 +189,13 @@ class Node:
         """
         required = f"format version {'kind' * bool(kinds)} {' '.join(made_for or ())} {names}"
         parts = self.members(required, optional)
-        kind = parts["kind"].text() if kinds else ""
-        found = parts["format"].text(), parts["version"].whole(0), kind
-        if found not in [(f"nlsid/{form}", VERSION, known) for known in kinds.split() or [""]]:
-            wanted = f"nlsid/{form}, version {VERSION} {kinds}".rstrip()
-            raise Rejected(f"{self.where} should be of format {wanted}; it is of format {found}")
+        found, version = parts["format"].text(), parts["version"].whole(0)
+        if found != f"nlsid/{form}" or version != VERSION:
+            wanted = f"{self.where} should be of format nlsid/{form}, version {VERSION}"
+            raise Rejected(f"{wanted}; it is of format {found!r}, version {version}")
+        if kinds and parts["kind"].text() not in kinds.split():
+            wanted = " or ".join(map(repr, kinds.split()))
+            raise Rejected(f"the kind of {self.where} is {self.kind()!r}, expected {wanted}")
         for role, made in (made_for or {}).items():
             if parts[role].text() != made:
                 raise Mismatch(f"the {self.where} was made for another {role}")

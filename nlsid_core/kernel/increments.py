@@ -17,7 +17,7 @@ from math import comb, prod
 from . import text
 from .exact import Matrix, combined, definite, transposed
 from .exact import product as times
-from .files import Node, Rejected, label, plain
+from .files import Node, Rejected, label
 from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
 from .terms import derivative
 
@@ -166,12 +166,10 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
 
     bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form.
     """
-    if type(node.value) is not dict or type(node.value.get("kind")) is not str:
-        raise Rejected(f"{node.where}: 'kind' is missing")
-    kind = node.value["kind"]
+    kind = node.kind()
     if kind not in (*_READERS, "implicit"):
         known = ", ".join([*_READERS, "implicit"])
-        raise Rejected(f"{node.where}: kind is {plain(kind)!r}; known: {known}")
+        raise Rejected(f"{node.where}: kind is {kind!r}; known: {known}")
     if kind == "implicit":
         model = _implicit(node, bounds)
     elif bounds is None:
@@ -537,9 +535,8 @@ def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
 
 
 def _members(node: Node, names: str) -> dict[str, Node]:
-    parts = node.members(f"format version kind period training bags {names}", "equation")
-    if parts["format"].text() != "nlsid/model" or parts["version"].whole(0) != 2:
-        raise Rejected(f"{node.where} should be of format nlsid/model, version 2")
+    stated = f"period training bags {names}"
+    parts = node.document("model", stated, " ".join(_READERS), optional="equation")
     if "equation" in parts:
         parts["equation"].text()
     parts["training"].text()

@@ -63,8 +63,9 @@ def calibration(
     """On what a level was measured, and what is known of a next trial."""
     count = len(set(trials))
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
+    those = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
     return (
-        f"largest of {count} distinct {kind}{'s' * (count > 1)}, each taken whole, "
+        f"largest of {those} taken whole, "
         f"{text.above(measured)}, safety factor {text.below(factor)} in amplitude; "
         f"{_rank_bound(trials, fitted_to, count)}"
     )

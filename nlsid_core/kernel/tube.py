@@ -17,7 +17,7 @@ from fractions import Fraction
 from . import driven_tube, text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
-from .files import Mismatch, Node, Read, Rejected, bound_files
+from .files import Node, Read, Rejected, bound_files
 from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
 from .trials import Recorded, calibration, read_trials, shared
 
@@ -52,13 +52,9 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     if type(about.value) is dict and "policy" in about.value:
         return driven_tube.decide(claim, proof, read)
     documents, digests = bound_files(about, read, "model funnel")
-    funnel = documents["funnel"].members("format version kind model settling tubes", "box")
-    if funnel["format"].text() != "nlsid/funnel" or funnel["version"].whole(0) != 2:
-        raise Rejected("the funnel should be of format nlsid/funnel, version 2")
-    if funnel["kind"].text() != "tube":
-        raise Rejected(f"the funnel's kind is {funnel['kind'].text()!r}, expected 'tube'")
-    if funnel["model"].text() != digests["model"]:
-        raise Mismatch("the funnel was made for another model")
+    made_for, names = {"model": digests["model"]}, "settling tubes"
+    stated = documents["funnel"]
+    funnel = stated.document("funnel", names, "tube", optional="box", made_for=made_for)
     model = read_model(documents["model"], funnel.get("box"))
     tubes = [_read(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
     given = proof.members("", "multipliers").get("multipliers")

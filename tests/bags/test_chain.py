@@ -146,7 +146,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     assert lines["5 samples lost"][:4] == ["0", "0", "8", "-"]
     assert lines["bias, 10 % of range"][:2] == ["0", "0"]
     assert lines["bias, 10 % of range"][4] == "8", "where CUSUM catches more the table shows it"
-    assert "0.61 of its range" in made.output
+    assert "half-width of speed: 0.236 m/s, 0.606 of its range, 0.39 m/s" in made.output
     assert "warning: the half-width of speed, 0.236 m/s, is 0.606 of its range" in made.output
     assert "trial_12 sets the level" in made.output
     page = (out / documents.REPORT).read_text()
@@ -185,6 +185,26 @@ def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     assert "what it catches is not known" in made.output
     required = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path), "--require", "0.9"])
     assert required.exit_code == 2, "not measured is neither yes nor no"
+
+
+def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_path: Path) -> None:
+    path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
+    content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
+    path.write_text(json.dumps(content))
+    common = ["--config", str(path), "--out", str(tmp_path)]
+    made = CliRunner().invoke(app, ["identify", str(trial("41")), *common])
+    assert made.exit_code == 0, made.output
+    model = str(tmp_path / documents.MODEL)
+    made = CliRunner().invoke(app, ["funnel", "--model", model, *common])
+    assert made.exit_code == 0, made.output
+    assert "of 1 held-back trial," in made.output
+    proved = documents.load_proved_funnel(tmp_path / documents.FUNNEL)
+    said = proved.verdict.assumptions[1]
+    assert "largest of 1 distinct window, taken whole, " in said
+    assert said.endswith("as windows of one recording are hardly exchangeable)")
+    (digest,) = {digest for _, digest in proved.design.model.bags}
+    assert proved.design.funnel.assumption.designed_on == (("trial_41[0:44]", f"{digest}[0:44]"),)
+    assert proved.design.funnel.assumption.measured_on[0][1] == f"{digest}[44:88]"
 
 
 def test_a_model_of_another_class_is_named_as_configurations_name_it(

@@ -120,7 +120,7 @@ def test_repeated_trials_count_once_and_no_trial_measures_nothing(
     once = documents["funnel"]["assumption"]["measured_on"][0]
     again = {"name": "the same under another name", "digest": once["digest"]}
     documents["funnel"] = assuming(documents["funnel"], measured_on=[once, again, once])
-    assert "largest of 1 distinct trial, " in decide(documents).assumptions[1]
+    assert "largest of 1 distinct trial, taken whole, " in decide(documents).assumptions[1]
     documents["funnel"] = assuming(documents["funnel"], measured_on=[])
     with pytest.raises(CertificateRejected, match="measured on no trial"):
         decide(documents)

@@ -1,0 +1,27 @@
+"""Tubes around a simulation validate against their published schemas, and damaged ones do not."""
+
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from nlsid_core import files
+from nlsid_core.designs import FUNNEL, PROOF
+from tests.core.kernel.tube_claims import design
+
+SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
+FILES = {FUNNEL: "funnel_tube", PROOF: "proof_output_tube"}
+
+
+@pytest.mark.parametrize("name", ["linear", "split", "implicit_box"])
+@pytest.mark.parametrize(("file", "schema"), FILES.items())
+def test_every_written_document_validates_and_a_damaged_one_does_not(
+    name: str, file: str, schema: str
+) -> None:
+    stated = files.load_document(SCHEMAS / f"{schema}.schema.json")
+    jsonschema.Draft202012Validator.check_schema(stated)
+    document = design(name).documents()[file]
+    jsonschema.validate(document, stated)
+    for damaged in (document | {"extra": 1}, {k: v for k, v in document.items() if k != "format"}):
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(damaged, stated)
