@@ -72,6 +72,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "quadrotor": Benchmark("quadrotor"),
         "recorder": Benchmark("recorder"),
         "repeated_experiments": Benchmark("repeated_experiments"),
+        "robots": Benchmark("robots", data="."),
         "rwse_scaling": Benchmark("rwse_scaling"),
         "satellite": Benchmark("satellite"),
         "tubes": Benchmark("tubes", data="."),
