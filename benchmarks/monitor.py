@@ -6,8 +6,8 @@ Latency is from the sending of a sample, whose stamp is on an exact grid, to its
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
 the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
-the priority that a robot gives them. The monitor runs on a funnel made for timing (its horizon is
-as long as the run), not on a proved one.
+the priority that a robot gives them. The monitor runs on a funnel made for timing:
+its horizon is as long as the run.
 """
 
 import os
@@ -18,11 +18,13 @@ import argparse
 import json
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import rclpy
@@ -32,6 +34,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from bags.designs.bundle import Bundle
+from bags.designs.documents import FUNNEL
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from benchmarks.machine import describe, peers
@@ -40,6 +44,7 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.designs import Design
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.monitor import Monitor
@@ -113,8 +118,27 @@ def timing_funnel(seconds: float) -> TubeDesign:
     design = design_tube(
         blank, Dataset(tuple(trials)), profile=[(0.0, 0.0), (0.1, 0.1)], horizon=0.1
     )
-    lasting = replace(design.funnel.assumption, budget=1.0, samples=round((seconds + 10.0) * RATE))
-    return replace(design, funnel=replace(design.funnel, level=2.0, assumption=lasting))
+    more = round((seconds + 10.0) * RATE)
+    u = np.concatenate([design.policy.u, np.repeat(design.policy.u[-1:], more)])
+    x = [design.policy.x[0]]
+    for entry in u[:-1]:
+        x.append(blank.A @ x[-1] + blank.B[:, 0] * entry + blank.offset)
+    policy = replace(design.policy, x=np.array(x), u=u)
+    funnel = replace(
+        design.funnel,
+        level=2.0,
+        half_widths=np.sqrt(2.0 / design.funnel.tau) * (1.0 + 1e-12),  # rounded up
+        assumption=replace(design.funnel.assumption, budget=1.0, samples=more),
+        policy=files.digest(policy.document()),
+    )
+    return Design.proved(blank, policy, funnel, claim=design.claim, proof=design.proof, found=None)
+
+
+def bundle_of(design: TubeDesign) -> Bundle:
+    """Its files as they are published."""
+    with tempfile.TemporaryDirectory() as folder:
+        design.save(folder)
+        return Bundle.load(Path(folder) / FUNNEL)
 
 
 class Ear(Node):
@@ -126,10 +150,8 @@ class Ear(Node):
         self.echoes: dict[int, int] = {}
         self.error_ns = 0
         self.ready = False
-        for role in ("model", "policy", "funnel"):
-            document = getattr(design, role).document()
-            publisher = self.create_publisher(String, f"{SOURCE}/{role}", qos.DOCUMENT)
-            publisher.publish(String(data=files.encode(document).decode()))
+        publisher = self.create_publisher(String, f"{SOURCE}/design", qos.DOCUMENT)
+        publisher.publish(String(data=bundle_of(design).text()))
         lane = Lane(self)
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
             lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)

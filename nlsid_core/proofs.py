@@ -31,17 +31,19 @@ def check(path: Path | str) -> Verdict:
         raise CertificateRejected(str(refusal)) from refusal
 
 
-def decide(document: Json, about: Mapping[str, Json | bytes]) -> Verdict:
+def decide(document: Json | bytes, about: Mapping[str, Json | bytes]) -> Verdict:
     """`check` for a proof in memory; `about`: documents or bytes by the file names it binds."""
+
+    def content_of(given: Json | bytes) -> bytes:
+        return given if isinstance(given, bytes) else files.encode(given)
 
     def read(name: str) -> bytes:
         if name not in about:
             raise FileNotFoundError(2, "not given", name)
-        content = about[name]
-        return content if isinstance(content, bytes) else files.encode(content)
+        return content_of(about[name])
 
     try:
-        return kernel.decide(files.encode(document), read)
+        return kernel.decide(content_of(document), read)
     except kernel.Mismatch as refusal:
         raise CertificateMismatch(str(refusal)) from refusal
     except kernel.Rejected as refusal:

@@ -1,5 +1,6 @@
 """Health as `diagnostic_msgs/DiagnosticArray`, the way ROS tools expect it."""
 
+import socket
 from collections.abc import Mapping
 
 from builtin_interfaces.msg import Time
@@ -19,5 +20,9 @@ def status(
     array = DiagnosticArray()
     array.header.stamp = stamp
     pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    array.status = [DiagnosticStatus(level=level, name=name, message=message, values=pairs)]
+    array.status = [
+        DiagnosticStatus(
+            level=level, name=name, message=message, hardware_id=socket.gethostname(), values=pairs
+        )
+    ]
     return array

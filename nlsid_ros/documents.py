@@ -1,23 +1,25 @@
-"""The three latched documents of a proved funnel, put together as they arrive.
+"""The latched bundle of a proved funnel, decided by the kernel before anything uses it.
 
-Of a continuous funnel `model` is the vector field, and parameters say where its signals are.
+Of a continuous funnel parameters say where its signals are.
 """
 
+import re
 from collections.abc import Callable
-from functools import partial
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from bags.designs.design import AnyDesign, Wiring, read_design
-from nlsid_core import files
-from nlsid_core.arrays import Json
-from nlsid_core.errors import NlsidError
+from bags.designs.bundle import MAX_BYTES, Bundle, Check
+from bags.designs.design import AnyDesign, Wiring
+from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.running import declare_number, declare_text
 
-ROLES = ("model", "policy", "funnel")
-Taken = Callable[[AnyDesign], None]
+LOOK = 0.2  # s between looks at who publishes, and at a check that is on
+CHECKING = "checking the proof"
+_DIGEST = re.compile(r"(sha256:)?[0-9a-f]{64}", re.ASCII)
 
 
 def declare_wiring(node: Node) -> Wiring | None:
@@ -37,36 +39,123 @@ def declare_wiring(node: Node) -> Wiring | None:
     )
 
 
-class FunnelSubscription:
-    """Calls `taken` with the design of `source` once its documents are all there and belong
-    together, again whenever they are replaced; `refused` with the reason when they do not.
+def declare_expected(node: Node) -> str:
+    """The parameter that pins the funnel; DataError if it is no digest."""
+    what = "SHA-256 of the only funnel.json to be used, as sha256sum prints it; empty: any proved"
+    expected = declare_text(node, "expected_digest", "", what)
+    if expected and not _DIGEST.fullmatch(expected):
+        raise DataError(f"expected_digest is '{expected}'; it should have 64 hexadecimal digits")
+    return "sha256:" + expected.removeprefix("sha256:") if expected else ""
+
+
+class DesignSubscription:
+    """Calls `taken` with the design that `source` publishes and its funnel's digest, once the
+    kernel has proved it here, and again when it has proved another; the same one again changes
+    nothing.
+
+    It is decided in a process of its own, while the node goes on. `state` says what becomes of it,
+    `refusal` why the newest was not used, empty if it was; `changed` is called when either changes.
+    With two publishers on the topic nothing is used until one of them is gone.
     """
 
     def __init__(
         self,
         node: Node,
         source: str,
-        taken: Taken,
-        refused: Callable[[str], None],
+        taken: Callable[[AnyDesign, str], None],
+        changed: Callable[[], None],
         *,
         wiring: Wiring | None = None,
+        expected: str = "",
     ) -> None:
-        self._taken, self._refused = taken, refused
-        self._documents: dict[str, Json] = {}
-        self._wiring = wiring
-        self.digest = ""
-        for role in ROLES:
-            node.create_subscription(
-                String, f"{source}/{role}", partial(self._take, role), qos.DOCUMENT
-            )
+        self._node, self._taken, self._changed = node, taken, changed
+        self._wiring, self._expected = wiring, expected
+        self._check: Check | None = None
+        self._waiting: str | None = None
+        self._used = ""  # the text of the design in use
+        self._crowded = False
+        self.digest = self.refusal = self._verdict = ""
+        self.state = "waiting for a design"
+        self._subscribe(source)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(LOOK, self._look, clock=wall)
 
-    def _take(self, role: str, message: String) -> None:
-        try:
-            self._documents[role] = files.parse_document(message.data, source=role)
-            if len(self._documents) < len(ROLES):
+    def close(self) -> None:
+        """Call off a check that is on."""
+        if self._check is not None:
+            self._check.close()
+            self._check = None
+
+    def _subscribe(self, source: str) -> None:
+        self._subscription = self._node.create_subscription(
+            String, f"{source}/design", self._on_bundle, qos.DOCUMENT
+        )
+        self._source = source
+
+    def _on_bundle(self, message: String) -> None:
+        if self._is_crowded():
+            return
+        if len(message.data) > MAX_BYTES:
+            self._refuse(f"it has {len(message.data)} characters; at most {MAX_BYTES} are read")
+            return
+        self._waiting = message.data
+        if message.data == self._used:
+            self._waiting, self.refusal, self.state = None, "", self._verdict
+            self._changed()
+        self._look()
+
+    def _is_crowded(self) -> bool:
+        """Whether several publish designs here: nobody can know whose counts."""
+        topic = self._subscription.topic_name
+        count = self._node.count_publishers(topic)
+        if count > 1:
+            if not self._crowded:
+                self._refuse(f"{topic} has {count} publishers; stop all but one")
+            self._crowded = True
+            self._waiting = None
+        elif self._crowded and count == 1:  # which the one that is left has published is not known
+            self._crowded = False
+            self._node.destroy_subscription(self._subscription)
+            self._subscribe(self._source)
+        return self._crowded
+
+    def _look(self) -> None:
+        """Take what the kernel has decided, and have the next one decided."""
+        if self._is_crowded():
+            self.close()
+        if self._check is not None and (answer := self._check.poll()) is not None:
+            text = self._check.text
+            self.close()
+            if "refused" in answer:
+                self._refuse(str(answer["refused"]))
+            else:
+                self._accept(text, str(answer["proved"]))
+        if self._check is None and self._waiting is not None:
+            text, self._waiting = self._waiting, None
+            try:
+                self._check = Check(text)
+            except OSError as error:
+                self._refuse(f"it cannot be checked: {error}")
                 return
-            design = read_design(self._documents, wiring=self._wiring)
-            self.digest = files.digest(self._documents["funnel"])
-            self._taken(design)
+            self.state = CHECKING
+            self._changed()
+
+    def _accept(self, text: str, verdict: str) -> None:
+        try:
+            bundle = Bundle.parse(text)
+            if self._expected and bundle.digest != self._expected:
+                self._refuse(f"its funnel is {bundle.digest}, not the expected {self._expected}")
+                return
+            if bundle.digest != self.digest:
+                self._taken(bundle.design(self._wiring), bundle.digest)
         except NlsidError as error:
-            self._refused(f"funnel not used: {error}")
+            self._refuse(str(error))
+            return
+        self._used, self._verdict, self.digest = text, verdict, bundle.digest
+        self.refusal, self.state = "", verdict
+        self._changed()
+
+    def _refuse(self, reason: str) -> None:
+        self.refusal = self.state = f"design refused: {reason}"
+        self._node.get_logger().error(self.refusal)
+        self._changed()

@@ -29,7 +29,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.messages import SignalMessage
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
@@ -274,7 +274,7 @@ class Excitation(ManagedNode):
         }
         level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, self.get_name(), level, self._state, values))
+        self._diagnostics.publish(status(now, name_of(self), level, self._state, values))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -4,7 +4,8 @@ Subscribes to the funnel, its model and its policy, and to the two signals by th
 paths, on message stamps. Publishes ~/margin (sensor_msgs/JointState: stamped, named numbers) for
 every sample, ~/events when the state changes, and /diagnostics at once when it does, otherwise
 once a second. Leaving the funnel calls `stop_service` and `snapshot_service`. Missing, stale or NaN
-state is unknown (STALE), never inside. `~/restart` begins a new run.
+state is unknown (STALE), never inside. What is outside, or violates the assumption, stays so until
+`~/restart`, which begins a new run.
 """
 
 import sys
@@ -19,6 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -36,14 +38,16 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription, declare_wiring
+from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.messages import stamp_ns_of
-from nlsid_ros.running import ManagedNode, declare_number, declare_text, run
+from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
+from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
 DISCOVERY = 0.1  # s: how often the graph is asked for the signals' types
+RETRY = 0.5  # s until a service that has not answered is called again
+THROTTLE = 5.0  # s between log lines about a service that does not answer
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
 LEVELS = {
     State.INSIDE: DiagnosticStatus.OK,
@@ -70,13 +74,19 @@ class FunnelMonitor(ManagedNode):
             declare_text(self, "nominal", "command", "what the tube is around: command or profile")
         )
         self._wiring = declare_wiring(self)
+        self._expected = declare_expected(self)
         number = partial(declare_number, self, tunable=True)
-        number("stale_after", 0.1, "s without a response: unknown", between=(0.001, 60.0))
+        what = "s without a response, or from its stamp to this node's clock: unknown"
+        number("stale_after", 0.1, what, between=(0.001, 60.0))
         number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
         number("warning_margin", 0.2, "warn below", between=(0.0, 1.0))
         number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
         number("hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0))
         number("clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0))
+        what = "judge stamps that are not of now: a recording that is played again"
+        self._allow_old_stamps = bool(declare(self, "allow_old_stamps", False, what))
+        what = "frame_id that the response must have; empty: that of the first"
+        self._frame = declare_text(self, "response_frame", "", what)
         self._watch: Watch | None = None
         self.tune(self.tunable())
         self._stop_service = declare_text(
@@ -96,10 +106,14 @@ class FunnelMonitor(ManagedNode):
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
         self._signals = Lane(self)
-        self._waiting: dict[str, SignalPath | SignalVector] = {}
+        self._paths: dict[str, SignalPath | SignalVector] = {}
+        self._kinds: dict[str, str] = {}  # role -> the type it is subscribed with
+        self._unfit = ""
         self._watch = None
+        self._latched: tuple[State, str] | None = None
+        self._frame_heard = self._frame
         self._run: Run | None = None
-        waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for the funnel")
+        waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for a design")
         self._said: tuple[Reading, State] = waiting, State.UNKNOWN
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
@@ -107,18 +121,28 @@ class FunnelMonitor(ManagedNode):
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._funnel = FunnelSubscription(
-            self, self._source, self._on_funnel, self._on_refusal, wiring=self._wiring
+        self._funnel = DesignSubscription(
+            self,
+            self._source,
+            self._on_design,
+            self._on_news,
+            wiring=self._wiring,
+            expected=self._expected,
         )
         if self._controller:
             self.create_subscription(String, f"{self._controller}/run", self._on_run, qos.DOCUMENT)
         self.create_service(Trigger, "~/restart", self._on_restart)
         names = (self._stop_service, self._snapshot_service)
         self._on_exit = [self.create_client(Trigger, name) for name in names if name]
-        simulated = self.get_parameter("use_sim_time").value
-        self._patience = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
+        self._unanswered: dict[Client, Future | None] = {}
+        self._failures: dict[str, str] = {}
+        self._simulated = bool(self.get_parameter("use_sim_time").value)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self._patience = self.get_clock() if self._simulated else wall
+        self._clock_ns = -1
         self.create_timer(DISCOVERY, self._connect, clock=wall)
+        self._retry = self.create_timer(RETRY, self._call, clock=wall)
+        self._retry.cancel()
         self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
         self._stale = self.create_timer(self._stale_after, self._on_stale, clock=self._patience)
         self._stale.cancel()
@@ -127,24 +151,31 @@ class FunnelMonitor(ManagedNode):
         )
         self._release.cancel()
 
-    def _on_funnel(self, design: AnyDesign) -> None:
-        """A funnel came, or another one: watch its signals from scratch."""
+    def stop(self) -> None:
+        """Call off a check that is on."""
+        self._funnel.close()
+
+    def _on_design(self, design: AnyDesign, digest: str) -> None:
+        """A proved design came, or another one: watch its signals from scratch."""
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
         signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
-        self._watch = watch
-        self._waiting = signals
+        self._watch, self._digest = watch, digest
+        self._paths, self._kinds, self._unfit = signals, {}, ""
+        self._frame_heard = self._frame
         self._deadlines.clear()
         self._tell(f"no {design.name} yet")
         self.get_logger().info(f"watching {design.response} and {design.command}")
         self._begin()
 
-    def _on_refusal(self, reason: str) -> None:
-        self._watch = None
-        self.get_logger().error(reason)
-        self._tell(reason)
+    def _on_news(self) -> None:
+        """A check began, or a design was used again or refused: what is in use stays in use."""
+        if self._watch is None:
+            self._tell(self._funnel.state)
+        else:
+            self._diagnostics.publish(self._status_message())
 
     def _on_run(self, message: String) -> None:
         """A controller announced the stamp of its sample 0."""
@@ -153,38 +184,55 @@ class FunnelMonitor(ManagedNode):
         except NlsidError as error:
             self.get_logger().error(f"announcement not used: {error}")
             return
+        if self._latched is not None:  # what happened before has not been looked at
+            self._call_for_help()
         self._begin()
 
     def _begin(self) -> None:
         """Begin the announced run if it is of the funnel at hand."""
         if self._watch is None or self._run is None:
             return
-        if self._run.funnel != self._funnel.digest:
-            self._tell("the controller tracks another funnel than the one published")
+        if self._run.funnel != self._digest:
+            self._tell("the controller tracks another funnel than the one in use here")
             return
         self._publish(self._watch.begin(self._run.start_ns))
 
     def _connect(self) -> None:
-        """Subscribe to signals whose topic has appeared, once its type is known to carry them."""
-        if not self._waiting or self._watch is None:
+        """Subscribe to the signals, each with a type that its publishers have and that carries it.
+
+        A subscription whose type is no longer published is replaced.
+        """
+        if self._watch is None:
             return
-        types = dict(self.get_topic_names_and_types())
-        for role, path in list(self._waiting.items()):
-            publishers = self.get_publishers_info_by_topic(path.topic)
-            kinds = types.get(self.resolve_topic_name(path.topic), [])
-            if not kinds or not publishers:
+        for role, path in self._paths.items():
+            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(path.topic))
+            kinds = list(dict.fromkeys(publisher.topic_type for publisher in publishers))
+            if not kinds or self._kinds.get(role) in kinds:
                 continue
-            del self._waiting[role]
-            kind = kinds[0]
             try:
-                self._watch.pairing.check(path.topic, kind, standard_types())
+                kind = self._fitting(path.topic, kinds)
             except BagError as error:
-                self.get_logger().error(str(error))
-                self._tell(str(error))
-                return
+                if str(error) != self._unfit:
+                    self._unfit = str(error)
+                    self.get_logger().error(str(error))
+                    self._tell(str(error))
+                continue
+            self._kinds[role], self._unfit = kind, ""
             callback = partial(self._on_signal, role, path)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
             self._signals.subscribe(message_class(kind), path.topic, callback, profile)
+
+    def _fitting(self, topic: str, kinds: list[str]) -> str:
+        """The first of the types that carries the signals; BagError about the last if none does."""
+        assert self._watch is not None
+        for kind in kinds:
+            try:
+                self._watch.pairing.check(topic, kind, standard_types())
+            except BagError as error:
+                unfit = error
+                continue
+            return kind
+        raise unfit
 
     def _on_signal(self, role: str, path: SignalPath | SignalVector, message: Any) -> None:
         """Decode stamp and value, and judge whatever samples are complete."""
@@ -201,6 +249,9 @@ class FunnelMonitor(ManagedNode):
         if role == "excitation":
             self._publish(watch.excitation(stamp_ns, value))
             return
+        if not logged and (reason := self._distrust(stamp_ns, message)):
+            self._publish(watch.refuse(stamp_ns, reason))
+            return
         self._heard_ns = self._patience.now().nanoseconds
         if self._stale.is_canceled():
             self._stale.reset()
@@ -213,6 +264,16 @@ class FunnelMonitor(ManagedNode):
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
                 self._release_in(due - self._heard_ns)
+
+    def _distrust(self, stamp_ns: int, message: Any) -> str:
+        """Why a response is not to be judged though its number could be; empty if it is."""
+        frame = frame_of(message)
+        self._frame_heard = self._frame_heard or frame
+        if frame != self._frame_heard:
+            return f"the response is in frame '{frame}', not in '{self._frame_heard}'"
+        if self._allow_old_stamps:
+            return ""
+        return off_clock(stamp_ns, self.get_clock(), self._stale_after)
 
     def _release_in(self, ahead_ns: int) -> None:
         self._release.timer_period_ns = ahead_ns
@@ -266,32 +327,62 @@ class FunnelMonitor(ManagedNode):
         self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN, at_once=True)
 
     def _say(self, reading: Reading, state: State, *, at_once: bool = False) -> None:
-        """Publish diagnostics, and an event, if the state changed; remember what to repeat."""
+        """Publish diagnostics, and an event, if the state changed; remember what to repeat.
+
+        An alarm is repeated until ~/restart, whatever comes after it.
+        """
         before = self._said[1]
         self._said = reading, state
         if state is before and not at_once:
             return
+        severity = SEVERITY.get(state, 0)
+        news = self._latched is None or severity > SEVERITY[self._latched[0]]
+        if severity >= SEVERITY[State.ASSUMPTION_VIOLATED] and news:
+            first = self._latched is None
+            self._latched = state, reading.reason
+            if first:
+                self._call_for_help()
         message = self._status_message()
         self._diagnostics.publish(message)
         self._events.publish(message)
-        worse = SEVERITY.get(state, 0) >= SEVERITY[State.ASSUMPTION_VIOLATED]
-        if worse and SEVERITY.get(before, 0) < SEVERITY[State.ASSUMPTION_VIOLATED]:
-            self._call_for_help()
 
     def _call_for_help(self) -> None:
-        """Ask the configured services to stop the robot and to keep what led here."""
-        for client in self._on_exit:
-            if not client.service_is_ready():
-                self.get_logger().error(f"{client.srv_name} is not there to be called")
-                continue
-            client.call_async(Trigger.Request()).add_done_callback(partial(self._on_answer, client))
+        """Have the configured services stop the robot and keep what led here; ask until they do."""
+        self._unanswered = dict.fromkeys(self._on_exit)
+        self._call()
+        self._retry.reset()
 
-    def _on_answer(self, client: Client, future: Any) -> None:
-        answer = future.result()
-        log = self.get_logger().info if answer.success else self.get_logger().error
-        log(f"{client.srv_name}: {answer.message}")
+    def _call(self) -> None:
+        """Call those who have not said that they did; the failures are in every status."""
+        for client, future in list(self._unanswered.items()):
+            answer = future.result() if future is not None and future.done() else None
+            if answer is not None and answer.success:
+                self.get_logger().info(f"{client.srv_name}: {answer.message}")
+                del self._unanswered[client]
+                continue
+            if future is not None:
+                client.remove_pending_request(future)
+                why = answer.message if answer is not None else "no answer"
+                self._failures[client.srv_name] = why
+            self._unanswered[client] = None
+            if client.service_is_ready():
+                self._unanswered[client] = client.call_async(Trigger.Request())
+            else:
+                self._failures[client.srv_name] = "not there to be called"
+        asked = {client.srv_name for client in self._unanswered}
+        for name in self._failures.keys() - asked:
+            del self._failures[name]
+        for name, why in self._failures.items():
+            self.get_logger().error(f"{name}: {why}", throttle_duration_sec=THROTTLE)
+        if not self._unanswered:
+            self._retry.cancel()
 
     def _on_heartbeat(self) -> None:
+        clock_ns = self.get_clock().now().nanoseconds
+        if self._simulated and clock_ns == self._clock_ns and self._watch is not None:
+            reason = "simulated time stands still: nobody publishes /clock"
+            self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN)
+        self._clock_ns = clock_ns
         self._diagnostics.publish(self._status_message())
         self._slowest_ns = 0
 
@@ -300,25 +391,36 @@ class FunnelMonitor(ManagedNode):
         watch = self._watch
         values = {
             **{name.replace("_", " "): f"{n:.6g}" for name, n in reading.numbers.items()},
+            "now": state.value,
             "worst axis": reading.worst_axis,
             "assuming": reading.assuming,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
+            "design": self._funnel.state,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
-        text = state.value + (f": {reading.reason}" if reading.reason else "")
+        level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
+        if self._latched is not None:
+            level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
+            text += "".join(f"; {name}: {why}" for name, why in self._failures.items())
+        if self._funnel.refusal:
+            level = DiagnosticStatus.ERROR
+            text += f"; {self._funnel.refusal}" if watch else ""
         stamp = self.get_clock().now().to_msg()
-        return status(stamp, name_of(self), LEVELS[state], text, values)
+        return status(stamp, name_of(self), level, text, values)
 
     def _on_restart(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         """Begin a new run: forget stamps, lags and budget."""
         answer.success = self._watch is not None
-        answer.message = "new run" if answer.success else "there is no funnel yet"
+        answer.message = "new run" if answer.success else "there is no design yet"
         if self._watch is not None:
             self._watch.restart()
-            self._run = None
+            self._run = self._latched = None
+            self._unanswered.clear()
+            self._failures.clear()
+            self._frame_heard = self._frame
             self._deadlines.clear()
             self._tell("restarted")
         return answer

@@ -1,12 +1,11 @@
-"""Node `funnel_publisher`: checks a funnel's proof, then publishes the funnel, latched.
+"""Node `funnel_publisher`: checks a funnel's proof, then publishes the design, latched.
 
-Publishes ~/funnel, ~/model and ~/policy (std_msgs/String, transient local): the JSON documents as
-they were proved; ~/tube (visualization_msgs/MarkerArray) and ~/nominal
-(trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses what is
-not proved: one error on /diagnostics, and exit status 1 if it is the first.
+Publishes ~/design (std_msgs/String, transient local): the files of model, policy, funnel and proof
+as one bundle, which whoever uses it has decided again; ~/tube (visualization_msgs/MarkerArray) and
+~/nominal (trajectory_msgs/JointTrajectory) show it. Publishes again when the files change. Refuses
+what is not proved: one error on /diagnostics, and exit status 1 if it is the first.
 """
 
-import json
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,15 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
+from bags.designs.bundle import Bundle
 from bags.designs.design import AnyDesign
-from bags.designs.documents import Proved, load_proved
-from nlsid_core.arrays import Json
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
@@ -31,6 +31,7 @@ from nlsid_ros.running import ManagedNode, declare, declare_text, run
 
 NAME = "funnel_publisher"
 LOOK = 0.5  # s between looks at the files
+REPORT = 1.0  # s between diagnostics while nothing changes
 
 
 class FunnelPublisher(ManagedNode):
@@ -57,17 +58,17 @@ class FunnelPublisher(ManagedNode):
         self._latched = {
             name: self.create_publisher(kind, f"~/{name}", qos.DOCUMENT)
             for name, kind in (
-                ("model", String),
-                ("policy", String),
-                ("funnel", String),
+                ("design", String),
                 ("tube", MarkerArray),
                 ("nominal", JointTrajectory),
             )
         }
         self._seen = self._files(self._path)
         self._publish(self._load(self._path))
+        wall = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(REPORT, self._report, clock=wall)
         if self._watch:
-            self.create_timer(LOOK, self._look)
+            self.create_timer(LOOK, self._look, clock=wall)
 
     def stop(self) -> None:
         """Publish no more."""
@@ -95,26 +96,32 @@ class FunnelPublisher(ManagedNode):
         with suppress(NlsidError, OSError):  # said by _load
             self._publish(self._load(self._path))
 
-    def _load(self, path: Path) -> Proved[AnyDesign]:
+    def _load(self, path: Path) -> tuple[Bundle, AnyDesign, str]:
+        """What to publish, what it is, and what is proved of it."""
         try:
-            return load_proved(path)
+            bundle = Bundle.load(path)
+            return bundle, bundle.design(), str(bundle.decided())
         except (NlsidError, OSError) as refusal:
             self._say(DiagnosticStatus.ERROR, f"REJECTED {refusal}")
             self.get_logger().fatal(f"not published, not proved: {refusal}")
             raise
 
-    def _publish(self, proved: Proved[AnyDesign]) -> None:
-        for name in ("model", "policy", "funnel"):
-            document: Json = getattr(proved.design, name).document()
-            self._latched[name].publish(String(data=json.dumps(document)))
-        self._latched["tube"].publish(tube_markers(proved.design, self._frame))
-        self._latched["nominal"].publish(nominal_trajectory(proved.design))
-        self._say(DiagnosticStatus.OK, str(proved.verdict))
-        self.get_logger().info(str(proved.verdict))
+    def _publish(self, proved: tuple[Bundle, AnyDesign, str]) -> None:
+        bundle, design, verdict = proved
+        self._latched["design"].publish(String(data=bundle.text()))
+        if design.policy is not None:  # without a plan there is nothing to draw
+            self._latched["tube"].publish(tube_markers(design, self._frame))
+            self._latched["nominal"].publish(nominal_trajectory(design))
+        self._say(DiagnosticStatus.OK, verdict)
+        self.get_logger().info(verdict)
 
     def _say(self, level: bytes, message: str) -> None:
+        self._said = level, message
+        self._report()
+
+    def _report(self) -> None:
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, message, {}))
+        self._diagnostics.publish(status(now, name_of(self), *self._said, {}))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -23,10 +23,14 @@ Received = Callable[[Any], None]
 
 
 class Lane:
-    """Subscriptions of a node, which has to be spun by one thread."""
+    """Subscriptions of a node, which has to be spun by one thread.
+
+    In simulated time it stays for nothing: the clock comes by the executor.
+    """
 
     def __init__(self, node: Node) -> None:
         self._node = node
+        self._stays = not node.get_parameter("use_sim_time").value
         self._callbacks: dict[Subscription, Received] = {}
 
     def subscribe(self, kind: Any, topic: str, callback: Received, profile: QoSProfile) -> None:
@@ -34,7 +38,8 @@ class Lane:
 
         def received(message: Any) -> None:
             callback(message)
-            self._stay()
+            if self._stays:
+                self._stay()
 
         subscription = self._node.create_subscription(kind, topic, received, profile)
         self._callbacks[subscription] = callback

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock
 
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.signals.signal import SignalPath
@@ -47,6 +48,21 @@ def _make_room(path: SignalPath, message: Any) -> None:
                 setattr(owner, step.field, [*part, *[0.0] * (step.index + 1 - len(part))])
             return
         owner = part
+
+
+def frame_of(message: Any) -> str:
+    """The frame that a message is in, and the one that moves if it names it."""
+    child = getattr(message, "child_frame_id", "")
+    return f"{message.header.frame_id}, {child}" if child else str(message.header.frame_id)
+
+
+def off_clock(stamp_ns: int, clock: Clock, most: float) -> str:
+    """Why a stamp is not of now, give or take `most` s; empty if it is."""
+    age = (clock.now().nanoseconds - stamp_ns) * 1e-9
+    if abs(age) <= most:
+        return ""
+    way = "before" if age > 0 else "after"
+    return f"a response is stamped {abs(age):.3g} s {way} this node's clock; {most:g} s are allowed"
 
 
 def stamp_ns_of(message: Any) -> int:

@@ -19,7 +19,7 @@ from bags.designs import documents
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.proofs import check
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.running import ManagedNode, declare, declare_text, run
 
 NAME = "model_identifier"
@@ -111,7 +111,7 @@ class ModelIdentifier(ManagedNode):
         text = said.what + (f": {said.error}" if said.error else "")
         now = self.get_clock().now().to_msg()
         values = {"progress": f"{said.fraction:.2f}", "out": str(self._out)}
-        self._diagnostics.publish(status(now, self.get_name(), level, text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def main(args: list[str] | None = None) -> None:

@@ -50,7 +50,8 @@ def plan_of(design: AnyDesign) -> Plan:
 
 def tube_markers(design: AnyDesign, frame: str) -> MarkerArray:
     """The plan and the tube's edges over time: 1 m along x is 1 s, along y one unit."""
-    plan, markers = plan_of(design), []
+    plan, markers = plan_of(design), [Marker(action=Marker.DELETEALL)]
+    markers[0].header.frame_id = frame
     columns = zip(plan.names, plan.nominal.T, plan.half_widths.T, strict=True)
     for name, nominal, width in columns:
         lines = ((nominal, NOMINAL), (nominal + width, EDGE), (nominal - width, EDGE))

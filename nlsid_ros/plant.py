@@ -63,6 +63,8 @@ class PlantNode(ManagedNode):
             "mass_scale", 1.0, "of every mass and inertia (MuJoCo)", between=(0.1, 10.0)
         )
         self._delay = number("delay", 0.0, "s from stamp to publication", between=(0.0, 10.0))
+        what = "s after which a command is no longer in force and the input is zero"
+        self._command_timeout = number("command_timeout", 0.5, what, between=(0.0, 3600.0))
         self._push = number("push", 0.3, "size of a push, input's unit", between=(-1e6, 1e6))
         self._push_duration = number("push_duration", 0.3, "s of a push", between=(0.0, 60.0))
         pushed: Any = declare(self, "push_input", 0, "index of the input pushed", between=(0, 100))
@@ -158,10 +160,15 @@ class PlantNode(ManagedNode):
         self._sent.append((due_ns, self._response.make(stamp_ns, y)))
 
     def _in_force(self, stamp_ns: int) -> FloatArray:
-        """The latest command stamped up to `stamp_ns`; those before it are forgotten."""
+        """The latest command stamped up to `stamp_ns`; those before it are forgotten.
+
+        The watchdog that every base needs: a command that is not renewed ends.
+        """
         while len(self._commands) > 1 and self._commands[1][0] <= stamp_ns:
             del self._commands[0]
-        return self._commands[0][1]
+        given_ns, values = self._commands[0]
+        is_old = stamp_ns - given_ns > round(self._command_timeout * 1e9)
+        return np.zeros(self._inputs) if is_old else values
 
     def _on_push(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         self._push_from_ns = self._next_ns

@@ -8,12 +8,16 @@ match a best-effort publisher: `subscription_to` matches what the publisher offe
 SENSOR: the response a controller acts on. Best effort matches every publisher, and an old sample
 sent again would be too late to act on.
 EVENTS: diagnostics. Reliable; a few pending are enough.
+`command`: what a robot acts on. Reliable, and the newest only: an older one must not act after it.
+Its deadline lets a base ask for commands in time, and hear from DDS when they are not.
 """
 
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from bags.recordings.quality import Profile
 
+LEAST_DEADLINE = 0.05  # s
 DOCUMENT = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
@@ -38,6 +42,17 @@ EVENTS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
+
+
+def command(period: float) -> QoSProfile:
+    """For commands sent every `period` s; the deadline leaves room for a busy machine."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+        deadline=Duration(seconds=max(4.0 * period, LEAST_DEADLINE)),
+    )
 
 
 def subscription_to(offered: list[ReliabilityPolicy]) -> QoSProfile:

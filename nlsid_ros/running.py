@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -17,6 +19,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,6 +28,7 @@ from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
+CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
@@ -53,6 +57,9 @@ class ManagedNode(LifecycleNode):
         self.autostart = bool(
             declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
         )
+        self._started_itself = False
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self.failure: Exception | None = None
         self._running = False
         self._made_before: set[object] = set()
@@ -74,7 +81,37 @@ class ManagedNode(LifecycleNode):
 
     def tunable(self) -> dict[str, Any]:
         """The tunable parameters' values."""
-        return {d.name: self.get_parameter(d.name).value for d in self.declared if d.tunable}
+        tunable = (declared for declared in self.declared if declared.tunable)
+        return {d.name: _as_meant(d, self.get_parameter(d.name).value) for d in tunable}
+
+    def start_itself(self) -> None:
+        """Configure and activate without a manager; raises what made it fail."""
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != TransitionCallbackReturn.SUCCESS and self.failure is not None:
+                raise self.failure
+        self._started_itself = True
+
+    def _on_change_state(
+        self, request: ChangeState.Request, answer: ChangeState.Response
+    ) -> ChangeState.Response:
+        """As rclpy does it, which ends the process where the state has no such transition.
+
+        A manager brings up what it believes unconfigured; a node that started itself goes back
+        there once, so that both can be used.
+        """
+        label = request.transition.label
+        wanted = label == "configure" if label else request.transition.id == CONFIGURE
+        if wanted and self._started_itself:
+            self._started_itself = False
+            self.trigger_deactivate()
+            self.trigger_cleanup()
+        try:
+            done: ChangeState.Response = self._change_state(request, answer)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(f"transition refused: {error}")
+            answer.success = False
+            return answer
+        return done
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: unconfigured to inactive."""
@@ -114,9 +151,12 @@ class ManagedNode(LifecycleNode):
     def _on_parameters(self, changed: list[Parameter]) -> SetParametersResult:
         values = self.tunable()
         asked = {parameter.name: parameter.value for parameter in changed}
-        if not asked.keys() & values.keys():
-            return SetParametersResult(successful=True)
         try:
+            for each in self.declared:
+                if each.name in asked:
+                    asked[each.name] = _as_meant(each, asked[each.name])
+            if not asked.keys() & values.keys():
+                return SetParametersResult(successful=True)
             self.tune({name: asked.get(name, value) for name, value in values.items()})
         except (NlsidError, OSError) as refusal:
             return SetParametersResult(successful=False, reason=str(refusal))
@@ -166,9 +206,7 @@ def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
     try:
         node = make()
         if node.autostart:
-            for transition in (node.trigger_configure, node.trigger_activate):
-                if transition() != TransitionCallbackReturn.SUCCESS and node.failure is not None:
-                    raise node.failure
+            node.start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         _spin_until_signalled(node, woken)
@@ -215,10 +253,11 @@ def declare(
 
     It can be changed while the node runs only if `tunable`: `ManagedNode.tune` is told then.
 
-    The default's type is the parameter's: ROS keeps 2 and 2.0 apart. Raises DataError if the value
-    given has another type or is out of range.
+    The default's type is the parameter's, and 2 is taken where 2.0 is meant. Raises DataError if
+    the value given has another type or is out of range.
     """
     descriptor = ParameterDescriptor(name=name, description=description, read_only=not tunable)
+    descriptor.dynamic_typing = isinstance(default, float)  # or ROS would refuse 2 for 2.0
     if between is not None:
         lo, hi = between
         if isinstance(default, int):
@@ -226,12 +265,26 @@ def declare(
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=lo, to_value=hi)]
     try:
-        value: Value = node.declare_parameter(name, default, descriptor).value
+        given = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
+    declared = Declared(name, default, description, between, tunable)
     if isinstance(node, ManagedNode):
-        node.declared.append(Declared(name, default, description, between, tunable))
-    return value
+        node.declared.append(declared)
+    return _as_meant(declared, given)
+
+
+def _as_meant(declared: Declared, given: Any) -> Value:
+    """A number as float where one is meant; DataError if it is none or is out of range."""
+    value: Value = given
+    if not isinstance(declared.default, float):
+        return value
+    what = f"parameter {declared.name} ({declared.description})"
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise DataError(f"{what}: {given!r} is not a number")
+    if declared.between is not None and not declared.between[0] <= given <= declared.between[1]:
+        raise DataError(f"{what}: {given} is not in [{declared.between[0]}, {declared.between[1]}]")
+    return float(given)
 
 
 def declare_number(

@@ -4,13 +4,16 @@ Of a difference equation sample k's input is known one period ahead; it is publi
 into force, stamped a quarter of a period before its sample is due, so that a sample off the grid by
 that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
 `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
-digest. Stale or impossible state, `~/stop`, and the end of the plan ramp the input to `stop_at`.
+digest. Stale or impossible state, `~/stop`, a required monitor that no longer judges, and the end
+of the plan ramp the input to `stop_at`.
 """
 
+import math
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
@@ -19,6 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -33,15 +37,18 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import FunnelSubscription, declare_wiring
+from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.messages import SignalMessage, stamp_ns_of
+from nlsid_ros.messages import SignalMessage, frame_of, off_clock, stamp_ns_of
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
 LAST_WORD = 1.0  # s for the last command to be received before the node goes
 REPORT = 1.0  # s between diagnostics while nothing changes
 BIG = 1e9
+LOOK = 0.02  # s between looks at whether responses come, commands go and the monitor judges
+ENDED = ("the plan is over", "the proof is over")  # as it should
+ASKED = ("asked to", "the node stops")
 LIMITS = [field.name for field in fields(Limits)]
 
 
@@ -61,15 +68,27 @@ class TrackingController(ManagedNode):
             self, "command_type", "geometry_msgs/msg/TwistStamped", "type of the commands published"
         )
         self._start_at_once = bool(
-            declare(self, "start_at_once", False, "begin a run as soon as there is a funnel")
+            declare(self, "start_at_once", False, "begin a run as soon as there is a design")
         )
-        number("stale_after", 0.1, "s without a response: stop", between=(0.001, 60.0))
+        what = "s without a response, or from its stamp to this node's clock: stop"
+        number("stale_after", 0.1, what, between=(0.001, 60.0))
         number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
         number("lowest", 0.0, "least input", between=(-BIG, BIG))
         number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG))
         number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
         number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
+        what = "s until a robot that is stopped is at rest, faster than stop_rate if need be"
+        number("stop_within", 5.0, what, between=(0.01, 60.0))
+        self._watched = bool(
+            declare(self, "require_monitor", False, "track only while the monitor judges")
+        )
+        self._monitor = declare_text(self, "monitor", "funnel_monitor", "node required")
+        what = "s without a verdict of the required monitor: stop"
+        number("monitor_patience", 1.0, what, between=(0.01, 60.0))
+        what = "frame_id that the response must have; empty: that of the first"
+        self._frame = declare_text(self, "response_frame", "", what)
         self._wiring = declare_wiring(self)
+        self._expected = declare_expected(self)
         self._controller: Controller | None = None
         self._stopping = ""
         self.tune(self.tunable())
@@ -82,7 +101,8 @@ class TrackingController(ManagedNode):
         if limits.lowest == limits.highest:
             raise DataError("no room between lowest and highest; set the limits of the input")
         self._limits, self._settling = limits, values["settling"]
-        self._stale_after = values["stale_after"]
+        self._stale_after, self._stop_within = values["stale_after"], values["stop_within"]
+        self._monitor_patience = values["monitor_patience"]
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
@@ -91,47 +111,58 @@ class TrackingController(ManagedNode):
         self._command: SignalMessage | None = None
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
-        self._due_ns = 0
+        self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
+        self._ramp = self._limits
         self._stopping = ""
-        self._text = "waiting for the funnel"
+        self._text = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self._funnel = FunnelSubscription(
-            self, self._source, self._on_funnel, self._tell, wiring=self._wiring
+        self._funnel = DesignSubscription(
+            self,
+            self._source,
+            self._on_design,
+            self._report,
+            wiring=self._wiring,
+            expected=self._expected,
         )
-        self._due = self.create_timer(1.0, self._on_due)
-        self._due.cancel()
+        if self._watched:
+            self._margin = self.create_subscription(
+                JointState, f"{self._monitor}/margin", self._on_margin, qos.STREAM
+            )
+        self._next = self.create_timer(1.0, self._on_due)
+        self._next.cancel()
         wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self._stale = self.create_timer(
-            self._stale_after, lambda: self._halt("the response stopped coming"), clock=wall
-        )
-        self._stale.cancel()
+        self._step = self.create_timer(1.0, self._on_step, clock=wall)
+        self._step.cancel()
+        self.create_timer(LOOK, self._look, clock=wall)
         self.create_timer(REPORT, self._report, clock=wall)
 
     def stop(self) -> None:
         """Ramp down before going, in real time."""
+        self._funnel.close()
         if self._controller is None and not self._stopping:
             return
         assert self._design is not None
         period = self._design.period
         self._halt("the node stops")
         while not self._limits.at_rest(self._input):
-            self._step_down()
+            self._on_step()
             time.sleep(period)
         self._commands.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
-    def _on_funnel(self, design: AnyDesign) -> None:
-        """Take a funnel, but never in the middle of a run: stop that first."""
-        if self._controller is not None or self._stopping:
-            self._halt("the funnel was replaced")
+    def _on_design(self, design: AnyDesign, digest: str) -> None:
+        """Take a design, but never in the middle of a run: stop that first."""
         response, command = design.response, design.command
         response.check(self._response_type, standard_types())
+        message = SignalMessage(command, self._command_type)
+        if self._controller is not None or self._stopping:
+            self._halt("the design was replaced")
         if self._design is None:
-            self._command = SignalMessage(command, self._command_type)
+            self._command = message
             self._commands = self.create_publisher(
-                self._command.kind, self._command.path.topic, qos.STREAM
+                message.kind, message.path.topic, qos.command(design.period)
             )
             self.create_subscription(
                 message_class(self._response_type),
@@ -140,9 +171,8 @@ class TrackingController(ManagedNode):
                 qos.SENSOR,
             )
         elif (response, command) != (self._design.response, self._design.command):
-            self._tell("the new funnel is about other signals; deactivate and activate again")
-            return
-        self._design = design
+            raise DataError("it is about other signals; deactivate and activate again")
+        self._design, self._digest = design, digest
         self._tell("idle")
         if self._start_at_once:
             self._begin()
@@ -150,7 +180,9 @@ class TrackingController(ManagedNode):
     def _begin(self) -> str:
         """Begin a run; why not, empty if it began."""
         if self._design is None:
-            return "there is no funnel yet"
+            return f"there is no design yet: {self._funnel.state}"
+        if self._funnel.refusal or self._funnel.state == CHECKING:
+            return self._funnel.state
         if self._controller is not None or self._stopping:
             return "a run is on"
         try:
@@ -158,8 +190,10 @@ class TrackingController(ManagedNode):
         except NlsidError as error:
             self._tell(f"idle; not started: {error}")
             return str(error)
+        if self._watched and not self.count_publishers(self._margin.topic_name):
+            self._controller = None
+            return f"require_monitor is set and nobody publishes {self._margin.topic_name}"
         self._first_ns = None
-        self._stale.timer_period_ns = round(self._stale_after * 1e9)
         self._tell("waiting for the response")
         return ""
 
@@ -169,8 +203,10 @@ class TrackingController(ManagedNode):
         if controller is None:
             return
         stamp_ns = stamp_ns_of(message)
+        self._heard = time.monotonic()
         if self._first_ns is None:  # its input is not ours; the next sample's is
-            self._first_ns = stamp_ns
+            self._first_ns, self._sent = stamp_ns, self._heard
+            self._frame_heard = self._frame or frame_of(message)
         else:
             waiting = controller.k < 1
             try:
@@ -179,58 +215,93 @@ class TrackingController(ManagedNode):
                 self._halt(str(error))
                 return
             controller.update(seconds(stamp_ns, self._first_ns), value)
-            if controller.ended:
-                self._halt(controller.ended)
+            if ended := controller.ended or self._distrust(stamp_ns, message):
+                self._halt(ended)
                 return
             if waiting and controller.k >= 1:
-                announced = Run(stamp_ns, self._funnel.digest).document()
+                self._judged = self._heard
+                announced = Run(stamp_ns, self._digest).document()
                 self._announce.publish(String(data=files.encode(announced).decode()))
                 self._tell("tracking")
-        self._stale.reset()
-        self._schedule(stamp_ns + round(controller.lead * 1e9))
+        self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
+        self._on_due()
 
-    def _schedule(self, due_ns: int) -> None:
-        """Publish at `due_ns`, at once if that has passed."""
-        self._due_ns = due_ns
-        ahead = due_ns - self.get_clock().now().nanoseconds
-        if ahead <= 0:
-            self._on_due()
-        else:
-            self._due.timer_period_ns = ahead
-            self._due.reset()
+    def _distrust(self, stamp_ns: int, message: Any) -> str:
+        """Why a response is not to be acted on though its number could be; empty if it is."""
+        if (frame := frame_of(message)) != self._frame_heard:
+            return f"the response is in frame '{frame}', not in '{self._frame_heard}'"
+        return off_clock(stamp_ns, self.get_clock(), self._stale_after)
 
     def _on_due(self) -> None:
-        self._due.cancel()
-        if self._controller is not None:
-            self._input = self._controller.u
-            self._send(self._due_ns)
-        elif self._stopping:
-            self._step_down()
-            if self._limits.at_rest(self._input):
-                self._tell(f"idle; stopped: {self._stopping}")
-                self._stopping = ""
-            else:
-                assert self._design is not None
-                self._schedule(self._due_ns + round(self._design.period * 1e9))
+        """Publish every input that is due, and wait for the next."""
+        self._next.cancel()
+        while self._due:
+            stamp_ns, u = self._due[0]
+            ahead = stamp_ns - self.get_clock().now().nanoseconds
+            if ahead > 0:
+                self._next.timer_period_ns = ahead
+                self._next.reset()
+                return
+            self._due.popleft()
+            self._input, self._sent = u, time.monotonic()
+            self._send(stamp_ns)
 
-    def _step_down(self) -> None:
+    def _on_margin(self, message: JointState) -> None:
+        """The required monitor has judged a sample."""
+        margin = dict(zip(message.name, message.position, strict=False)).get("margin", math.nan)
+        if margin >= 0.0:
+            self._judged = time.monotonic()
+        elif margin < 0.0 and self._controller is not None and self._controller.k >= 1:
+            self._halt(f"outside: {self._monitor} says margin {margin:.3g}")
+
+    def _look(self) -> None:
+        """Watch on the wall's clock that responses come, commands go and the monitor judges."""
+        if self._controller is None or self._first_ns is None:
+            return
         assert self._design is not None
-        self._input = self._limits.towards_stop(self._input, self._design.period)
+        now = time.monotonic()
+        unsent = 2.0 * (self._stale_after + self._design.period)
+        if now - self._heard > self._stale_after:
+            self._halt("the response stopped coming")
+        elif now - self._sent > unsent:
+            self._halt(f"no command has gone out for {unsent:g} s")
+        elif self._is_unwatched(now):
+            self._halt(f"{self._monitor} has judged nothing for {self._monitor_patience:g} s")
+
+    def _is_unwatched(self, now: float) -> bool:
+        tracking = self._controller is not None and self._controller.k >= 1
+        return self._watched and tracking and now - self._judged > self._monitor_patience
+
+    def _on_step(self) -> None:
+        """One step towards rest; the last says so."""
+        assert self._design is not None
+        self._input = self._ramp.towards_stop(self._input, self._design.period)
         self._send(self.get_clock().now().nanoseconds)
+        if self._limits.at_rest(self._input):
+            self._step.cancel()
+            self._tell(f"idle; stopped: {self._stopping}")
+            self._stopping = ""
 
     def _send(self, stamp_ns: int) -> None:
         assert self._command is not None
         self._commands.publish(self._command.make(stamp_ns, self._input))
 
     def _halt(self, reason: str) -> None:
-        """End the run and ramp down."""
-        self._stale.cancel()
+        """End the run and ramp down, in real time and within `stop_within`."""
         if self._controller is None:
             return
+        assert self._design is not None
         self._controller = None
+        self._next.cancel()
+        self._due.clear()
         self._stopping = reason
+        away = float(np.max(np.abs(np.subtract(self._input, self._limits.stop_at))))
+        rate = max(self._limits.stop_rate, away / self._stop_within)
+        self._ramp = replace(self._limits, stop_rate=rate)
         self._tell(f"stopping: {reason}")
-        self._schedule(self.get_clock().now().nanoseconds)
+        self._step.timer_period_ns = round(self._design.period * 1e9)
+        self._step.reset()
+        self._on_step()
 
     def _on_start(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         answer.message = self._begin()
@@ -248,16 +319,22 @@ class TrackingController(ManagedNode):
         self._report()
 
     def _report(self) -> None:
-        level = DiagnosticStatus.OK
-        if self._stopping or "stopped" in self._text:
-            level = DiagnosticStatus.WARN
+        level, text = DiagnosticStatus.OK, self._text
+        ended = self._text.removeprefix("idle; stopped: ").removeprefix("stopping: ")
+        if ended != self._text and ended not in ENDED:
+            level = DiagnosticStatus.WARN if ended in ASKED else DiagnosticStatus.ERROR
+        if self._design is None or self._funnel.refusal:
+            text = "; ".join(part for part in (self._text, self._funnel.state) if part)
+        if self._funnel.refusal:
+            level = DiagnosticStatus.ERROR
         values = {
             "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",
-            "funnel": self._funnel.digest if hasattr(self, "_funnel") else "",
+            "funnel": self._funnel.digest,
+            "design": self._funnel.state,
         }
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, name_of(self), level, self._text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def main(args: list[str] | None = None) -> None:

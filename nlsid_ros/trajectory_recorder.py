@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -31,7 +33,7 @@ from bags.signals.recording import Recording
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
-from nlsid_ros.diagnostics import status
+from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.polling import Polled, Received
 from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
@@ -142,10 +144,11 @@ class TrajectoryRecorder(ManagedNode):
         self._topics.want(self._wanted)
         if self._said_by:
             self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
-        self.create_timer(POLL, self._polled.take)
-        self.create_timer(DISCOVERY, self._topics.look)
-        self.create_timer(self._period, self._keep_up)
-        self.create_timer(REPORT, self._report)
+        wall = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulated time stands still
+        self.create_timer(POLL, self._polled.take, clock=wall)
+        self.create_timer(DISCOVERY, self._topics.look, clock=wall)
+        self.create_timer(self._period, self._keep_up, clock=wall)
+        self.create_timer(REPORT, self._report, clock=wall)
         for name, serve in (
             ("start", self._on_start),
             ("stop", self._on_stop),
@@ -296,8 +299,10 @@ class TrajectoryRecorder(ManagedNode):
             text = "; ".join(f"{topic}: {why}" for topic, why in problems.items())
         if recording is not None and recording.ended:
             level, text = DiagnosticStatus.ERROR, recording.ended
+        if self.get_parameter("use_sim_time").value and not self.get_clock().now().nanoseconds:
+            level, text = DiagnosticStatus.ERROR, f"nobody publishes /clock; {text}"
         now = self.get_clock().now().to_msg()
-        self._diagnostics.publish(status(now, NAME, level, text, values))
+        self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 
 def _answering(

@@ -357,6 +357,17 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"excitation, not by a {kind.__name__} with {said}; leave out `profile` for a tube "
             "around the model's simulation, or use `nlsid track` for a measured state"
         )
+    if config.funnel is not None:
+        for role, signals in (
+            ("response", config.signals.response),
+            ("excitation", config.signals.excitation),
+        ):
+            topics = sorted({signal.path.partition(":")[0] for signal in signals})
+            if len(topics) > 1:
+                yield (
+                    f"funnel: a monitor reads every {role} from one topic, not from "
+                    f"{', '.join(topics)}; publish them in one message, or leave out `funnel`"
+                )
     if kind is BlockCascadeClass and not config.split.validation:
         yield "split.validation: a block_cascade chooses its knots on validation trials; name bags"
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):

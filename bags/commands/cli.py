@@ -76,7 +76,7 @@ def init(
     robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
     yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
 ) -> None:
-    """Write a first configuration from bags: signals, clock, period, gaps, split, lags, horizon.
+    """Write a first configuration from bags: signals, clock, period, gaps, split, lags, tube.
 
     It is tried on the bags, every key says why, and what later steps will meet is said first.
     """

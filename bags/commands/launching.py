@@ -4,12 +4,15 @@
 its language this knows what those files use: arg, node, param, remap, `$(var NAME)` and `if`.
 """
 
+import ctypes
+import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,6 +22,8 @@ from nlsid_core.errors import DataError
 
 LOOK = 0.2  # s between looks at whether all still run
 PATIENCE = 20.0  # s for a node to end when asked to
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 _VARIABLE = re.compile(r"\$\(var (\w+)\)")
 
 
@@ -78,13 +83,19 @@ class LaunchFile:
 
 
 def run_together(commands: Sequence[Sequence[str]]) -> int:
-    """Run until SIGINT or until one ends, then end all; the worst of their exit statuses."""
-    running = [subprocess.Popen(command) for command in commands]
+    """Run until a stop signal or until one ends, then end all; the worst of their exit statuses.
+
+    On Linux they also end when this process is killed, by SIGTERM as if each had been asked to.
+    """
+    asked = threading.Event()
+    before = {number: signal.signal(number, lambda *_: asked.set()) for number in STOP_SIGNALS}
+    running: list[subprocess.Popen[bytes]] = []
     try:
-        while all(process.poll() is None for process in running):
+        for command in commands:
+            process = subprocess.Popen(command, preexec_fn=_end_with(os.getpid()))
+            running.append(process)
+        while not asked.is_set() and all(process.poll() is None for process in running):
             time.sleep(LOOK)
-    except KeyboardInterrupt:
-        pass
     finally:
         for process in running:
             if process.poll() is None:
@@ -94,7 +105,23 @@ def run_together(commands: Sequence[Sequence[str]]) -> int:
                 process.wait(timeout=PATIENCE)
             except subprocess.TimeoutExpired:
                 process.kill()
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return max(abs(process.wait()) for process in running)
+
+
+def _end_with(parent: int) -> Callable[[], None] | None:
+    """What a new process does so that it gets SIGTERM when its parent is gone; Linux only."""
+    if not sys.platform.startswith("linux"):
+        return None
+    prctl = ctypes.CDLL(None).prctl
+
+    def ask() -> None:
+        prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:  # it was gone before
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    return ask
 
 
 def _command(node: Element, values: Mapping[str, str]) -> list[str]:

@@ -163,6 +163,8 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
     The funnel's kind decides. Raises DocumentError if one is not what it should be,
     CertificateMismatch if they do not belong together.
     """
+    if "funnel" not in documents:
+        raise DocumentError("a design has a funnel")
     funnel = read_funnel(documents["funnel"])
     readers: dict[type[AnyFunnel], tuple[type[AnyPolicy] | None, Any]] = {
         LinearFunnel: (LinearPolicy, DifferenceEquation.from_document),
@@ -171,6 +173,11 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
         TubeFunnel: (None, partial(read, source="model")),
     }
     kind, read_model = readers[type(funnel)]
+    wanted = {"model", "funnel"} | ({"policy"} if kind is not None else set())
+    if documents.keys() != wanted:
+        raise DocumentError(
+            f"{', '.join(documents)}: with this funnel go {', '.join(sorted(wanted))}"
+        )
     policy = None if kind is None else read_policy(documents["policy"])
     if kind is not None and not isinstance(policy, kind):
         raise DocumentError(

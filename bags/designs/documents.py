@@ -4,15 +4,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast, get_args
 
-from bags.designs.design import AnyDesign, LinearDesign, SampledDesign, WiredDesign, Wiring
+from bags.designs.bundle import Bundle
+from bags.designs.design import AnyDesign, LinearDesign, SampledDesign, Wiring
 from nlsid_core import designs, files
 from nlsid_core.documents import load
-from nlsid_core.errors import CertificateMismatch, DocumentError
+from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, StableModel
-from nlsid_core.running.monitor import refuse_mismatch
 
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
@@ -61,13 +61,9 @@ def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[Any
     Of a continuous funnel the vector field is read in the place of the model. Raises
     CertificateRejected or CertificateMismatch if the proof does not prove this funnel.
     """
-    path = Path(path)
-    found = designs.load_design(path.parent)
-    if files.digest(path.read_bytes()) != found.verdict.digests["funnel"]:
-        raise CertificateMismatch(f"{FUNNEL_PROOF} beside {path} is not about this funnel")
-    design: Any = WiredDesign(found.model, found.policy, found.funnel, wiring)
-    refuse_mismatch(found.model, found.policy, found.funnel)
-    return Proved(design, found.verdict)
+    bundle = Bundle.load(path)
+    verdict = bundle.decided()
+    return Proved(bundle.design(wiring), verdict)
 
 
 def load_proved_funnel(path: Path | str) -> Proved[LinearDesign]:

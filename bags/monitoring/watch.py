@@ -64,6 +64,7 @@ class Watch:
         self._alarm.restart()
         self.origin_ns: int | None = None
         self._newest_ns = 0
+        self._newest: tuple[int, tuple[float, ...]] | None = None
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
         self._start_ns: int | None = None
         self._running = not self._announced
@@ -92,6 +93,9 @@ class Watch:
         self._newest_ns = max(self._newest_ns, stamp_ns)
         before = self.pairing.late_responses
         numbers = _numbers(y)
+        newest, self._newest = self._newest, (stamp_ns, tuple(numbers))
+        if newest is not None and newest[0] == stamp_ns and newest != self._newest:
+            return self.missing(f"{self.design.name} has two values at one stamp")
         readings = self._judge(self.pairing.respond(stamp_ns, numbers))
         if self.origin_ns is None and not any(map(math.isfinite, numbers)) and not self._framed:
             return self.missing(f"{self.design.name} is {y}")  # and no sample was before it
@@ -115,6 +119,11 @@ class Watch:
         t = seconds(self._newest_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
         reading = self.monitor.missing(t, reason)
         return [Stamped(self._newest_ns, reading, self._alarm.update(reading))]
+
+    def refuse(self, stamp_ns: int, reason: str) -> list[Stamped]:
+        """A response that is not to be judged: unknown from here on."""
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        return self.missing(reason)
 
     def _judge(self, samples: Sequence[Sample]) -> list[Stamped]:
         judged = []

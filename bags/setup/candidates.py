@@ -32,7 +32,7 @@ MOST_SAMPLES: Final = 4000  # of a pair whose correlation is computed
 MOST_COMMANDS: Final = 24  # and responses, by their roles, whose pairs are compared
 LONGEST_DELAY: Final = 3.0  # s, of what still counts as an answer
 WINDOW: Final = 5  # messages of a slope
-POSITIONS_LIKED: Final = 0.7  # against a rate: positions that add up a command are in no class
+OTHER_KIND_LIKED: Final = 0.7  # a rate for a reference position; positions that add up a command
 SLOPES_LIKED: Final = 0.95  # against a rate that is measured
 OTHER_JOINT_LIKED: Final = 0.8  # against the same joint's
 COMMANDS: Final = {  # message types that command; the others are taken by their names
@@ -290,7 +290,8 @@ def _pairs(
                 continue
             correlation = float(np.mean([one.correlation for one in known]))
             roles = u.command * (1.0 - y.command)
-            liked = POSITIONS_LIKED if y.is_position else 1.0
+            is_reference = u.is_position and u.unit == _position_unit(y.unit)
+            liked = 1.0 if is_reference == y.is_position else OTHER_KIND_LIKED
             liked *= SLOPES_LIKED if "|derivative" in y.text else 1.0
             liked *= OTHER_JOINT_LIKED if _other_joint(u.text, y.text) else 1.0
             pairs.append(
@@ -321,6 +322,11 @@ def _delay(
             held, np.interp(at, y_ns, y), step / 1e9, min(LONGEST_DELAY, (end - start) / 4e9)
         )
     return None
+
+
+def _position_unit(unit: str) -> str:
+    """Of the position whose unit, or whose rate's unit, this is."""
+    return " or ".join(part.removesuffix("/s") for part in unit.split(" or "))
 
 
 def _other_joint(command: str, response: str) -> bool:

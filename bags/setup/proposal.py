@@ -6,7 +6,9 @@ refused there is changed (gaps cut out, responses resampled) or said.
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,17 +25,21 @@ from bags.signals.expressions import Expression
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.identification import LeastSquares, LinearClass, identify
+from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
 from nlsid_core.running.grid import TOLERANCE
 
 LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
+FEW_LAGS: Final = (1, 2, 3)  # tried with several signals,
+DEGREES: Final = (1, 2, 3)  # with these degrees in the inputs
+TRIED_ITERATIONS: Final = 8  # of the robust simulation error, enough to tell lags apart
 LAGS_BETTER: Final = 0.98  # of the error that more lags have to reach
 ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they come
-ROUND: Final = 0.01  # relative: a period this near a round number is that number
+ROUND: Final = 0.002  # relative: a period this near a round number is that number
 FEW_GAPS: Final = 5.0  # periods: gaps up to here are filled in, longer ones cut out
 DYNAMICS: Final = 40.0  # samples in a period of the fastest motion that are enough
 TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
+SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 RELATED: Final = 0.3  # correlation below which command and response may be unrelated
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
@@ -121,15 +127,13 @@ def propose(
         ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
-        proposal.walls.append(
-            "several signals: a tube is designed for one response and one excitation; the model "
-            "is identified and proved, `nlsid funnel` has nothing for it"
-        )
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
     if linear:
         _say_lags(proposal, trials.train)
-        _say_funnel(proposal, trials)
+    else:
+        _say_degree(proposal, trials.train)
+    _say_funnel(proposal)
     return proposal
 
 
@@ -193,7 +197,7 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                 proposal.walls.append(
                     f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
                 )
-            if best.response.is_position:
+            if best.response.is_position and not best.command.is_position:
                 proposal.walls.append(
                     f"{y.path} is a position: one that adds up its command for ever is in no model "
                     "class; take |derivative(0.2 s) of it"
@@ -308,9 +312,9 @@ def _say_grid(proposal: Proposal, read: _Read) -> None:
     if read.band > 0:
         factor = max(int(1.0 / (DYNAMICS * read.band) / read.period), 1)
     if factor > 1:
-        grid["period"] = _round(factor * read.period)
+        grid["period"] = float(f"{factor * read.period:.4g}")
         why["period"] = (
-            f"every {factor}th of {read.period:g} s: 99 % of the response's power is below "
+            f"{factor} times {read.period:g} s: 99 % of the response's power is below "
             f"{read.band:.3g} Hz"
         )
         regular = False
@@ -362,7 +366,8 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
         proposal.content["split"] = {"share": SHARE}
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
         proposal.walls.append(
-            "one bag: the disturbance is measured on the drive that was fitted; record more"
+            "one bag: a tube is designed on one trial and its level measured on another; record "
+            "more, or cut it: nlsid bag split BAG --out PART --every 5"
         )
 
 
@@ -400,22 +405,32 @@ def _say_lags(proposal: Proposal, train: Dataset) -> None:
     for lags in LAGS:
         try:
             fit = identify(
-                fitted, LinearClass(lags), method=LeastSquares(), test=train.select(held_back),
-                allow_unproved=True,
+                fitted, LinearClass(lags), method=Rse(iterations=TRIED_ITERATIONS),
+                comparators=(), test=train.select(held_back),
             )  # fmt: skip
-        except NlsidError:
+        except NlsidError:  # too few samples for so many, or no proof
             continue
-        errors[lags] = float(fit.errors["test"]["least_squares"])
+        errors[lags] = float(fit.errors["test"]["rse"])
     known = {lags: error for lags, error in errors.items() if math.isfinite(error)}
     section = proposal.content["identification"]
     if not known:
         proposal.why["lags"] = "a first guess"
+        proposal.walls.append(
+            "no number of lags gave a model that is proved stable: identification will refuse; a "
+            "response that adds up its command for ever needs |derivative(0.2 s)"
+        )
         return
     best = min(known.values())
-    section["lags"] = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
+    good = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
+    others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
+    for lags in (good, *others):
+        section["lags"] = lags
+        with suppress(NlsidError):  # more data and iterations may end without a proof: the next
+            identify(train, LinearClass(lags), comparators=())
+            break
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     where = "on what they were fitted to" if alone else "on trials held back"
-    proposal.why["lags"] = f"least squares models simulated {where} are off by {said}"
+    proposal.why["lags"] = f"proved models simulated {where} are off by {said}"
     if best > POOR:
         proposal.walls.append(
             f"no number of lags simulates {where.removeprefix('on ')} with less than {best:.3g} % "
@@ -423,17 +438,42 @@ def _say_lags(proposal: Proposal, train: Dataset) -> None:
         )
 
 
-def _say_funnel(proposal: Proposal, trials: Trials) -> None:
-    lags = int(proposal.content["identification"]["lags"])
-    period = float(proposal.content["grid"]["period"])
-    samples = max(len(trial) for trial in trials.train) - lags
-    longest = max(len(trial) for trial in trials.test)
-    samples = max(min(samples, longest), 1)
-    proposal.content["funnel"] = {"horizon": float(f"{samples * period:.6g}"), "policy": "none"}
-    proposal.why["horizon"] = f"{samples} samples: the longest run that training and test have"
-    proposal.why["policy"] = "a prediction tube around what the received commands give"
-    if longest - lags > samples:
-        proposal.walls.append(
-            f"the longest test run is {longest * period:.4g} s; a tube is proved for "
-            f"{samples * period:.4g} s, and the monitor says nothing after"
-        )
+def _say_degree(proposal: Proposal, train: Dataset) -> None:
+    """Lags and degree in the inputs of a class for several, by trials held back."""
+    section = proposal.content["identification"]
+    ranges = tuple((float(low), float(high)) for low, high in section["input_range"])
+    names = train.names
+    held_back = list(names[1::3]) or list(names[:1])
+    fitted = train if len(held_back) == len(names) else train.without(held_back)
+    known: dict[tuple[int, int], float] = {}
+    for lags, degree in product(FEW_LAGS, DEGREES):
+        with suppress(NlsidError):
+            fit = identify(
+                fitted, StateAffineClass(lags, right_degree=degree, input_range=ranges),
+                method=LeastSquares(), comparators=(), test=train.select(held_back),
+                allow_unproved=True,
+            )  # fmt: skip
+            error = float(fit.errors["test"]["least_squares"])
+            if math.isfinite(error):
+                known[lags, degree] = error
+    if not known:
+        return
+    best = min(known.values())
+    lags, degree = next(key for key, error in known.items() if error * LAGS_BETTER <= best)
+    section |= {"lags": lags, "right_degree": degree}
+    said = ", ".join(f"{key[0]} and {key[1]}: {error:.3g} %" for key, error in known.items())
+    proposal.why["lags"] = f"least squares on trials held back, lags and right_degree: {said}"
+    proposal.why["right_degree"] = "as the lags"
+
+
+def _say_funnel(proposal: Proposal) -> None:
+    for role, signals in proposal.content["signals"].items():
+        topics = sorted({signal["path"].partition(":")[0] for signal in signals})
+        if len(topics) > 1:
+            proposal.walls.append(
+                f"a monitor reads every {role} from one topic, and these are on "
+                f"{', '.join(topics)}: a model is identified and proved, without a tube"
+            )
+            return
+    proposal.content["funnel"] = {"safety_factor": SAFETY}
+    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less"

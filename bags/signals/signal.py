@@ -193,6 +193,9 @@ class SignalPath:
             setattr(message, _attribute(last.field), kind(value))
         else:
             array = getattr(message, _attribute(last.field))
+            if isinstance(array, np.ndarray) and not array.flags.writeable:
+                array = array.copy()  # a decoded message's array is a view of its bytes
+                setattr(message, _attribute(last.field), array)
             array[self._place(last, message, array)] = value
 
     def _is_angle(self, msgtype: str, types: Typestore) -> bool:

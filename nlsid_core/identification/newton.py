@@ -266,6 +266,11 @@ class Descent:
         short, limit = 0, MAX_NEWTON if barrier is None else MAX_CENTRING
         for _ in range(limit):
             gradient, hessian = self._derivatives(z, point, mu, barrier)
+            if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
+                raise SolverError(
+                    "the simulation of the model that the search starts from grows beyond all "
+                    "numbers, so its derivatives are not known; try fewer lags or another method"
+                )
             scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
             step = (
                 -scale

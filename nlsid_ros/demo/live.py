@@ -131,7 +131,7 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     write_faulty_copy(bag, faulty, str(paths[0]), FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
     with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
-        with _node("funnel_monitor", {}):
+        with _node("funnel_monitor", {"allow_old_stamps": True}):
             _wait("the monitor to be ready", lambda: observer.has_said("funnel_monitor", " yet"))
             with _node("trajectory_recorder", {"bag": recording, "topics": list(topics)}):
                 _wait("the recorder", lambda: observer.has_said("trajectory_recorder", ""))

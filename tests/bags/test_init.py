@@ -25,6 +25,7 @@ from tests.bag_messages import COMMAND, SPEED, speed_bag
 from tests.conftest import SHARED
 
 CMD = "/cmd_vel:twist.linear.x"
+POSITION = "/odom:pose.pose.position.x"
 YAW = "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"
 
 
@@ -144,7 +145,7 @@ def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: P
     whole_way(schunk()[0].parent, config, tmp_path / "out")
 
 
-def test_several_signals_get_a_class_for_several_and_a_word_about_tubes(tmp_path: Path) -> None:
+def test_several_signals_get_a_class_for_several_and_a_word_about_topics(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     steering = "/steering_command:position[name=steering]"
     said = nlsid(
@@ -152,10 +153,34 @@ def test_several_signals_get_a_class_for_several_and_a_word_about_tubes(tmp_path
         "-u", CMD, "-u", steering, "-y", SPEED, "-y", YAW,
     )  # fmt: skip
     content = yaml.safe_load(config.read_text())
+    assert content["identification"]["model"] == "state_affine"
     assert content["identification"]["input_range"] == [[0.0, 0.4], [-0.2, 0.2]]
+    assert content["identification"]["right_degree"] in (1, 2, 3)
     assert "funnel" not in content
-    assert "mind: several signals" in said
+    assert "mind: a monitor reads every excitation from one topic" in said
     nlsid("identify", f1tenth()[0].parent, "--config", config, "--out", tmp_path / "out")
+    config.write_text(config.read_text() + "\nfunnel: {}\n")
+    refused = nlsid("config", "check", config, status=1)
+    assert "not from /cmd_vel, /steering_command; publish them in one message" in refused
+
+
+def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
+    """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
+    config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
+    nlsid(
+        "init",
+        folder,
+        "--out",
+        config,
+        "-u",
+        CMD,
+        "-y",
+        SPEED,
+        "-y",
+        f"{POSITION}|derivative(0.2 s)",
+    )
+    assert len(load_config(config).signals.response) == 2
+    assert whole_way(folder, config, tmp_path / "out").count("inside") >= 6
 
 
 def test_without_a_terminal_somebody_has_to_choose(tmp_path: Path) -> None:
@@ -200,18 +225,23 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("robot", "clock"),
+    ("robot", "seconds"),
     [
-        ("ur10_panda/ur10_exciting_trajectory.db3", "header"),
-        ("ur10_panda/panda_exciting_trajectory.db3", "header"),
-        ("cougars_auv/SO_lastbag_mcap", "header"),
+        ("ur10_panda/ur10_exciting_trajectory.db3", 5.51),
+        ("ur10_panda/panda_exciting_trajectory.db3", 4.8),
+        ("cougars_auv/SO_lastbag_mcap", 24.0),
     ],
 )
-def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, clock: str) -> None:
-    bag = SHARED / robot
+def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seconds: float) -> None:
+    """Each is one recording, which is cut into parts first, as `init` says it should be."""
+    bag, parts = SHARED / robot, tmp_path / "parts"
     if not bag.exists():
         pytest.skip(f"needs {robot} in ../shared/data")
+    said = nlsid("init", bag, "--yes", "--out", tmp_path / "one.yaml")
+    assert "mind: one bag" in said
+    parts.mkdir()
+    nlsid("bag", "split", bag, "--out", parts / "part", "--every", seconds)
     config = tmp_path / "robot.yaml"
-    nlsid("init", bag, "--yes", "--out", config)
-    assert load_config(config).clock == clock
-    whole_way(bag, config, tmp_path / "out")
+    nlsid("init", parts, "--yes", "--out", config)
+    assert load_config(config).clock == "header"
+    whole_way(parts, config, tmp_path / "out")

@@ -101,7 +101,9 @@ def set_parameter(
     """Change a parameter of a running node; why it was refused, empty if it was not."""
     client = node.create_client(SetParameters, f"/{name}/set_parameters")
     spin_until(client.service_is_ready)
-    if isinstance(value, str):
+    if isinstance(value, int):
+        wanted = ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=value)
+    elif isinstance(value, str):
         wanted = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=value)
     else:
         wanted = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)

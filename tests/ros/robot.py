@@ -13,6 +13,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.designs.bundle import Bundle
+from bags.designs.documents import FUNNEL
 from nlsid_ros import qos
 
 MONITOR = "nlsid_ros.funnel_monitor"
@@ -27,14 +29,10 @@ class Robot:
     def __init__(self, node: Node, spin_until: Spin, folder: Path) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
-        self.latched: dict[str, Publisher] = {}
-        self.texts: dict[str, str] = {}
-        for role in ("model", "policy", "funnel"):
-            self.latched[role] = node.create_publisher(
-                String, f"/funnel_publisher/{role}", qos.DOCUMENT
-            )
-            self.texts[role] = (folder / f"{role}.json").read_text()
-            self.latched[role].publish(String(data=self.texts[role]))
+        self.levels: dict[str, bytes] = {}
+        self.bundle = Bundle.load(folder / FUNNEL)
+        self.latched = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
+        self.publish(self.bundle)
         self.odom = node.create_publisher(Odometry, "/odom", qos.STREAM)
         self.command = node.create_publisher(TwistStamped, "/cmd_vel", qos.STREAM)
         self.clock = node.create_publisher(Clock, "/clock", qos.STREAM)
@@ -44,6 +42,11 @@ class Robot:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
             self.said.setdefault(status.name, []).append((status.message, values))
+            self.levels[status.name] = status.level
+
+    def publish(self, bundle: Bundle) -> None:
+        """Publish a design, latched."""
+        self.latched.publish(String(data=bundle.text()))
 
     def has_said(self, text: str, node: str = "funnel_monitor") -> bool:
         """Whether `node` has said `text`."""

@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 
 from tests.ros.processes import (
@@ -27,7 +28,12 @@ def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
     monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
-    slow: dict[str, object] = {"hysteresis": 1.0, "clear_after": 60.0, "stale_after": 5.0}
+    slow: dict[str, object] = {
+        "hysteresis": 1.0,
+        "clear_after": 60.0,
+        "stale_after": 5.0,
+        "allow_old_stamps": True,
+    }
     with node_here("test_robot") as (node, spin_until), process(MONITOR, **slow) as monitor:
         robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
@@ -51,7 +57,7 @@ def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
     monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
-    wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0}
+    wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0, "allow_old_stamps": True}
     with node_here("test_robot") as (node, spin_until), process(MONITOR, **wary) as monitor:
         robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
@@ -81,7 +87,7 @@ def test_an_alarm_calls_the_services_it_was_given_once(
     services: dict[str, object] = {"stop_service": "/halt", "snapshot_service": "/keep"}
     with (
         node_here("test_robot") as (node, spin_until),
-        process(MONITOR, stale_after=5.0, **services) as monitor,
+        process(MONITOR, stale_after=5.0, allow_old_stamps=True, **services) as monitor,
     ):
         for name in ("/halt", "/keep"):
             node.create_service(Trigger, name, answer(name))
@@ -97,17 +103,33 @@ def test_an_alarm_calls_the_services_it_was_given_once(
         stop(monitor)
 
 
-def test_an_alarm_with_nobody_to_call_says_so(
+def test_an_alarm_with_nobody_to_call_says_so_and_calls_until_somebody_answers(
     monkeypatch: pytest.MonkeyPatch, funnel: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     with (
         node_here("test_robot") as (node, spin_until),
-        process(MONITOR, stale_after=5.0, stop_service="/nobody") as monitor,
+        process(MONITOR, stale_after=5.0, allow_old_stamps=True, stop_service="/nobody") as monitor,
     ):
         robot = Robot(node, spin_until, funnel.parent)
         robot.ready()
         robot.drive(GOOD)
         robot.drive([10, 11], speed=1e3)
         robot.spin_until(lambda: robot.has_said("outside"))
-        assert "/nobody is not there to be called" in stop(monitor)
+        robot.spin_until(lambda: robot.has_said("; /nobody: not there to be called"))
+        assert robot.levels["funnel_monitor"] == DiagnosticStatus.ERROR
+        called: list[str] = []
+
+        def late(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            called.append("/nobody")
+            response.success = len(called) > 2
+            response.message = "the base is busy"
+            return response
+
+        node.create_service(Trigger, "/nobody", late)
+        robot.spin_until(lambda: robot.has_said("; /nobody: the base is busy"))
+        robot.spin_until(lambda: len(called) == 3)
+        robot.said.clear()
+        robot.spin_until(lambda: robot.has_said("outside"))
+        assert not robot.has_said("/nobody"), "it did it"
+        assert "/nobody: not there to be called" in stop(monitor)

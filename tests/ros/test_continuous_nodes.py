@@ -3,6 +3,7 @@
 import math
 import time
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from nlsid_core import files
+from bags.designs.bundle import Bundle
+from bags.designs.documents import FUNNEL
+from nlsid_core.design import ContinuousTracking
+from nlsid_core.design import design as design_of
+from nlsid_core.dynamics import Nominal
 from nlsid_core.running.monitor import Monitor
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
@@ -27,10 +32,14 @@ WIRING = {"response": "/joints:position[0]", "command": "/effort:effort[0]", "pe
 
 
 def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     use_domain_of_this_run(monkeypatch)
-    field, policy, funnel = stage()
+    field, policy, _ = stage()
+    nominal = Nominal(policy.x, policy.u)
+    design = design_of(ContinuousTracking(field, nominal, goal=np.array([[25.0]]), policy=policy))
+    policy, funnel = design.policy, design.funnel
+    design.save(tmp_path)
     commands: dict[int, float] = {}
     margins: dict[int, float] = {}
     said: dict[str, list[str]] = {}
@@ -52,9 +61,8 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
 
     with ExitStack() as stack:
         node, spin_until = stack.enter_context(node_here("test_robot"))
-        for role, noun in (("model", field), ("policy", policy), ("funnel", funnel)):
-            latched = node.create_publisher(String, f"/funnel_publisher/{role}", qos.DOCUMENT)
-            latched.publish(String(data=files.encode(noun.document()).decode()))
+        latched = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
+        latched.publish(String(data=Bundle.load(tmp_path / FUNNEL).text()))
         states = node.create_publisher(JointState, "/joints", qos.STREAM)
         node.create_subscription(JointState, "/effort", hear_command, qos.STREAM)
         node.create_subscription(JointState, "/funnel_monitor/margin", hear_margin, qos.STREAM)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files
 from bags.designs import documents
 from bags.monitoring.announcement import Run
 from nlsid_core import files
@@ -33,13 +37,23 @@ STOP_RATE = 2.0
 class Stage:
     """A controller that tracks, on the simulated plant, and what is heard of it."""
 
-    def __init__(self, stack: ExitStack, funnel: Path, **settings: object) -> None:
+    def __init__(
+        self, stack: ExitStack, funnel: Path, folder: Path | None = None, **settings: object
+    ) -> None:
         self.commands: list[tuple[int, float]] = []
         self.said: list[str] = []
         self.monitor: list[str] = []
         self.node, self.spin_until = stack.enter_context(node_here("test_operator"))
         self.node.create_subscription(TwistStamped, "/cmd_vel", self._hear, qos.STREAM)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear_said, qos.EVENTS)
+        self.designs: list[String] = []
+        self.node.create_subscription(
+            String, "/funnel_publisher/design", self.designs.append, qos.DOCUMENT
+        )
+        if folder is not None:
+            for path in funnel.parent.iterdir():
+                (folder / path.name).write_bytes(path.read_bytes())
+            funnel = folder / funnel.name
         self.publisher = stack.enter_context(process("nlsid_ros.funnel_publisher", funnel=funnel))
         self.plant = stack.enter_context(
             process("nlsid_ros.plant", model=funnel.with_name(documents.MODEL))
@@ -88,7 +102,7 @@ def stage(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Callable[..
     """Sets a stage with parameters of the controller."""
     use_domain_of_this_run(monkeypatch)
     with ExitStack() as stack:
-        yield lambda **settings: Stage(stack, funnel, **settings)
+        yield partial(Stage, stack, funnel)
 
 
 def test_commands_come_at_the_models_rate_and_the_start_is_announced_latched(
@@ -128,13 +142,23 @@ def test_a_state_that_is_no_number_stops_it(stage: Callable[..., Stage]) -> None
     robot.expect_ramp_down("speed is nan")
 
 
-def test_a_funnel_replaced_in_mid_run_stops_it(stage: Callable[..., Stage], funnel: Path) -> None:
-    robot = stage()
+def test_another_design_in_mid_run_stops_it_and_the_same_one_again_does_not(
+    stage: Callable[..., Stage], tmp_path: Path
+) -> None:
+    robot = stage(folder=tmp_path)
     robot.track()
-    latched = robot.node.create_publisher(String, "/funnel_publisher/funnel", qos.DOCUMENT)
-    robot.spin_until(lambda: latched.get_subscription_count() >= 1)
-    latched.publish(String(data=funnel.read_text()))
-    robot.expect_ramp_down("the funnel was replaced")
+    heard = len(robot.designs)
+    (tmp_path / documents.FUNNEL).touch()
+    robot.spin_until(lambda: len(robot.designs) > heard)
+    count = len(robot.commands)
+    robot.spin_until(lambda: len(robot.commands) > count + 10)
+    assert not robot.has_said("stop")
+    config = load_config(config_file("f1tenth.yaml"))
+    assert config.funnel is not None
+    wider = config.funnel.model_copy(update={"safety_factor": 2.0})
+    wide = config.model_copy(update={"funnel": wider})
+    design_funnel_files(tmp_path / documents.MODEL, wide, tmp_path)
+    robot.expect_ramp_down("the design was replaced")
 
 
 def test_limits_that_would_cut_off_the_plan_are_refused_and_nothing_moves(

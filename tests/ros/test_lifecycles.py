@@ -75,6 +75,53 @@ def test_a_node_goes_through_its_lifecycle_twice(name: str, tmp_path: Path) -> N
                 assert source.ending is None
 
 
+ALL: dict[str, dict[str, object]] = {
+    **NODES,
+    "funnel_monitor": {},
+    "tracking_controller": {"highest": 0.4},
+}
+ALL["plant"] = {"kind": "pendulum"}
+
+
+def asked(
+    name: str, transition: int, node: Node, spin_until: Callable[[Callable[[], bool]], None]
+) -> tuple[bool, int]:
+    """Whether the node says that the transition was made, and its state after it."""
+    request = ChangeState.Request(transition=Transition(id=transition))
+    done = call(node, spin_until, ChangeState, f"/{name}/change_state", request)
+    now = call(node, spin_until, GetState, f"/{name}/get_state", GetState.Request())
+    return done.success, now.current_state.id  # type: ignore[attr-defined]
+
+
+def settings_of(name: str, folder: Path) -> dict[str, object]:
+    """What it needs to start."""
+    own: dict[str, dict[str, object]] = {
+        "trajectory_recorder": {"bag": folder / "run"},
+        "model_identifier": {"out": folder},
+    }
+    return {**ALL[name], **own.get(name, {})}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_manager_takes_over_a_node_that_started_itself_and_wrong_requests_do_no_harm(
+    name: str, tmp_path: Path
+) -> None:
+    configure, activate = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE
+    inactive, active = State.PRIMARY_STATE_INACTIVE, State.PRIMARY_STATE_ACTIVE
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}", **settings_of(name, tmp_path)) as running,
+    ):
+        assert asked(name, activate, node, spin_until) == (False, active), "it is active already"
+        assert asked(name, configure, node, spin_until) == (True, inactive), "as a manager does"
+        assert asked(name, configure, node, spin_until) == (False, inactive)
+        assert asked(name, activate, node, spin_until) == (True, active)
+        assert asked(name, activate, node, spin_until) == (False, active)
+        assert asked(name, configure, node, spin_until) == (False, active)
+        assert asked(name, 99, node, spin_until) == (False, active), "there is no such transition"
+        assert "Traceback" not in stop(running)
+
+
 @pytest.mark.parametrize("name", NODES)
 def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_runs(
     name: str, tmp_path: Path
@@ -117,7 +164,7 @@ def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_run
     ("name", "wrong", "message"),
     [
         ("trajectory_recorder", {"split_time": -1.0}, "Min: 0.0, Max: 1000000.0, value: -1.0"),
-        ("trajectory_recorder", {"snapshot": 5}, "parameter snapshot (s kept in memory"),
+        ("trajectory_recorder", {"snapshot": "long"}, "parameter snapshot (s kept in memory"),
         ("excitation", {"period": 0.0}, "parameter period (s between commands)"),
         ("excitation", {"repeats": 0}, "parameter repeats (how often it is played)"),
         ("excitation", {"kind": "noise"}, "kind is 'noise'; it should be one of multisine"),

@@ -24,6 +24,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from bags.designs import documents
+from bags.designs.bundle import Bundle
 from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.interfaces import example_nodes
@@ -153,7 +154,8 @@ def test_every_node_ends_cleanly_when_asked_to(
     ("name", "parameters", "message"),
     [
         ("tracking_controller", {"highest": 0.4, "settling": -1.0}, "parameter settling"),
-        ("tracking_controller", {"highest": 1}, "parameter highest (greatest input; must be set)"),
+        ("tracking_controller", {"highest": "much"}, "parameter highest (greatest input; must be"),
+        ("tracking_controller", {"highest": 2 * 10**9}, "is not in [-1000000000.0, 1000000000.0]"),
         ("tracking_controller", {}, "no room between lowest and highest"),
         ("tracking_controller", {"lowest": 0.2, "highest": 0.4}, "limits: 0.0 should be in"),
         ("funnel_publisher", {"funnel": "/nowhere/funnel.json"}, "nowhere"),
@@ -174,7 +176,7 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
     with (
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_monitor") as monitor,
-        process("nlsid_ros.tracking_controller", highest=0.4) as controller,
+        process("nlsid_ros.tracking_controller", highest=1) as controller,
     ):
 
         def ask(name: str, key: str, value: float | str) -> str:
@@ -186,6 +188,8 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
         assert "warning_margin" in ask("funnel_monitor", "warning_margin", 1.5)
         assert "read-only" in ask("funnel_monitor", "nominal", "profile")
         assert ask("tracking_controller", "highest", 0.3) == ""
+        assert ask("tracking_controller", "highest", 1) == "", "a whole number is a number"
+        assert "is not a number" in ask("tracking_controller", "highest", "much")
         assert "no room between" in ask("tracking_controller", "highest", 0.0)
         assert "stop_rate" in ask("tracking_controller", "stop_rate", 0.0)
         assert funnel.is_file()
@@ -199,7 +203,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
     heard: list[str] = []
 
     def hear(message: String) -> None:
-        heard.append(files.digest(files.parse_document(message.data)))
+        heard.append(Bundle.parse(message.data).digest)
 
     names = (documents.MODEL, documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF)
     for place in ("good", "forged"):
@@ -214,7 +218,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_publisher", funnel=funnel) as publisher,
     ):
-        node.create_subscription(String, "/funnel_publisher/funnel", hear, qos.DOCUMENT)
+        node.create_subscription(String, "/funnel_publisher/design", hear, qos.DOCUMENT)
         spin_until(lambda: len(heard) == 1)
         good, bad = (str(tmp_path / place / documents.FUNNEL) for place in ("good", "forged"))
         assert "not the funnel this proof is about" in set_parameter(
@@ -229,7 +233,7 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
 @pytest.mark.parametrize("name", ["funnel_publisher", "funnel_monitor", "tracking_controller"])
 def test_a_node_goes_through_its_lifecycle_again_and_again(funnel: Path, name: str) -> None:
     own = {
-        "funnel_publisher": "/funnel_publisher/funnel",
+        "funnel_publisher": "/funnel_publisher/design",
         "funnel_monitor": "/funnel_monitor/margin",
         "tracking_controller": "/tracking_controller/run",
     }[name]

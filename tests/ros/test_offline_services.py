@@ -19,6 +19,7 @@ from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
+from bags.designs.bundle import Bundle
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
@@ -85,8 +86,8 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
     said: list[str] = []
     pictures: list[object] = []
 
-    def hear_funnel(message: String) -> None:
-        funnels.append(files.digest(files.parse_document(message.data)))
+    def hear_design(message: String) -> None:
+        funnels.append(Bundle.parse(message.data).digest)
 
     def hear_status(message: DiagnosticArray) -> None:
         said.extend(status.message for status in message.status)
@@ -95,7 +96,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_publisher", funnel=tmp_path / documents.FUNNEL) as publisher,
     ):
-        node.create_subscription(String, "/funnel_publisher/funnel", hear_funnel, qos.DOCUMENT)
+        node.create_subscription(String, "/funnel_publisher/design", hear_design, qos.DOCUMENT)
         node.create_subscription(
             MarkerArray, "/funnel_publisher/tube", pictures.append, qos.DOCUMENT
         )
@@ -105,7 +106,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
         spin_until(lambda: len(funnels) == 1 and len(pictures) == 2)
         lengths = {
-            len(each.markers[0].points) if isinstance(each, MarkerArray) else len(each.points)  # type: ignore[attr-defined]
+            len(each.markers[-1].points) if isinstance(each, MarkerArray) else len(each.points)  # type: ignore[attr-defined]
             for each in pictures
         }
         assert lengths == {117}

@@ -73,12 +73,21 @@ def heard(
 
 
 def test_a_pendulum_runs_on_an_exact_grid_in_real_time_and_answers_a_torque() -> None:
-    ear = heard(80, torque=[0.5], kind="pendulum", noise=0.001, rate_noise=0.01)
+    ear = heard(
+        80, torque=[0.5], kind="pendulum", command_timeout=60.0, noise=0.001, rate_noise=0.01
+    )
     np.testing.assert_allclose(np.diff(ear.t), 0.01, atol=1e-6)
     states = np.array(ear.states)
     assert 5e-4 < states[:10, 0].std() < 2e-3
     assert float(np.max(states[:, 0])) > 0.08  # towards 0.5 / (9.81 * 0.5) rad
     assert sorted(ear.ages)[len(ear.ages) // 2] < 0.1  # a busy machine may be late, but it keeps up
+
+
+def test_a_command_that_is_not_renewed_ends() -> None:
+    ear = heard(80, torque=[0.5, 0.0, 0.0], kind="satellite", period=0.01, command_timeout=0.1)
+    rates = np.array(ear.states)[:, 3]
+    assert 0.0 < rates[-1] < 0.5 * 0.15 / 5.0, "0.1 s of 0.5 N m on 5 kg m²"
+    assert rates[-1] == rates[-30]
 
 
 @MUJOCO

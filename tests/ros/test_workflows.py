@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from signal import SIGINT
+from signal import SIGINT, SIGKILL, SIGTERM, Signals
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -89,7 +90,7 @@ def live(workflow: str, *arguments: str) -> Iterator[None]:
 
 def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> None:
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
-    with live("monitor", f"funnel:={funnel}", *PATIENT):
+    with live("monitor", f"funnel:={funnel}", "allow_old_stamps:=true", *PATIENT):
         operator.hears("funnel_monitor", " yet")
         topics = "['/odom', '/cmd_vel']"
         with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
@@ -98,6 +99,50 @@ def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> 
             assert player.wait(timeout=20) == 0
     assert not operator.has_said("funnel_monitor", "outside")
     assert not operator.has_said("funnel_monitor", "violated")
+
+
+@pytest.mark.parametrize("how", [SIGTERM, SIGKILL], ids=["SIGTERM", "SIGKILL"])
+def test_nodes_end_with_the_command_that_started_them(
+    operator: Operator, funnel: Path, how: Signals
+) -> None:
+    model = funnel.with_name(documents.MODEL)
+    arguments = [f"funnel:={funnel}", f"model:={model}", "plant:=true", "highest:=0.4", *PATIENT]
+    command = [sys.executable, "-m", "bags.commands.cli", "live", "closed_loop", *arguments]
+    commands: list[float] = []
+
+    def hear(message: TwistStamped) -> None:
+        commands.append(message.twist.linear.x)
+
+    operator.node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+    running = subprocess.Popen(command, cwd=ROOT)
+    try:
+        operator.hears("funnel_monitor", "waiting for the controller")
+        operator.hears("tracking_controller", "idle")
+        counted = operator.node.count_subscribers
+        operator.spin_until(lambda: counted("/cmd_vel") >= 3)  # plant, monitor and this one
+        operator.waits(1.0)  # the graph knows a subscription before its publisher does
+        operator.call("/tracking_controller/start")
+        operator.hears("funnel_monitor", "inside")
+        children = Path(f"/proc/{running.pid}/task/{running.pid}/children").read_text().split()
+        assert len(children) == 4
+        running.send_signal(how)
+        running.wait(timeout=ENDED)
+        operator.spin_until(lambda: not any(_runs(child) for child in children))
+        operator.spin_until(lambda: operator.node.get_node_names() == ["test_operator"])
+    finally:
+        running.kill()
+        running.wait()
+    assert max(commands) > 0.0
+    operator.spin_until(lambda: commands[-1] == 0.0)  # it ramped down
+
+
+def _runs(pid: str) -> bool:
+    """Whether a process is there and has not ended."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"
 
 
 def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
@@ -130,7 +175,13 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
         for name in ("gentle", "hard"):
             operator.call(f"/{name}/plant/push")
         operator.hears("hard/funnel_monitor", "outside the tube")
-        operator.hears("hard/tracking_controller", "idle; stopped: asked to")
+        ends = ("asked to", "outside: funnel_monitor says")  # whichever is heard first
+        operator.spin_until(
+            lambda: any(
+                operator.has_said("hard/tracking_controller", f"idle; stopped: {end}")
+                for end in ends
+            )
+        )
         operator.hears("gentle/tracking_controller", "idle; stopped: the plan is over")
         names = {name for name, _ in operator.node.get_topic_names_and_types()}
     assert not operator.has_said("gentle/funnel_monitor", "outside")

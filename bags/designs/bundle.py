@@ -1,0 +1,195 @@
+"""A design's files as one text, which is published once and decided again by whoever receives it.
+
+What arrives is untrusted. A `Check` decides it in a process of its own, with bounds on its time and
+its memory, so that neither a large proof nor a hostile one holds up the loop that waits for it.
+
+python -m bags.designs.bundle < BUNDLE    one JSON object on standard output
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from bags.designs.design import AnyDesign, Wiring, read_design
+from nlsid_core import designs, files, proofs
+from nlsid_core.arrays import Json
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError, NlsidError
+from nlsid_core.kernel import Verdict
+from nlsid_core.kernel.files import read_regular
+
+FORMAT: Final = "nlsid/bundle"
+PROOF: Final = "proof"  # the role of the file that names the others
+MAX_BYTES: Final = 16 * 2**20  # of a bundle; real ones have about 1 MB
+MAX_ROLES: Final = 8
+MAX_MEMORY: Final = 4 * 2**30  # bytes of address space to decide in
+MAX_TIME: Final = 600.0  # s to decide in
+NICE: Final = 10  # the loop that runs meanwhile comes first
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """The bytes of a design's files by role: `proof`, and those that its claim is about."""
+
+    contents: Mapping[str, bytes]
+
+    @classmethod
+    def load(cls, funnel: Path | str) -> "Bundle":
+        """The files of the proof beside `funnel`.
+
+        Raises CertificateMismatch if the proof is about another funnel, DocumentError if it is no
+        proof or the files are too large to be published; OS errors for the proof pass through.
+        """
+        funnel = Path(funnel)
+        folder = funnel.parent
+        proof = (folder / designs.PROOF).read_bytes()
+        contents = {PROOF: proof}
+        for role, name in _names(proof).items():
+            with contextlib.suppress(OSError):  # the kernel says which is missing
+                contents[role] = read_regular(folder / name)
+        if contents.get("funnel") != funnel.read_bytes():
+            raise CertificateMismatch(f"{designs.PROOF} beside {funnel} is not about this funnel")
+        bundle = cls(contents)
+        _refuse_size(bundle.text())
+        return bundle
+
+    @classmethod
+    def parse(cls, text: str) -> "Bundle":
+        """Read what `text` wrote; DocumentError says what is wrong with it."""
+        _refuse_size(text)
+        document = files.parse_document(text, source="bundle")
+        files.header(document, FORMAT, source="bundle")
+        texts = files.member(document, "files", dict, source="bundle")
+        if len(texts) > MAX_ROLES or not all(isinstance(each, str) for each in texts.values()):
+            raise DocumentError(f"bundle: files should be at most {MAX_ROLES} texts by role")
+        return cls({role: _bytes(each) for role, each in texts.items()})
+
+    def text(self) -> str:
+        """One line of JSON: the files' texts by role."""
+        texts = {
+            role: content.decode("utf-8", "replace") for role, content in self.contents.items()
+        }
+        return json.dumps({"format": FORMAT, "version": files.VERSION, "files": texts})
+
+    @property
+    def digest(self) -> str:
+        """Of the funnel's file, which names the model and the policy that it was made for."""
+        return files.digest(self.contents.get("funnel", b""))
+
+    def decided(self) -> Verdict:
+        """The kernel's verdict about these files and no others.
+
+        Raises CertificateRejected or CertificateMismatch with the reason.
+        """
+        if PROOF not in self.contents:
+            raise CertificateRejected("there is no proof in the bundle")
+        proof = self.contents[PROOF]
+        about = {name: self.contents[r] for r, name in _names(proof).items() if r in self.contents}
+        verdict = proofs.decide(proof, about)
+        found = {role: files.digest(content) for role, content in self.contents.items()}
+        if found != verdict.digests or "funnel" not in found:
+            raise CertificateMismatch(
+                f"the proof is about {', '.join(sorted(verdict.digests))}; with a funnel come "
+                f"{', '.join(sorted(found))}"
+            )
+        return verdict
+
+    def design(self, wiring: Wiring | None = None) -> AnyDesign:
+        """The files as what a robot runs; decides nothing.
+
+        Raises DocumentError or CertificateMismatch if they are not a design.
+        """
+        documents = {
+            "model" if role == "vector_field" else role: files.parse_document(content, source=role)
+            for role, content in self.contents.items()
+            if role != PROOF
+        }
+        return read_design(documents, wiring=wiring)
+
+
+class Check:
+    """Decides a bundle's text in a process of its own; `poll` until it returns something."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._ends = time.monotonic() + MAX_TIME
+        self._answer = tempfile.TemporaryFile()  # noqa: SIM115 - until close
+        with tempfile.TemporaryFile() as question:
+            question.write(text.encode("utf-8", "replace"))
+            question.seek(0)
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", __name__],
+                stdin=question,
+                stdout=self._answer,
+                stderr=subprocess.DEVNULL,
+            )
+
+    def poll(self) -> Json | None:
+        """None while it works; then `proved` with the sentence, or `refused` with the reason."""
+        if self._process.poll() is None:
+            if time.monotonic() < self._ends:
+                return None
+            self._process.kill()
+            self._process.wait()
+            return {"refused": f"not decided within {MAX_TIME:g} s"}
+        self._answer.seek(0)
+        with contextlib.suppress(DocumentError):
+            return files.parse_document(self._answer.read(), source="verdict")
+        return {"refused": f"the kernel ended with status {self._process.returncode}"}
+
+    def close(self) -> None:
+        """Call it off, or let go of what is left of it."""
+        self._process.kill()
+        self._process.wait()
+        self._answer.close()
+
+
+def decide(text: str) -> Json:
+    """`proved` with the sentence and the funnel's digest, or `refused` with the reason."""
+    try:
+        bundle = Bundle.parse(text)
+        verdict = bundle.decided()
+        bundle.design()
+    except (NlsidError, MemoryError) as refusal:
+        return {"refused": str(refusal) or "it takes too much memory to decide"}
+    return {"proved": str(verdict), "digest": bundle.digest}
+
+
+def _names(proof: bytes) -> dict[str, str]:
+    """The plain file names by role that a proof's claim is about."""
+    document = files.parse_document(proof, source=PROOF)
+    claim = files.member(document, "claim", dict, source=PROOF)
+    about = files.member(claim, "about", dict, source=PROOF)
+    names = {role: files.member(about[role], "file", str, source=PROOF) for role in about}
+    return {role: name for role, name in names.items() if Path(name).name == name}
+
+
+def _bytes(text: str) -> bytes:
+    return text.encode("utf-8", "surrogatepass")  # the kernel refuses what is no text
+
+
+def _refuse_size(text: str) -> None:
+    if len(text) > MAX_BYTES:
+        raise DocumentError(f"bundle: {len(text)} characters; one has at most {MAX_BYTES}")
+
+
+def main() -> None:
+    """Decide the bundle on standard input."""
+    os.nice(NICE)
+    with contextlib.suppress(ImportError):  # other platforms have no such bounds
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
+        resource.setrlimit(resource.RLIMIT_CPU, (round(MAX_TIME), round(MAX_TIME)))
+    print(json.dumps(decide(sys.stdin.buffer.read().decode("utf-8", "replace"))))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,407 @@
+"""Many recorded robots: from their bags through `nlsid init` to a monitor, with nothing edited.
+
+python -m benchmarks.robots --data DIR [--json]
+
+DIR holds dart, emps, kuka_kr300, schunk_arm, ur10_panda and cougars_auv; the F1TENTH bags ship with
+the project. Tables are imported as bags once, to the cache. `options` are those of `nlsid init`;
+`lines_of_yaml_edited` counts what was changed in the file that it wrote. Test bags are unseen; a
+false alarm is one of them that is not inside, `caught` are copies of them with a broken sensor.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import logging
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bags.chain.config import Config, load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.designs import documents
+from bags.monitoring.replay import replay_bag
+from bags.recordings.message_types import standard_types
+from bags.recordings.writer import BagWriter
+from bags.samples import f1tenth
+from bags.setup.candidates import look
+from bags.setup.proposal import choose, propose
+from bags.setup.written import yaml_text
+from bags.signals.expressions import Expression, derivative
+from bags.signals.reader import read_signals
+from bags.tools.edit import split
+from bags.tools.importing import import_tables
+from benchmarks.cache import cache_folder
+from benchmarks.machine import describe
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.errors import NlsidError
+from nlsid_core.running.reading import Status
+
+JOINTS = "sensor_msgs/msg/JointState"
+TWIST = "geometry_msgs/msg/TwistStamped"
+SCHUNK_TRIALS = range(5, 101, 5)  # of 100 repeats of a few motions
+PARTS = 5  # of a robot's only recording
+DART_SECOND = 1.0 / 20.0  # s between samples of the car's motion
+DART_WINDOW = 0.2  # s, of the slopes that make speed and yaw rate of the motion capture's poses
+DART_ROLES = {
+    "rubbery": (
+        "81_throttle_ramps", "80_circles_rubbery_floor", "91_free_driving_16_sept_2024",
+        "free_driving_steer_rate_testing_16_sept_2024", "circles_27_sept_2024_fast_ramp",
+    ),
+    "controls": ("83_4_april_2025_MPCC_rosbag", "83_9_april_2025_MPCCPP_rosbag"),
+    "tape": ("81_circles_tape_and_tiles",),
+    "slippery": ("83_16_april_2025_slippery_floor",),
+}  # fmt: skip
+DART_PART = 30.0  # s: the drives are cut into parts of this length
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot: the folder below DIR, what makes its bags, and what is said to `nlsid init`."""
+
+    name: str
+    folder: str
+    bags: Callable[[Path, Path], list[Path]]
+    responses: tuple[str, ...] = ()
+    excitations: tuple[str, ...] = ()
+
+
+def f1tenth_bags(_folder: Path, _cache: Path) -> list[Path]:
+    """The shipped ones."""
+    return f1tenth()
+
+
+def schunk_bags(folder: Path, cache: Path) -> list[Path]:
+    """Motor torques and joint states of a few of the hundred trials."""
+    made = []
+    for trial in SCHUNK_TRIALS:
+        source = folder / "Robot" / f"measurement_{trial}"
+        signals = [
+            f"/joint_states:{field}[name=joint_{k + 1}]={table}[{k + shift}]"
+            for k in range(6)
+            for field, table, shift in (
+                ("position", "trajectory", 0),
+                ("velocity", "trajectory", 6),
+                ("effort", "input", 0),
+            )
+        ]  # fmt: skip
+        made.append(
+            imported(
+                cache / f"trial_{trial:03d}", [source / "input.csv", source / "trajectory.csv"],
+                signals, period=0.004,
+            )
+        )  # fmt: skip
+    return made
+
+
+def emps_bags(folder: Path, cache: Path) -> list[Path]:
+    """Reference, measured position and motor voltage of both recordings, each in parts."""
+    made = []
+    for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
+        signals = [
+            f"/reference:position[name=slide]={name}.qg",
+            f"/joint_states:position[name=slide]={name}.qm",
+            f"/motor_command:effort[name=slide]={name}.vir",
+        ]
+        whole = imported(cache / name, [folder / f"{name}.mat"], signals, period=0.001)
+        made += parts(whole, 24.8 / PARTS)
+    return made
+
+
+def kuka_bags(folder: Path, cache: Path) -> list[Path]:
+    """Reference and measured position, velocity and torque of six motors; three recordings."""
+    made = []
+    for letter in "ABC":
+        signals = [
+            f"{topic}[name=motor_{k + 1}]=rec.{table}[{k}, :]"
+            for k in range(6)
+            for topic, table in (
+                ("/reference:position", "ref_pos_deg"),
+                ("/joint_states:position", "act_pos_mot_deg"),
+                ("/joint_states:velocity", "act_vel_mot_deg_per_s"),
+                ("/joint_states:effort", "act_torque_abs_nm"),
+            )
+        ]
+        file = folder / f"2020-10-21_10s_FF_{letter}_08ms.mat"
+        made.append(imported(cache / f"drive_{letter}", [file], signals, period=0.004))
+    return made
+
+
+def ur10_bags(folder: Path, cache: Path) -> list[Path]:
+    """One recording in parts."""
+    return one_in_parts(folder / "ur10_exciting_trajectory.db3", cache, 27.5)
+
+
+def panda_bags(folder: Path, cache: Path) -> list[Path]:
+    """One recording in parts."""
+    return one_in_parts(folder / "panda_exciting_trajectory.db3", cache, 24.2)
+
+
+def cougars_bags(folder: Path, cache: Path) -> list[Path]:
+    """One recording of an underwater robot in parts."""
+    return one_in_parts(folder / "SO_lastbag_mcap", cache, 119.5)
+
+
+def dart_bags(folder: Path, cache: Path) -> list[Path]:
+    """The car on the rubbery floor, its drives in parts."""
+    return dart_drives(folder, cache, "rubbery")
+
+
+def dart_drives(folder: Path, cache: Path, role: str) -> list[Path]:
+    """Parts of the drives on one floor."""
+    made = []
+    for name in DART_ROLES[role]:
+        for file in sorted((folder / name).glob("*.csv")):
+            bag = cache / f"{role}_{name[:2]}_{file.stem}".replace(".", "_")
+            if not bag.is_dir():
+                write_drive(file, bag)
+            made += parts(bag, DART_PART)
+    return made
+
+
+def write_drive(file: Path, bag: Path) -> None:
+    """One drive as commands and motion, every 50 ms by the motion capture's clock.
+
+    Speed and yaw rate are the slopes of positions and yaw over the last DART_WINDOW s, as a monitor
+    would have them. `/drive` has the measured speed beside the steering command, for a model whose
+    inputs both are. Rows before the first pose and with repeated times are left out.
+    """
+    with file.open(encoding="utf-8-sig") as stream:
+        titles = stream.readline().strip().split(",")
+    table = np.genfromtxt(file, delimiter=",", skip_header=1)
+    columns = dict(zip(titles, table.T, strict=True))
+    t = columns["vicon time"]
+    later = np.concatenate([[True], np.diff(t) > 0])
+    t, rows = t[later] - t[0], np.flatnonzero(later)
+    grid = np.arange(t[0], t[-1], DART_SECOND)
+    stamps: IntArray = 1_700_000_000 * 10**9 + np.rint(grid * 1e9).astype(np.int64)
+
+    def on_grid(name: str) -> FloatArray:
+        values = np.unwrap(columns[name][rows]) if "yaw" in name else columns[name][rows]
+        found: FloatArray = np.interp(grid, t, values)
+        return found
+
+    rates = [derivative(on_grid(n), stamps, DART_WINDOW) for n in ("vicon x", "vicon y")]
+    yaw_rate = derivative(on_grid("vicon yaw"), stamps, DART_WINDOW)
+    before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)  # commands are held
+    throttle, steering = (columns[name][rows][before] for name in ("throttle", "steering"))
+    with BagWriter(bag) as writer:
+        for k in np.flatnonzero(np.isfinite(yaw_rate)):
+            motion = {"x": float(np.hypot(rates[0][k], rates[1][k])), "yaw": float(yaw_rate[k])}
+            command = {"x": float(throttle[k]), "yaw": float(steering[k])}
+            drive = {"x": motion["x"], "yaw": command["yaw"]}
+            for topic, numbers in (("/command", command), ("/drive", drive), ("/odom", motion)):
+                stamp = int(stamps[k])
+                data = twist(stamp, numbers["x"], numbers["yaw"])
+                writer.write(topic, TWIST, data, log_time_ns=stamp, publish_time_ns=stamp)
+
+
+def twist(stamp_ns: int, x: float, yaw: float) -> bytes:
+    """A TwistStamped with linear.x and angular.z."""
+    kinds = standard_types().types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    seconds, rest = divmod(stamp_ns, 10**9)
+    header = kinds["std_msgs/msg/Header"](
+        kinds["builtin_interfaces/msg/Time"](seconds, rest), "base"
+    )
+    body = kinds["geometry_msgs/msg/Twist"](vector(x, 0.0, 0.0), vector(0.0, 0.0, yaw))
+    return bytes(standard_types().serialize_cdr(kinds[TWIST](header, body), TWIST))
+
+
+def imported(bag: Path, files: Sequence[Path], signals: Sequence[str], *, period: float) -> Path:
+    """Tables as a bag of joint states, once."""
+    if not bag.is_dir():
+        topics = dict.fromkeys(signal.partition(":")[0] for signal in signals)
+        import_tables(files, bag, signals, types=dict.fromkeys(topics, JOINTS), period=period)
+    return bag
+
+
+def one_in_parts(bag: Path, cache: Path, seconds: float) -> list[Path]:
+    """A robot's only recording in PARTS parts."""
+    copy = cache / bag.stem
+    if not copy.exists():
+        shutil.copytree(bag, copy) if bag.is_dir() else shutil.copy(bag, copy.with_suffix(".db3"))
+    return parts(copy if bag.is_dir() else copy.with_suffix(".db3"), seconds / PARTS)
+
+
+def parts(bag: Path, seconds: float) -> list[Path]:
+    """The bag cut every so many seconds, once; a rest of less than half of that is left out."""
+    made = sorted(bag.parent.glob(f"{bag.stem}_part_[0-9][0-9]"))
+    made = made or split(bag, bag.parent / f"{bag.stem}_part", every=seconds)
+    return made[:-1] if len(made) > 1 else made
+
+
+ROBOTS = (
+    Robot("F1TENTH speed", ".", f1tenth_bags, ("/odom:twist.twist.linear.x",)),
+    Robot("F1TENTH yaw rate", ".", f1tenth_bags),
+    Robot(
+        "F1TENTH 2x2", ".", f1tenth_bags,
+        ("/odom:twist.twist.linear.x", "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"),
+        ("/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"),
+    ),
+    Robot("DART steering to yaw rate", "dart", dart_bags, ("/odom:twist.angular.z",),
+          ("/command:twist.angular.z",)),
+    Robot("DART yaw rate by steering and speed", "dart", dart_bags, ("/odom:twist.angular.z",),
+          ("/drive:twist.angular.z", "/drive:twist.linear.x")),
+    Robot("Schunk arm", "schunk_arm", schunk_bags),
+    Robot("EMPS slide", "emps", emps_bags),
+    Robot("KUKA KR300", "kuka_kr300", kuka_bags),
+    Robot("UR10", "ur10_panda", ur10_bags),
+    Robot("Panda", "ur10_panda", panda_bags),
+    Robot("CoUGARs underwater robot", "cougars_auv", cougars_bags),
+)  # fmt: skip
+
+
+def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
+    """One robot's way; `refused` says where it ended, with the reason, if it did."""
+    options = [*(f"-y {text}" for text in robot.responses),
+               *(f"-u {text}" for text in robot.excitations)]  # fmt: skip
+    row: dict[str, Any] = {"robot": robot.name, "options": options, "lines_of_yaml_edited": 0}
+    folder = data / robot.folder
+    if not folder.is_dir():
+        return row | {"refused": f"data: no folder {robot.folder}"}
+    mine = cache / "robots" / (robot.folder if robot.folder != "." else "f1tenth")
+    mine.mkdir(parents=True, exist_ok=True)
+    bags = robot.bags(folder, mine)
+    step, started = "init", time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as name:
+            out = Path(name)
+            config = initialised(robot, bags, out / "robot.yaml")
+            row["signals"] = [
+                s.path for s in (*config.signals.response, *config.signals.excitation)
+            ]
+            step = "identify"
+            fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
+            row["test_error"] = fit.fit.errors["test"][fit.fit.chosen.method.name]
+            step = "funnel"
+            design = design_funnel_files(out / documents.MODEL, config, out)
+            test = [bag for bag in bags if bag.name in config.split.test]
+            widths = [
+                float(width) / spread(bags, signal.path)
+                for width, signal in zip(
+                    design.funnel.half_widths, config.signals.response, strict=True
+                )
+            ]
+            row |= {"half_width_of_range": max(widths), "each": widths}
+            step = "monitor"
+            row |= held_against(config, test, out)
+            if robot.folder == "dart":
+                row |= floors(config, folder, mine, out)
+    except NlsidError as error:
+        row["refused"] = f"{step}: {error}"
+    finally:
+        row["minutes"] = (time.perf_counter() - started) / 60.0
+    return row
+
+
+def initialised(robot: Robot, bags: list[Path], path: Path) -> Config:
+    """What `nlsid init --yes` writes for this robot, read again."""
+    found = look(bags)
+    responses, excitations = choose(found, robot.responses, robot.excitations)
+    proposal = propose(bags, found, responses=responses, excitations=excitations, robot=robot.name)
+    path.write_text(yaml_text(proposal))
+    return load_config(path)
+
+
+def spread(bags: list[Path], signal: str) -> float:
+    """The response's range over all bags."""
+    read = [read_signals(bag, [signal], sort=True, gaps_in=[signal])[signal] for bag in bags]
+    values = np.concatenate([samples.values for samples in read])
+    return float(np.ptp(values))
+
+
+def held_against(config: Config, test: list[Path], out: Path) -> dict[str, Any]:
+    """Unseen bags that are not inside, and copies of them with a broken sensor that are caught."""
+    alarms = [flagged(config, bag, out) for bag in test]
+    signal = str(Expression.parse(config.signals.response[0].path).path)
+    caught = []
+    for bag in test:
+        for number, (_, fault) in enumerate(FAULTS.items()):
+            copy = out / f"{bag.name}_{number}"
+            try:
+                write_faulty_copy(bag, copy, signal, fault)
+            except NlsidError:  # an angle is made of four numbers and cannot be scaled
+                continue
+            caught.append(flagged(config, copy, out))
+    return {
+        "test_bags": len(test),
+        "false_alarms": sum(alarms),
+        "broken": len(caught),
+        "caught": sum(caught),
+    }
+
+
+def floors(config: Config, folder: Path, cache: Path, out: Path) -> dict[str, str]:
+    """How many drives on other floors are flagged."""
+    said = {}
+    for role in ("controls", "tape", "slippery"):
+        verdicts = [flagged(config, bag, out) for bag in dart_drives(folder, cache, role)]
+        said[f"flagged_{role}"] = f"{sum(verdicts)} of {len(verdicts)}"
+    return said
+
+
+def flagged(config: Config, bag: Path, out: Path) -> bool:
+    """Whether a bag is outside or violates the assumption."""
+    proved = documents.load_proved(out / documents.FUNNEL)
+    replay = replay_bag(proved, bag, centre=config.monitor.nominal_source)
+    return replay.verdict in (Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value)
+
+
+def main() -> None:
+    """Print the table, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of recorded data")
+    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
+    parser.add_argument("robots", nargs="*", help="parts of names; all by default")
+    arguments = parser.parse_args()
+    logging.getLogger("bags").setLevel(logging.ERROR)  # every bag's samples left out at its ends
+    wanted = [
+        r for r in ROBOTS if not arguments.robots or any(n in r.name for n in arguments.robots)
+    ]
+    print(f"{describe()}\n")
+    print(
+        f"{'':36s}{'edited':>7s}{'error %':>9s}"
+        f"{'width/range':>12s}{'false':>8s}{'caught':>8s}{'min':>6s}"
+    )
+    rows = []
+    for robot in wanted:
+        row = measure(robot, arguments.data, cache=cache_folder())
+        rows.append(row)
+        print(line(row), flush=True)
+    widths = [row["half_width_of_range"] for row in rows if "half_width_of_range" in row]
+    narrow = sum(width <= 0.5 for width in widths)
+    print(f"\n{narrow} of {len(widths)} tubes are at most half of the range")
+    if arguments.json:
+        print(json.dumps({"robots": rows, "narrow": narrow, "tubes": len(widths)}))
+
+
+def line(row: dict[str, Any]) -> str:
+    """One robot's row."""
+    parts_of_row = [f"{row['robot']:36s}{row['lines_of_yaml_edited']:7d}"]
+    parts_of_row.append(f"{row['test_error']:9.2f}" if "test_error" in row else f"{'-':>9s}")
+    if "false_alarms" in row:
+        false = f"{row['false_alarms']}/{row['test_bags']}"
+        caught = f"{row['caught']}/{row['broken']}"
+        parts_of_row.append(f"{row['half_width_of_range']:12.3f}{false:>8s}{caught:>8s}")
+    else:
+        width = row.get("half_width_of_range")
+        parts_of_row.append(f"{'-' if width is None else f'{width:.3f}':>12s}{'-':>8s}{'-':>8s}")
+    parts_of_row.append(f"{row.get('minutes', 0.0):6.2f}")
+    floors_of_row = [f"{key}: {value}" for key, value in row.items() if key.startswith("flagged")]
+    extras = [extra for extra in (*floors_of_row, row.get("refused", "")) if extra]
+    parts_of_row.extend(f"\n    {extra}" for extra in extras)
+    return "".join(parts_of_row)
+
+
+if __name__ == "__main__":
+    main()

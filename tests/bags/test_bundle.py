@@ -1,0 +1,145 @@
+"""Bundles of a design: what is true is decided as from its files, everything else is refused."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.designs import bundle as bundles
+from bags.designs import documents
+from bags.designs.bundle import Bundle, Check, decide
+from bags.samples import f1tenth
+from nlsid_core import files
+from nlsid_core.arrays import Json
+from nlsid_core.errors import CertificateMismatch, DocumentError
+from nlsid_core.proofs import check
+
+
+@pytest.fixture(scope="module")
+def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("chain")
+    config = load_config(config_file("f1tenth.yaml"))
+    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    design_funnel_files(out / documents.MODEL, config, out)
+    return out / documents.FUNNEL
+
+
+@pytest.fixture(scope="module")
+def bundle(funnel: Path) -> Bundle:
+    return Bundle.load(funnel)
+
+
+def test_a_bundle_is_the_files_byte_for_byte_and_decided_like_them(
+    bundle: Bundle, funnel: Path
+) -> None:
+    read = Bundle.parse(bundle.text())
+    assert read == bundle
+    names = {"model": documents.MODEL, "policy": documents.POLICY, "funnel": documents.FUNNEL}
+    for role, name in (names | {"proof": documents.FUNNEL_PROOF}).items():
+        assert read.contents[role] == funnel.with_name(name).read_bytes()
+    assert read.decided() == check(funnel.with_name(documents.FUNNEL_PROOF))
+    assert read.design().digest == read.digest == files.digest(funnel.read_bytes())
+    assert decide(bundle.text()) == {"proved": str(read.decided()), "digest": read.digest}
+
+
+def with_digit_changed(text: str) -> str:
+    at = next(i for i in range(len(text) // 2, len(text)) if text[i] in "12345678")
+    return text[:at] + str(int(text[at]) + 1) + text[at + 1 :]
+
+
+@pytest.mark.parametrize("role", ["model", "policy", "funnel", "proof"])
+@pytest.mark.parametrize("damage", ["a digit", "gone", "empty", "another's"])
+def test_no_file_can_be_changed_left_out_or_exchanged(
+    bundle: Bundle, role: str, damage: str
+) -> None:
+    contents = dict(bundle.contents)
+    if damage == "gone":
+        del contents[role]
+    elif damage == "empty":
+        contents[role] = b""
+    elif damage == "another's":
+        contents[role] = contents["model" if role != "model" else "policy"]
+    else:
+        contents[role] = with_digit_changed(contents[role].decode()).encode()
+    assert set(decide(Bundle(contents).text())) == {"refused"}
+
+
+def test_a_file_that_the_proof_is_not_about_is_refused(bundle: Bundle) -> None:
+    more = Bundle({**bundle.contents, "vector_field": bundle.contents["model"]})
+    with pytest.raises(CertificateMismatch, match="the proof is about funnel, model, policy"):
+        more.decided()
+
+
+def test_a_proof_of_something_else_brings_no_design(funnel: Path, bundle: Bundle) -> None:
+    """The model's own proof of stability is a true claim, and about no funnel."""
+    proof = funnel.with_name(documents.MODEL_PROOF).read_bytes()
+    model = {"proof": proof, "model": bundle.contents["model"]}
+    assert "with a funnel come" in decide(Bundle(model).text())["refused"]
+    assert "refused" in decide(Bundle({**bundle.contents, "proof": proof}).text())
+
+
+@pytest.mark.parametrize("name", ["../model.json", "/etc/passwd", "", "."])
+def test_a_name_that_is_not_plain_is_not_read(funnel: Path, tmp_path: Path, name: str) -> None:
+    proof = files.load_document(funnel.with_name(documents.FUNNEL_PROOF))
+    proof["claim"]["about"]["model"]["file"] = name
+    for path in funnel.parent.glob("*.json"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    files.write_document(tmp_path / documents.FUNNEL_PROOF, proof)
+    loaded = Bundle.load(tmp_path / documents.FUNNEL)
+    assert "model" not in loaded.contents
+    assert "refused" in decide(loaded.text())
+
+
+def deep(document: Json) -> str:
+    return json.dumps(document | {"files": "[" * 100_000})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda d: json.dumps(d | {"format": "nlsid/model"}), "expected 'nlsid/bundle'"),
+        (lambda d: json.dumps(d | {"version": 1}), "this nlsid reads version"),
+        (lambda d: json.dumps(d | {"files": []}), "'files' should be dict"),
+        (lambda d: json.dumps(d | {"files": {"proof": 1}}), "texts by role"),
+        (lambda d: json.dumps(d | {"files": dict.fromkeys(map(str, range(9)), "")}), "at most 8"),
+        (lambda _: "[" * 100_000, "not a valid document"),
+        (lambda _: "", "not a valid document"),
+        (lambda _: " " * (bundles.MAX_BYTES + 1), "one has at most"),
+        (lambda d: json.dumps(d | {"files": {"proof": "\ud800"}}), "not a valid document"),
+    ],
+)
+def test_what_is_no_bundle_is_refused_with_the_reason(
+    bundle: Bundle, change: Callable[[Json], str], says: str
+) -> None:
+    assert says in decide(change(json.loads(bundle.text())))["refused"]
+
+
+def test_a_bundle_too_large_to_be_taken_is_not_made(
+    funnel: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bundles, "MAX_BYTES", 1000)
+    with pytest.raises(DocumentError, match="one has at most 1000"):
+        Bundle.load(funnel)
+
+
+def answered(check: Check) -> Json:
+    while (answer := check.poll()) is None:
+        time.sleep(0.01)
+    check.close()
+    return answer
+
+
+def test_a_check_in_a_process_of_its_own_says_the_same_and_can_be_called_off(
+    bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert answered(Check(bundle.text())) == decide(bundle.text())
+    forged = Bundle({**bundle.contents, "policy": b"{}"})
+    assert answered(Check(forged.text())) == decide(forged.text())
+    Check(bundle.text()).close()
+    monkeypatch.setattr(bundles, "MAX_TIME", 0.0)
+    assert answered(Check(bundle.text())) == {"refused": "not decided within 0 s"}
