@@ -131,7 +131,7 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
             "stale_after": 2.0,
         },
     }
-    pushed_ns = runs = 0
+    pushed_ns = runs = alarms = 0
     with ExitStack() as stack:
         operator, spin_until = _operator(stack)
         stream, events = qos.STREAM, qos.EVENTS
@@ -140,6 +140,7 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
         operator.create_subscription(String, "/tracking_controller/run", heard.run, qos.DOCUMENT)
         start = operator.create_client(Trigger, "/tracking_controller/start")
         push = operator.create_client(Trigger, "/plant/push")
+        restart = operator.create_client(Trigger, "/funnel_monitor/restart")
         for name, parameters in nodes.items():
             stack.enter_context(python(*node(name, **parameters)))
         spin_until(lambda: start.service_is_ready() and push.service_is_ready())
@@ -165,6 +166,9 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
                     pushed_ns = time.time_ns()
                     push.call_async(Trigger.Request())
             spin_until(lambda: heard.ready("tracking_controller", "idle"))
+            if len(heard.alarms) > alarms:  # an alarm is kept until somebody has seen to it
+                alarms = len(heard.alarms)
+                spin_until(restart.call_async(Trigger.Request()).done)
         until = time.monotonic() + 1.0
         spin_until(lambda: time.monotonic() > until)  # the last verdicts are on their way
     return compared(

@@ -42,8 +42,9 @@ BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "04", "05", "13
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """The shipped configuration with a state-affine model."""
+    """The shipped configuration with a state-affine model, and no plan that it could track."""
     content = yaml.safe_load(config_file("f1tenth.yaml").read_text())
+    del content["funnel"]
     content["identification"] = STATE_AFFINE
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(content))
