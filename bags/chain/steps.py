@@ -262,7 +262,10 @@ def design_funnel_files(
     """
     options = config.funnel
     if options is None:
-        raise DataError("the configuration has no section 'funnel': horizon, profile, policy, ...")
+        raise DataError(
+            "the configuration has no section 'funnel'; `funnel: {}` is one, for a tube around the "
+            "model's simulation, and with a profile it plans a motion and its policy"
+        )
     planned = options.profile is not None
     load = documents.load_model if planned else documents.load_stable_model
     model: StableModel = load(model_path)

@@ -1,5 +1,6 @@
 """One verb for every model class and method, in Python and on the command line."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ STATE_AFFINE = {
     "lags": 2, "model": "state_affine", "method": "rse_certified", "iterations": 5,
     "leading_degree": 1, "right_degree": 1, "input_range": [0.0, 0.5],
 }  # fmt: skip
-BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "04", "05", "13", "24", "34"}]
+BAGS = [str(bag) for bag in f1tenth() if bag.name[-2:] in {"01", "03", "05", "13", "23", "35"}]
 
 
 @pytest.fixture
@@ -145,7 +146,7 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
          "--out", str(out)],
     )  # fmt: skip
     assert refused.exit_code != 0
-    assert "kind is 'state_affine'" in str(refused.exception)
+    assert "has no section 'funnel'" in str(refused.exception)
 
 
 def test_the_command_line_compares_methods_on_the_same_bags(
@@ -158,5 +159,5 @@ def test_the_command_line_compares_methods_on_the_same_bags(
     )
     assert made.exit_code == 0, made.output
     for method in (LeastSquares, Rie, Rse, CertifiedRse):
-        assert made.output.count(method.title) == 2
+        assert len(re.findall(rf"│ {method.name} ", made.output)) == 2
     assert "20 ahead" in made.output
