@@ -7,19 +7,21 @@ gain is the one whose tube is narrowest on the trials of the design, and the bou
 largest that the other trials, those of the calibration, reach over their whole length.
 """
 
+import warnings
 from collections.abc import Sequence
 from fractions import Fraction
 from typing import TypeAlias
 
 import cvxpy as cp
 import numpy as np
-from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import lsq_linear
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -136,7 +138,9 @@ def _smallest_ellipsoid(model: DifferenceEquation, K: FloatArray, L: FloatArray)
         decrease = variable - grow * closed @ variable @ closed.T - noise / scale
         constraints.append(decrease >> 0)
     problem = cp.Problem(cp.Minimize(reach), constraints)
-    problem.solve(solver=cp.CLARABEL)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of accuracy: the kernel decides what is found
+        problem.solve(solver=cp.CLARABEL)
     if variable.value is None:
         raise Infeasible(
             f"no ellipsoid serves both the played inputs and the policy ({problem.status}); "
@@ -172,7 +176,7 @@ def kalman_gain(model: DifferenceEquation, noise_ratio: float) -> FloatArray:
     noise_ratio: variance of a disturbance of the input over the variance of the measurement.
     """
     A, B, C = model.A, model.B, model.C
-    S = solve_discrete_are(A.T, C.T, noise_ratio * B @ B.T, np.eye(1))
+    S = solve_riccati(A.T, C.T, noise_ratio * B @ B.T, np.eye(1))
     gain: FloatArray = (A @ S @ C.T)[:, 0] / (1.0 + (C @ S @ C.T)[0, 0])
     return gain
 
@@ -203,7 +207,7 @@ def lqr_gain(model: DifferenceEquation, *, output_weight: float, input_weight: f
     if output_weight <= 0 or input_weight <= 0:
         raise DataError(f"LQR weights should be positive; {output_weight} and {input_weight}")
     A, B, C = model.A, model.B, model.C
-    S = solve_discrete_are(A, B, output_weight * C.T @ C, np.array([[input_weight]]))
+    S = solve_riccati(A, B, output_weight * C.T @ C, np.array([[input_weight]]))
     gain: FloatArray = (B.T @ S @ A)[0] / (input_weight + (B.T @ S @ B)[0, 0])
     return gain
 

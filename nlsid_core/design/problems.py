@@ -65,7 +65,7 @@ class OutputTube:
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
     the range of the training trials and a tenth of it on both sides).
-    Source: TUBES, sections 2 to 6.
+    Source: docs/certificate_tube.md.
     """
 
     model: StableModel

@@ -5,7 +5,7 @@ The kernel's reading of the model file gives F, H and the vertices E. Observers 
 of the mean increment over a grid of noise ratios, ρ is taken from a grid above the square of the
 proved rate. Of all pairs those whose forecast a reaction time ahead is the narrowest are solved as
 semidefinite programs, on the training trials; the level is measured on other trials.
-Source: TUBES, sections 2, 4, 5 and 6; docs/certificate_tube.md.
+Source: docs/certificate_tube.md.
 """
 
 import warnings
@@ -17,13 +17,14 @@ from typing import Any, TypeAlias
 
 import cvxpy
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, solve_discrete_are, solve_discrete_lyapunov
+from scipy.linalg import LinAlgError, block_diag, solve_discrete_lyapunov
 from scipy.signal import lfilter
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.tube import Tube, TubeFunnel
@@ -293,8 +294,8 @@ def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
         Q, S = ratio * G @ spread @ G.T, ratio * G @ spread @ D.T
         R = ratio * D @ spread @ D.T + sizes
         try:
-            X = solve_discrete_are(form.A.T, form.C.T, Q, R, s=S)
-        except (LinAlgError, ValueError):
+            X = solve_riccati(form.A.T, form.C.T, Q, R, S)
+        except Infeasible:
             continue
         L = np.linalg.solve(form.C @ X @ form.C.T + R, (form.A @ X @ form.C.T + S).T).T
         if np.isfinite(L).all():

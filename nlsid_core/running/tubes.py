@@ -3,7 +3,7 @@
 Each tube has an observer, x̂⁺ = f(x̂, w) + L e, and a number, E⁺ = ρE + e'Re; the simulation x⁺ =
 f(x, w) is common to them. A sample without a measurement is a step with e = 0, and nothing is said
 of it; nothing ends a run but an input that the model refuses or a box that is left, after which it
-starts anew. Source: TUBES, section 8; docs/certificate_tube.md.
+starts anew. Source: docs/certificate_tube.md.
 """
 
 import math

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import solve_discrete_are
 
 from nlsid_core import conic, files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
+from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 from nlsid_core.models.measured_state import MeasuredState
@@ -111,7 +111,7 @@ def tvlqr(
     """Time-varying LQR around a motion, weights relative to half the data box squared."""
     half_x, half_u = (np.diff(r, axis=1)[:, 0] / 2 for r in (model.x_range, model.u_range))
     Q, R = np.diag(state_weight / half_x**2), np.diag(input_weight / half_u**2)
-    P_final = solve_discrete_are(*model.linearised(x[-1], u[-1]), Q, R)
+    P_final = solve_riccati(*model.linearised(x[-1], u[-1]), Q, R)
     linear = [model.linearised(x_k, u_k) for x_k, u_k in zip(x[:-1], u, strict=True)]
     A, B = (np.array(part) for part in zip(*linear, strict=True))
     return discrete_tvlqr(A, B, Q=Q, R=R, P_final=(P_final + P_final.T) / 2)
@@ -124,7 +124,7 @@ def observer_gain(model: MeasuredState) -> FloatArray:
     """
     A, _ = model.linearised(model.x_range.mean(axis=1), model.u_range.mean(axis=1))
     Q, R = np.diag(model.disturbance**2), np.diag(model.noise**2)
-    prior = solve_discrete_are(A.T, np.eye(len(model)), Q, R)
+    prior = solve_riccati(A.T, np.eye(len(model)), Q, R)
     return np.asarray(np.linalg.solve(prior + R, prior).T)
 
 
