@@ -259,7 +259,8 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample."""
     table = Table(
         title="held against the funnel",
-        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube",
+        caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
+        "assumed",
         title_justify="left",
         caption_justify="left",
     )
@@ -269,12 +270,19 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("margin", "right"),
         ("at", "right"),
         ("axis", "left"),
-        ("assumption", "right"),
+        ("used", "right"),
         ("bad from", "right"),
         ("judged", "right"),
     ):
         long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
-        table.add_column(column, justify=justify, no_wrap=not long, overflow="fold")  # type: ignore[arg-type]
+        width = 8 if long else None
+        table.add_column(
+            column,
+            justify=justify,  # type: ignore[arg-type]
+            no_wrap=not long and column != "judged",
+            overflow="fold",
+            min_width=width,
+        )
     for replay in replays:
         worst, bad = replay.worst, replay.first_bad
         colour = COLOURS[replay.verdict]

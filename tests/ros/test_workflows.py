@@ -9,21 +9,29 @@ from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM, Signals
 
 import pytest
+import yaml
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.chain.config import load_config
+from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
+from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
 from nlsid_ros import qos
+from nlsid_ros.messages import stamp_ns_of
 from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
 
 pytestmark = ros_test
@@ -143,6 +151,48 @@ def _runs(pid: str) -> bool:
     except OSError:
         return False
     return state not in "ZX"
+
+
+def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
+    operator: Operator, tmp_path: Path
+) -> None:
+    """Around the model's own simulation: margins heard are those of the replay, bit for bit."""
+    content = yaml.safe_load((ROOT / "config" / "f1tenth.yaml").read_text())
+    content["funnel"] = {}
+    path = tmp_path / "robot.yaml"
+    path.write_text(yaml.safe_dump(content))
+    config, out = load_config(path), tmp_path / "out"
+    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    design_funnel_files(out / documents.MODEL, config, out)
+    trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
+    replayed = replay_bag(
+        documents.load_proved(out / documents.FUNNEL), trial, centre=Centre.COMMAND
+    )
+    assert replayed.verdict == "inside"
+    expected = [
+        (stamp, reading.margin)
+        for stamp, reading in zip(replayed.stamps_ns, replayed.readings, strict=True)
+        if reading.status is Status.INSIDE
+    ]
+    heard: dict[int, float] = {}
+
+    def margin(message: JointState) -> None:
+        heard[stamp_ns_of(message)] = message.position[0]
+
+    operator.node.create_subscription(JointState, "/funnel_monitor/margin", margin, qos.STREAM)
+    funnel = out / documents.FUNNEL
+    with live("monitor", f"funnel:={funnel}", "allow_old_stamps:=true", *PATIENT):
+        operator.hears("funnel_monitor", " yet")
+        topics = "['/odom', '/cmd_vel']"
+        with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
+            operator.hears("funnel_monitor", "inside")
+            operator.spin_until(lambda: {stamp for stamp, _ in expected} <= heard.keys())
+            assert player.wait(timeout=20) == 0
+        operator.hears("funnel_monitor", "unknown: no speed for 1 s")
+    assert len(expected) > 100
+    assert [(stamp, heard[stamp]) for stamp, _ in expected] == expected
+    assert not operator.has_said("funnel_monitor", "outside")
+    assert not operator.has_said("funnel_monitor", "violated")
 
 
 def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
