@@ -97,7 +97,8 @@ class Heard:
         for entry in message.status:
             self.said[entry.name] = entry.message
             if entry.name == "funnel_monitor" and entry.level == DiagnosticStatus.ERROR:
-                self.alarms.append(entry.message.partition(": ")[2])
+                reason = entry.message.partition(": ")[2]
+                self.alarms.append(reason.partition("; /")[0])  # then what was asked to stop it
 
     def run(self, message: String) -> None:
         """A run was announced."""
