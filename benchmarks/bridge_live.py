@@ -39,7 +39,7 @@ from bags.designs.documents import FUNNEL, load_proved_tracking
 from bags.monitoring.replay import announced_runs, replay_messages
 from benchmarks.machine import describe, peers
 from benchmarks.processes import isolate, node, python
-from benchmarks.swing import swing_config
+from benchmarks.swing import SECONDS, swing_config
 from nlsid_core.errors import NlsidError
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
@@ -168,10 +168,10 @@ def live(design: Path, bag: Path, *, seconds: float) -> LiveLoop:
                     push.call_async(Trigger.Request())
             spin_until(lambda: heard.ready("tracking_controller", "idle"))
             if len(heard.alarms) > alarms:  # an alarm is kept until somebody has seen to it
-                alarms = len(heard.alarms)
+                spin_until(_after(1.5 * SECONDS))  # the stopped run is judged to its end
                 spin_until(restart.call_async(Trigger.Request()).done)
-        until = time.monotonic() + 1.0
-        spin_until(lambda: time.monotonic() > until)  # the last verdicts are on their way
+                alarms = len(heard.alarms)
+        spin_until(_after(1.0))  # the last verdicts are on their way
     return compared(
         load_proved_tracking(design / FUNNEL).design, bag, heard, pushed_ns, seconds, runs
     )
@@ -213,6 +213,12 @@ def compared(
         push_detect_ms=(after[0].stamp_ns - pushed_ns) / 1e6 if after else math.nan,
         alarm=heard.alarms[0] if heard.alarms else "",
     )
+
+
+def _after(seconds: float) -> Callable[[], bool]:
+    """Whether they have passed since now."""
+    until = time.monotonic() + seconds
+    return lambda: time.monotonic() > until
 
 
 def _operator(stack: ExitStack) -> tuple[Node, Callable[[Callable[[], object]], None]]:
