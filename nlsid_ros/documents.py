@@ -96,10 +96,13 @@ class DesignSubscription:
         if self._is_crowded():
             return
         if len(message.data) > MAX_BYTES:
+            self.close()  # of what was the newest until now
+            self._waiting = None
             self._refuse(f"it has {len(message.data)} characters; at most {MAX_BYTES} are read")
             return
         self._waiting = message.data
         if message.data == self._used:
+            self.close()
             self._waiting, self.refusal, self.state = None, "", self._verdict
             self._changed()
         self._look()

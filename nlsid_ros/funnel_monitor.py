@@ -337,10 +337,10 @@ class FunnelMonitor(ManagedNode):
             return
         severity = SEVERITY.get(state, 0)
         news = self._latched is None or severity > SEVERITY[self._latched[0]]
-        if severity >= SEVERITY[State.ASSUMPTION_VIOLATED] and news:
-            first = self._latched is None
-            self._latched = state, reading.reason
-            if first:
+        if severity >= SEVERITY[State.ASSUMPTION_VIOLATED]:
+            if news:
+                self._latched = state, reading.reason
+            if not self._unanswered:
                 self._call_for_help()
         message = self._status_message()
         self._diagnostics.publish(message)

@@ -205,8 +205,11 @@ class TrackingController(ManagedNode):
         stamp_ns = stamp_ns_of(message)
         self._heard = time.monotonic()
         if self._first_ns is None:  # its input is not ours; the next sample's is
-            self._first_ns, self._sent = stamp_ns, self._heard
             self._frame_heard = self._frame or frame_of(message)
+            if reason := self._distrust(stamp_ns, message):
+                self._halt(reason)
+                return
+            self._first_ns, self._sent = stamp_ns, self._heard
         else:
             waiting = controller.k < 1
             try:

@@ -55,7 +55,8 @@ class Replay:
         said, found = "", []
         before: Reading | None = None
         for reading in self.readings:
-            if before is not None and self.period > 0.0 and not _starting(reading):
+            starts = before is not None and _starting(before) and _starting(reading)
+            if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
                 if lost > 0:
                     reason = f"{lost} samples are missing"
@@ -152,7 +153,7 @@ def replay_messages(
     announced = planned and bool(announced_runs(design, bag))
     watch = Watch(design, centre=centre, announced=announced)
     stamped = [entry for said in _fed(watch, bag, announced=announced) for entry in said]
-    stamped += watch.flush()
+    stamped += watch.end()
     if not stamped:
         raise BagError(f"{bag}: no sample with both {design.response} and {design.command}")
     return stamped

@@ -27,6 +27,9 @@ class Stamped(NamedTuple):
     state: State
 
 
+SILENT = 5  # periods that commands may go on after the last response of a recording
+
+
 class Watch:
     """Makes samples as identification does (`bags.signals.sampling`) and asks the monitor of each.
 
@@ -111,6 +114,18 @@ class Watch:
     def flush(self, until_ns: int | None = None) -> list[Stamped]:
         """Stop waiting for commands: responses stamped up to `until_ns` (None: all)."""
         return self._judge(self.pairing.flush(until_ns))
+
+    def end(self) -> list[Stamped]:
+        """The recording is over: what waited, and unknown to its end if only commands went on."""
+        said = self.flush()
+        silent_ns = self.pairing.newest_command_ns - self._newest_ns
+        if not self._newest_ns or silent_ns <= SILENT * self.design.period * 1e9:
+            return said
+        stamp_ns = self._newest_ns + int(silent_ns)
+        t = seconds(stamp_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
+        reason = f"no {self.design.name} in the last {silent_ns * 1e-9:.3g} s of the commands"
+        reading = self.monitor.missing(t, reason)
+        return [*said, Stamped(stamp_ns, reading, self._alarm.update(reading))]
 
     def missing(self, reason: str) -> list[Stamped]:
         """The state is missing or stale: unknown from here on."""

@@ -149,6 +149,11 @@ class Sampler:
         self._add(k, stamp_ns, value)
         return self._release(-math.inf)
 
+    @property
+    def newest_command_ns(self) -> float:
+        """The newest stamp of a command; -inf before the first."""
+        return max(kept.newest_ns for kept in self._kept[len(self.responses) :])
+
     def flush(self, until_ns: int | None = None) -> list[Sample]:
         """Stop waiting: the samples up to `until_ns` (None: all) as things are.
 

@@ -29,6 +29,7 @@ from .files import Node, Read, Rejected, Terms, bound_files, label
 from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 from .text import above, below
+from .trials import LONGEST, Recorded, read_trials, shared
 
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
@@ -46,7 +47,7 @@ class Model:
     period: Fraction
     signals: list[tuple[str, str, Fraction, Fraction]]
     states: int
-    bags: set[str]
+    bags: list[Recorded]
 
 
 @dataclass(frozen=True)
@@ -363,7 +364,7 @@ def _read_model(node: Node) -> Model:
     outputs = len(x) // 2 if trapezoidal else len(x)
     columns = transposed(parts["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
-    bags = set(_digests(parts["bags"]))
+    bags = read_trials(parts["bags"])
     model = Model(trapezoidal, polynomials, period, signals, len(x), bags)
     degree, variables = max(map(sum, exponents)), _variables(model)
     if comb(variables + degree, degree) > MAX_MONOMIALS:
@@ -397,13 +398,15 @@ def _read_funnel(node: Node, model: Model, steps: int, digests: dict[str, str]) 
     if min(radii["tube"] + radii["inlet"] + roots) <= 0 or radii["tube"][0] > radii["inlet"][0]:
         raise Rejected("radii and roots should be positive, and the tube start in the inlet")
     stated = parts["assumption"].members("form bound rate gain measured safety_factor measured_on")
-    form, runs = stated["form"].text(), _digests(stated["measured_on"])
+    form, runs = stated["form"].text(), read_trials(stated["measured_on"])
     bound, rate, gain, measured, factor = (
         _nonnegative(stated[key]) for key in ("bound", "rate", "gain", "measured", "safety_factor")
     )
     if form not in ("response", "peak") + ("energy", "fading") * (not model.trapezoidal):
         raise Rejected(f"form {form!r} is not for this kind of model; use response or peak")
-    if not runs or not all(runs) or model.bags.intersection(runs):
+    if any(run.end < LONGEST for run in runs):
+        raise Rejected("commissioning runs are whole recordings, and windows of one are none")
+    if not runs or shared(runs, model.bags):
         raise Rejected("the assumption needs commissioning runs that the model was not fitted on")
     plain = (form != "fading" and rate != 1) or (form in ("response", "peak") and gain != 1)
     if rate > 1 or gain < 1 or plain:
@@ -464,11 +467,6 @@ def _assumptions(model: Model, funnel: Funnel) -> tuple[str, ...]:
     low, high = min(funnel.roots[1:]), max(funnel.roots[1:])
     near = "every step of the model ends at a root with |S_vv (v+ - v[k+1])| <= roots[k+1]"
     return (*assumptions, f"{near}, {below(low)} to {above(high)}")
-
-
-def _digests(node: Node) -> list[str]:
-    """The digests of recordings."""
-    return [entry.members("name digest")["digest"].text() for entry in node.items()]
 
 
 def _nonnegative(node: Node) -> Fraction:

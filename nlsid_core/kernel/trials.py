@@ -30,6 +30,8 @@ def read_trials(trials: Node) -> list[Recorded]:
         parts = trial.members("name digest")
         parts["name"].text()
         recording, cut, samples = parts["digest"].text().partition("[")
+        if not recording:
+            raise Rejected(f"{trial.where}: a trial should have the digest of its recording")
         if not cut:
             found.append(Recorded(recording))
             continue
@@ -58,9 +60,12 @@ def shared(trials: list[Recorded], others: list[Recorded]) -> int:
 
 
 def calibration(
-    measured: Fraction, factor: Fraction, trials: list[Recorded], fitted_to: list[Recorded]
+    measured: Fraction, factor: Fraction, trials: list[Recorded], fitted_to: list[Recorded] | None
 ) -> str:
-    """On what a level was measured, and what is known of a next trial."""
+    """On what a level was measured, and what is known of a next trial.
+
+    fitted_to: what made the model; None if it does not say.
+    """
     count = len(set(trials))
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
@@ -71,7 +76,7 @@ def calibration(
     )
 
 
-def _rank_bound(trials: list[Recorded], fitted_to: list[Recorded], count: int) -> str:
+def _rank_bound(trials: list[Recorded], fitted_to: list[Recorded] | None, count: int) -> str:
     """How often a next trial exceeds the largest of those measured, if that can be said.
 
     The largest of m + 1 exchangeable numbers is the last with probability at most 1/(m + 1). The
@@ -80,6 +85,8 @@ def _rank_bound(trials: list[Recorded], fitted_to: list[Recorded], count: int) -
     none = "no probability is stated of a next trial, as"
     if any(trial.end < LONGEST for trial in trials):
         return f"{none} windows of one recording are hardly exchangeable"
+    if fitted_to is None:
+        return f"{none} the model does not name what it was fitted to"
     if seen := shared(trials, fitted_to):
         return f"{none} the model was fitted to {seen} of them"
     return (

@@ -73,7 +73,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
             margin = min(margin, 1 - used)
     content = documents["model"].value
     named = type(content) is dict and "bags" in content
-    fitted = read_trials(documents["model"].member("bags")) if named else []
+    fitted = read_trials(documents["model"].member("bags")) if named else None
     assumptions = [_start(model, tubes, funnel["settling"].whole(0, MAX_SAMPLES))]
     if "box" in funnel:
         assumptions.append(_inside(model, funnel["box"]))
@@ -168,7 +168,7 @@ def _inside(model: Model, box: Node) -> str:
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 
 
-def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded]) -> str:
+def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> str:
     # One output and R = 1: V and E carry its unit squared.
     unit, energy = "", "e'Re"
     if len(model.y) == 1:

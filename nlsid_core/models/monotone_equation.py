@@ -7,6 +7,7 @@ next output is unique.
 Source: thesis (3.14).
 """
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -174,6 +175,8 @@ def solve_increasing(e: tuple[float, ...], target: float, guess: float) -> float
         return target / first
     least = first - second * second / (3.0 * third)
     residual = ((third * guess + second) * guess + first) * guess - target
+    if math.isnan(residual):
+        return math.nan
     reach = (4.0 * abs(residual) / third) ** (1.0 / 3.0)
     if least > 0.0:
         reach = min(reach, abs(residual) / least)

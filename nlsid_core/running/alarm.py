@@ -66,8 +66,8 @@ class Alarm:
 
     def update(self, reading: Reading) -> State:
         """What is said of the robot after this reading."""
-        if reading.status is Status.UNKNOWN:
-            self.restart()
+        if reading.status is Status.UNKNOWN:  # and what was bad before is not better for it
+            self._better_since = math.inf
             return State.UNKNOWN
         now = self._now(reading)
         if self._state is State.UNKNOWN or SEVERITY[now] >= SEVERITY[self._state]:

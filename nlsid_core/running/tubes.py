@@ -2,8 +2,8 @@
 
 Each tube has an observer, x̂⁺ = f(x̂, w) + L e, and a number, E⁺ = ρE + e'Re; the simulation x⁺ =
 f(x, w) is common to them. A sample without a measurement is a step with e = 0, and nothing is said
-of it; nothing ends a run but an input that the model refuses or a box that is left, after which it
-starts anew. Source: docs/certificate_tube.md.
+of it. The simulation needs every input: where one is not known, as of a sample that never came, is
+refused by the model or leaves the box, a new run starts. Source: docs/certificate_tube.md.
 """
 
 import math
@@ -24,7 +24,6 @@ from nlsid_core.running.stepping import Stepper
 
 TREND = 10  # samples over which the margin's fall is taken
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
-LONGEST_GAP = 10_000  # samples without a measurement that are stepped through; then a new start
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 STARTING = "waiting for the first"
 
@@ -81,7 +80,6 @@ class TubeRun:
         self._x: FloatArray | None = None
         self._spent = np.zeros(len(self._tubes))
         self._k = 0
-        self._u: FloatArray | None = None
         self._fall: list[deque[tuple[float, float]]] = [deque(maxlen=TREND) for _ in self._funnels]
 
     def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
@@ -89,17 +87,16 @@ class TubeRun:
 
         NaN, or None for u, is a sample without a measurement.
         """
-        measured = np.atleast_1d(np.asarray(y, dtype=np.float64))
+        measured = np.atleast_1d(np.array(y, dtype=np.float64))  # copies: the caller may go on
         if u is None:
             u = np.full(len(self._stepper.u), np.nan)
-        applied = np.atleast_1d(np.asarray(u, dtype=np.float64))
+        applied = np.atleast_1d(np.array(u, dtype=np.float64))  # with its own
         fault = self._take(t)
         if fault:
             return self._unknown(t, measured, fault)
         fault = self._fault(t, measured, applied)
         if fault:
             return self._unknown(t, measured, self._without(applied) or fault)
-        self._u = applied
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
@@ -109,12 +106,14 @@ class TubeRun:
         return Reading(t, Status.UNKNOWN, reason=reason)
 
     def _take(self, t: float) -> str:
-        """Count the sample stamped t and step through those before it that did not come."""
+        """Count the sample stamped t; a new run starts where some before it did not come."""
         if not math.isfinite(t):
             return f"stamp is {t}"
         if math.isnan(self._due):
             self._due = t
         late = (t - self._due) / self.period
+        if not math.isfinite(late):
+            return f"stamp is {t}"
         lost = round(late)
         if lost < 0:
             return f"the sample at t = {t:g} s came a second time, or time went back"
@@ -126,11 +125,8 @@ class TubeRun:
                 f"the grid; {TOLERANCE:g} are allowed; a new run starts"
             )
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
-        if lost > LONGEST_GAP:
+        if lost:
             self._begin()
-        for _ in range(lost):
-            if self._without(None):
-                break
         return ""
 
     def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
@@ -142,18 +138,16 @@ class TubeRun:
                     return f"no {signal.name} at t = {t:g} s (it is {value}): nothing is claimed"
         return ""
 
-    def _without(self, u: FloatArray | None) -> str:
-        """A step with e = 0, under the input u if it is known, else the one before.
+    def _without(self, u: FloatArray) -> str:
+        """A step with e = 0 under the input u, or a new run if that is not known.
 
-        Why that ends the run, empty if it does not.
+        Why the model ends the run, empty if it does not.
         """
-        known = u is not None and u.shape == (len(self._stepper.u),) and np.isfinite(u).all()
-        if known:
-            self._u = u
-        if self._x is None or self._u is None:
+        known = u.shape == (len(self._stepper.u),) and np.isfinite(u).all()
+        if self._x is None or not known:
             self._begin()
             return ""
-        _, after, refused = self._advance(self._u)
+        _, after, refused = self._advance(u)
         if refused:
             self._begin()
             return refused
@@ -161,6 +155,11 @@ class TubeRun:
         return ""
 
     def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
+        if any(((u < low) | (u > high)).any() for _, (low, high), _ in self._boxes):
+            self._begin()
+            return self._unknown(
+                t, y, f"outside the box in which the tube is proved, at t = {t:g} s"
+            )
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
@@ -193,20 +192,28 @@ class TubeRun:
             return self._unknown(t, y, f"{refused}, at t = {t:g} s; a new run starts")
         e = y - outputs[:-1]
         simulated = outputs[-1]
-        if self._single_R is not None:
-            used = self._single_R * (e[:, 0] * e[:, 0])
-            after[:-1] += self._L[:, :, 0] * e
-        else:
-            used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
-            after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
-        self._spent = self._rho * self._spent + used
+        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+            if self._single_R is not None:
+                used = self._single_R * (e[:, 0] * e[:, 0])
+                after[:-1] += self._L[:, :, 0] * e
+            else:
+                used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
+                after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
+            self._spent = self._rho * self._spent + used
         self._x, self._k = after, self._k + 1
         deviation = y - simulated
         sizes = np.abs(deviation) / self._widths
         spent = self._spent / self._level
         if not (np.isfinite(spent).all() and np.isfinite(after).all()):
             self._begin()
-            return self._unknown(t, y, f"the model's state is not finite at t = {t:g} s")
+            reason = f"the model's state is not finite at t = {t:g} s"
+            if np.isfinite(simulated).all() and (sizes > 1.0).any():
+                away = Reading(
+                    t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),
+                    level=Level.NONE, reason=f"outside the tube; {reason}",
+                )  # fmt: skip
+                return [away] * len(self._funnels)
+            return self._unknown(t, y, reason)
         measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
         away, innovations = deviation.tolist(), e.tolist()
         return [

@@ -12,7 +12,10 @@ from bags.chain.joint_bags import write_joint_bag
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
 from bags.designs import documents
+from bags.designs.design import AnyDesign
+from bags.designs.documents import Proved
 from bags.monitoring.replay import replay_bag
+from bags.monitoring.watch import Watch
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
@@ -85,5 +88,41 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     assert "not judged from 1.000 s on: 3 samples are missing" in done.output
     replayed = replay_bag(documents.load_proved(out / documents.FUNNEL), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
-    assert replayed.span - replayed.judged_span == pytest.approx(0.03)
-    assert {r.status for r in replayed.readings[100:]} == {Status.INSIDE}
+    starts = [r for r in replayed.readings[100:] if r.reason.startswith("waiting for")]
+    assert len(starts) == 3, "commands are not known in the gap, so that a new run starts after it"
+    assert replayed.span - replayed.judged_span == pytest.approx(0.06)
+    assert {r.status for r in replayed.readings[103:]} == {Status.INSIDE}
+
+
+@pytest.fixture
+def linear(one: Path, tmp_path: Path) -> Proved[AnyDesign]:
+    """The proved tube of a linear model."""
+    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
+    config, out = load_config(path), tmp_path / "out"
+    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=quiet)
+    design_funnel_files(out / documents.MODEL, config, out)
+    return documents.load_proved(out / documents.FUNNEL)
+
+
+def test_a_bag_with_a_long_hole_is_not_inside(linear: Proved[AnyDesign], tmp_path: Path) -> None:
+    kept = np.r_[np.arange(60), np.arange(20_060, 20_100)]
+    zeros = np.zeros((len(kept), 2))
+    trial = Trajectory(t=PERIOD * kept, y=zeros, u=zeros[:, :1], name="hole")
+    replayed = replay_bag(linear, write_joint_bag(tmp_path, trial), centre=Centre.COMMAND)
+    assert replayed.verdict == Status.UNKNOWN.value
+    assert replayed.reason == "20000 samples are missing"
+
+
+def test_a_recording_whose_outputs_stop_before_its_commands_is_not_inside(
+    linear: Proved[AnyDesign],
+) -> None:
+    watch = Watch(linear.design)
+    for k in range(300):
+        stamp_ns = round((k + 1) * PERIOD * 1e9)
+        watch.excitation(stamp_ns, 0.0)
+        if k < 60:
+            watch.response(stamp_ns, 0.0)
+    (last,) = watch.end()
+    assert last.stamp_ns == round(300 * PERIOD * 1e9)
+    assert last.reading.status is Status.UNKNOWN
+    assert "of the commands" in last.reading.reason

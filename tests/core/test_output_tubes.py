@@ -86,27 +86,86 @@ def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
     assert grown < 0
 
 
-def test_a_missing_sample_is_a_step_without_injection_and_nothing_is_claimed_of_it() -> None:
-    trial = trial_of("linear", 200)
-    said, stamps = {}, trial.t
-    for kind in ("nan", "absent"):
-        monitor, readings = monitor_of("linear"), {}
-        for k, (t, y, u) in enumerate(zip(stamps, trial.y, trial.u, strict=True)):
-            gap = 52 <= k < 55
-            if gap and kind == "absent":
-                continue
-            readings[k] = monitor.update(float(t), np.array([np.nan]) if gap else y, u)
-        said[kind] = readings
+def with_a_gap(kind: str) -> tuple[Monitor, dict[int, Reading]]:
+    """Readings of samples 0 … 199, of which 52 to 54 have no output, no input, or never came."""
+    trial, monitor, readings = trial_of("linear", 200), monitor_of("linear"), {}
+    for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True)):
+        if not 52 <= k < 55:
+            readings[k] = monitor.update(float(t), y, u)
+        elif kind == "no output":
+            readings[k] = monitor.update(float(t), np.array([np.nan]), u)
+        elif kind == "no input":
+            readings[k] = monitor.update(float(t), y, None)
+    return monitor, readings
+
+
+def test_a_missing_output_is_a_step_without_injection_and_nothing_is_claimed_of_it() -> None:
+    _, readings = with_a_gap("no output")
     for k in (52, 53, 54):
-        assert said["nan"][k].status is Status.UNKNOWN
-        assert "nothing is claimed" in said["nan"][k].reason
-    assert all(said["absent"][k].status is Status.INSIDE for k in range(55, 200))
-    # absent samples take the input before them, the others their own; steps of 10 hide it here
+        assert readings[k].status is Status.UNKNOWN
+        assert "nothing is claimed" in readings[k].reason
+    assert all(readings[k].status is Status.INSIDE for k in range(55, 200))
+    whole = run(monitor_of("linear"), trial_of("linear", 200))
+    assert whole[60].nominal == readings[60].nominal, "the simulation goes on"
+
+
+@pytest.mark.parametrize("kind", ["no input", "absent"])
+def test_where_an_input_is_not_known_a_new_run_starts(kind: str) -> None:
+    """The claim is about a simulation under the same inputs, and there is none without them."""
+    monitor, readings = with_a_gap(kind)
+    start = 55 + monitor.lags
+    assert all(readings[k].reason.startswith("waiting for") for k in range(55, start))
+    assert all(readings[k].status is Status.INSIDE for k in range(start, 200))
+    trial, fresh = trial_of("linear", 200), monitor_of("linear")
     for k in range(55, 200):
-        assert said["nan"][k].margin == said["absent"][k].margin
-        assert said["nan"][k].assumption == said["absent"][k].assumption
-    whole = run(monitor_of("linear"), trial)
-    assert whole[60].nominal == said["nan"][60].nominal, "the simulation goes on"
+        again = fresh.update(float(trial.t[k]), trial.y[k], trial.u[k])
+        assert (again.nominal, again.margin) == (readings[k].nominal, readings[k].margin) or (
+            again.status is readings[k].status is Status.UNKNOWN
+        )
+
+
+def test_a_stamp_years_ahead_is_answered_at_once_and_starts_a_new_run() -> None:
+    trial, monitor = trial_of("linear", 60), monitor_of("linear")
+    rows = list(zip(trial.t, trial.y, trial.u, strict=True))
+    for t, y, u in rows[:30]:
+        monitor.update(float(t), y, u)
+    later = [monitor.update(float(t) + 1.8e9, y, u) for t, y, u in rows[30:]]
+    assert later[0].status is Status.UNKNOWN
+    assert later[-1].status is Status.INSIDE
+    assert "stamp is" in monitor.update(1.7e308, rows[0][1], rows[0][2]).reason
+
+
+def test_a_caller_may_fill_the_same_arrays_again() -> None:
+    for name in ("linear", "implicit_linear"):
+        trial, monitor = trial_of(name, 100), monitor_of(name)
+        y_same, u_same = np.empty_like(trial.y[0]), np.empty_like(trial.u[0])
+        said = []
+        for t, y, u in zip(trial.t, trial.y, trial.u, strict=True):
+            y_same[:], u_same[:] = y, u
+            said.append(monitor.update(float(t), y_same, u_same))
+        assert [r.margin for r in said[5:]] == [r.margin for r in run(monitor_of(name), trial)[5:]]
+
+
+def test_an_output_that_is_absurd_is_outside() -> None:
+    trial, monitor = trial_of("linear", 60), monitor_of("linear")
+    readings = [
+        monitor.update(float(t), y * 0 + 1e200 if k == 40 else y, u)
+        for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True))
+    ]
+    assert readings[39].status is Status.INSIDE
+    assert readings[40].status is Status.OUTSIDE
+    assert not readings[40].margin >= 0.0
+
+
+def test_inputs_that_leave_the_box_while_a_run_starts_are_not_taken() -> None:
+    trial, monitor = trial_of("implicit_box", 60), monitor_of("implicit_box")
+    first = [
+        monitor.update(float(t), y, np.array([40.0]) if k == 0 else u)
+        for k, (t, y, u) in enumerate(zip(trial.t, trial.y, trial.u, strict=True))
+    ]
+    assert "outside the box" in first[0].reason
+    judged = [k for k, reading in enumerate(first) if reading.status is Status.INSIDE]
+    assert judged[0] == monitor.lags + 1
 
 
 def test_a_drifting_clock_stays_on_the_grid_and_a_shifted_one_starts_a_new_run() -> None:

@@ -146,6 +146,8 @@ def left_over(c: Sequence[P], witness: Any) -> dict[Key, Fraction] | None:
     """
     n, basis = c[0].n, [tuple(row) for row in witness["basis"]]
     of_squares = squares(witness, n)
+    while len(c) > 1 and not c[-1].terms:  # of the degree that c has
+        c = c[:-1]
     degree = max(len(c), len(of_squares)) - 1
     rest = [a - b for a, b in zip(bernstein(c, degree), raised(of_squares, degree), strict=True)]
     size = [Fraction(2) ** column for column in witness["columns"]]

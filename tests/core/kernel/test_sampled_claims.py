@@ -209,7 +209,11 @@ FALSE: dict[str, tuple[dict[str, Any], str]] = {
     "a negative half-width": ({"widths": [1.0, -0.6]}, "half-width"),
     "a bound below what was measured": ({"measured": 0.06}, "safety_factor x measured"),
     "no commissioning run": ({"runs": []}, "commissioning runs"),
-    "a commissioning run without a digest": ({"runs": [""]}, "commissioning runs"),
+    "a commissioning run without a digest": ({"runs": [""]}, "digest of its recording"),
+    "a window as a commissioning run": (
+        {"runs": ["sha256:" + 64 * "2" + "[0:50]"]},
+        "commissioning runs are whole",
+    ),
     "the fitting bag as a commissioning run": (
         {"runs": [DIGEST, "sha256:" + 64 * "1"]},
         "commissioning runs",
