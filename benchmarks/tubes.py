@@ -4,8 +4,8 @@ python -m benchmarks.tubes [--json]
 
 Models of the shipped F1TENTH recordings: half of the training trials identify a model and design
 its tube, the other half scale it, and the test trials are judged, untouched and sabotaged. Widths
-are per amplitude (half the range), at safety factor 1; published are those of TUBES, section 12,
-which scaled on all of its trials.
+are per amplitude (half the range), at safety factor 1; published are earlier figures of the same
+tubes, scaled on all trials.
 """
 
 import os

@@ -263,6 +263,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         "assumed",
         title_justify="left",
         caption_justify="left",
+        collapse_padding=True,
     )
     for column, justify in (
         ("bag", "left"),
@@ -275,7 +276,7 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("judged", "right"),
     ):
         long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
-        width = 8 if long else None
+        width = {"bag": 8, "axis": 10}.get(column)
         table.add_column(
             column,
             justify=justify,  # type: ignore[arg-type]

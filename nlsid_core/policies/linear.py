@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.arrays import FloatArray, Json, freeze
+from nlsid_core.errors import DocumentError, ShapeError
 
 FORMAT = "nlsid/policy"
 KIND = "linear"
@@ -31,12 +29,7 @@ class LinearPolicy:
     model: str
 
     def __post_init__(self) -> None:
-        for key in ("x", "u", "K", "L"):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if not np.isfinite(values).all():
-                raise DataError(f"policy: {key} holds NaN or infinity")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        freeze(self, "policy", ("x", "u", "K", "L"))
         n = len(self.K)
         if self.x.ndim != 2 or self.x.shape != (len(self.u), n) or self.L.shape != (n,):
             raise ShapeError(

@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.arrays import FloatArray, Json, freeze
+from nlsid_core.errors import DocumentError, ShapeError
 from nlsid_core.policies.linear import FORMAT
 
 KIND = "sampled"
@@ -30,12 +28,7 @@ class SampledPolicy:
     model: str
 
     def __post_init__(self) -> None:
-        for key in ("x", "u", "K", "L"):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if not np.isfinite(values).all():
-                raise DataError(f"policy: {key} holds NaN or infinity")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        freeze(self, "policy", ("x", "u", "K", "L"))
         if self.x.ndim != 2 or self.u.ndim != 2 or not len(self.u):
             raise ShapeError("policy: x should be (N + 1, n), u (N, p) with N > 0")
         n, (steps, p) = self.x.shape[1], self.u.shape
