@@ -43,7 +43,7 @@ from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.designs import Design
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
@@ -75,7 +75,7 @@ def updates() -> dict[str, float]:
     data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
     model = identify(data, LinearClass(LAGS)).model
     designs = [
-        design_tube(
+        design_output_tube(
             model, data, profile=[(0.0, 0.0), (2.8, 0.35)], horizon=2.8, safety_factor=1.5 + 0.1 * i
         )
         for i in range(FUNNELS)
@@ -101,7 +101,7 @@ def updates() -> dict[str, float]:
     return result
 
 
-def timing_funnel(seconds: float) -> TubeDesign:
+def timing_funnel(seconds: float) -> OutputTubeDesign:
     """A model sampled at 1 kHz and a funnel that lasts `seconds`; for timing only."""
     period, samples = 1.0 / RATE, 200
     rng = np.random.default_rng(1)
@@ -115,7 +115,7 @@ def timing_funnel(seconds: float) -> TubeDesign:
         y = blank.simulate(u, [0.0, 0.0]) + 1e-3 * rng.standard_normal(samples)
         t = np.arange(samples) * period
         trials.append(Trajectory(t=t, y=y, u=u, name=f"run_{index}", digest=f"sha256:{index:064x}"))
-    design = design_tube(
+    design = design_output_tube(
         blank, Dataset(tuple(trials)), profile=[(0.0, 0.0), (0.1, 0.1)], horizon=0.1
     )
     more = round((seconds + 10.0) * RATE)
@@ -134,7 +134,7 @@ def timing_funnel(seconds: float) -> TubeDesign:
     return Design.proved(blank, policy, funnel, claim=design.claim, proof=design.proof, found=None)
 
 
-def bundle_of(design: TubeDesign) -> Bundle:
+def bundle_of(design: OutputTubeDesign) -> Bundle:
     """Its files as they are published."""
     with tempfile.TemporaryDirectory() as folder:
         design.save(folder)
@@ -144,7 +144,7 @@ def bundle_of(design: TubeDesign) -> Bundle:
 class Ear(Node):
     """Publishes the documents, and hears margins and alarms with their time of arrival."""
 
-    def __init__(self, design: TubeDesign) -> None:
+    def __init__(self, design: OutputTubeDesign) -> None:
         super().__init__("ear")
         self.margins: dict[int, int] = {}
         self.echoes: dict[int, int] = {}

@@ -188,7 +188,7 @@ def funnel(
 ) -> None:
     """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
-    Around the simulation of an identified model of any class, or a plan of a linear one (--model,
+    Around the simulation of an identified model of any class, and a plan of a linear one (--model,
     --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
     it says what it catches: faults put into the test trials, through the monitor.
     """

@@ -16,7 +16,6 @@ from nlsid_core import designs, files
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict, text
 from nlsid_core.models.signal import Signal
 
@@ -176,7 +175,7 @@ def tolerances(folder: Path | str) -> Tolerances:
         signals = (given,) if isinstance(given, Signal) else given
         path = goal = funnel.half_widths
         about = "what the model simulates from the commands that were sent, not with the commands"
-        if not isinstance(funnel, TubeFunnel):
+        if design.policy is not None:
             about += "; or with the plan in policy.json where the policy drives"
     rows = zip(signals, path.tolist(), goal.tolist(), strict=True)
     entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bags.designs.design import AnyDesign, is_linear, is_tube
+from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Stamped, Watch
@@ -24,7 +24,7 @@ RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 class Replay:
     """One bag's readings, and what a summary says of them.
 
-    axis: what is measured; unit, half_width: of the one output of a linear tube, else empty and 0.
+    axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
     """
 
     name: str
@@ -125,7 +125,7 @@ def replay_bag(proved: Proved[AnyDesign], bag: Path | str, *, centre: Centre) ->
     design = proved.design
     stamped = replay_messages(design, bag, centre=centre)
     unit, half_width = "", 0.0
-    if is_linear(design) or (is_tube(design) and len(design.signals[0]) == 1):
+    if is_tube(design) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, design.funnel.half_width
     return Replay(
         name=Path(bag).name,

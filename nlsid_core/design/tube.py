@@ -1,10 +1,11 @@
-"""`design_output_tube`: a proved tube around the simulation of a stable model of any class.
+"""`design_output_tube`: a proved tube around the simulation of a stable model, or around a plan.
 
     E ζ = 0,   x̄⁺ = F ζ + L e,   o = H ζ + e,   E_{k+1} = ρ E_k + e_k'R e_k
 The kernel's reading of the model file gives F, H and the vertices E. Observers L are Kalman gains
 of the mean increment over a grid of noise ratios, ρ is taken from a grid above the square of the
 proved rate. Of all pairs those whose forecast a reaction time ahead is the narrowest are solved as
-semidefinite programs, on the training trials; the level is measured on other trials.
+semidefinite programs, on the training trials; the level is measured on other trials. With a plan
+of a linear model and an LQR around it, the programs hold for the closed loop as well.
 Source: docs/certificate_tube.md.
 """
 
@@ -24,14 +25,17 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import Rejected, increments
 from nlsid_core.kernel.files import Node, parse
-from nlsid_core.models import BlockCascade, ImplicitModel, StableModel
+from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
+from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.stepping import Stepper
 
 cp: Any = cvxpy  # its functions are not seen by type checkers
@@ -51,7 +55,7 @@ ROUNDS = 6  # of cutting planes, most of the time 2-4
 CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
-OutputTubeDesign: TypeAlias = Design[Any, None, TubeFunnel, None]
+OutputTubeDesign: TypeAlias = Design[Any, TubePolicy | None, TubeFunnel, None]
 
 
 def design_output_tube(
@@ -63,6 +67,9 @@ def design_output_tube(
     safety_factor: float = 1.5,
     horizon: float | None = None,
     box: Sequence[tuple[float, float]] | None = None,
+    profile: Sequence[tuple[float, float]] | None = None,
+    inlet: float = 0.0,
+    lqr_weights: tuple[float, float] | None = (1.0, 1.0),
 ) -> OutputTubeDesign:
     """The funnel that `OutputTube` describes; its options are these.
 
@@ -70,22 +77,42 @@ def design_output_tube(
     """
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    trials = calibration_trials(train, calibration, least=least_window(model, train))
+    trials = calibration_trials(train, calibration, least=least_window(model, train, horizon))
     train = trials.design
     y_box, u_box = _box(model, stepper, train, box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
-    form = _Form.of(model, bounds)
+    K: FloatArray | None = None
+    if profile is not None:
+        if not isinstance(model, DifferenceEquation):
+            raise DataError(
+                f"a profile is planned for a linear model, not for a {type(model).__name__}; "
+                "leave it out for a tube around the model's simulation"
+            )
+        K = np.zeros(len(model))
+        if lqr_weights is not None:
+            K = lqr_gain(model, output_weight=lqr_weights[0], input_weight=lqr_weights[1])
+    form = _Form.of(model, bounds, K)
     samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
     amplitudes = np.maximum(
         np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
     )
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
-    found = [_best(form, gains, e, amplitudes, samples, form.fading())]
+    start = inlet / safety_factor
+    found = [_best(form, gains, e, amplitudes, samples, form.fading(), start)]
     lasting: list[int | None] = [None]
     if horizon is not None:
-        lasting.append(length := max(1, round(horizon / model.period)))
-        found.append(_best(form, gains, e, amplitudes, length, [1.0]))
+        length = max(1, round(horizon / model.period))
+        longest = max(map(len, trials.calibration)) - settling
+        if length > longest:
+            raise DataError(
+                f"horizon {horizon} s is {length} samples; the energy can be measured on the "
+                f"calibration trials for 1 to {longest}"
+            )
+        lasting.append(length)
+        if profile is not None:  # the policy has one observer
+            gains, e = found[0].L[None], [part[:, found[0].at : found[0].at + 1] for part in e]
+        found.append(_best(form, gains, e, amplitudes, length, [1.0], start))
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
         tube = Tube(
@@ -93,23 +120,41 @@ def design_output_tube(
             half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
             safety_factor=safety_factor, designed_on=trials.designed_on,
             measured_on=trials.measured_on, samples=samples_left,
+            inlet=0.0 if profile is None else inlet**2 / float(np.linalg.inv(design.P)[0, 0]),
         )  # fmt: skip
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
     funnel = TubeFunnel(
         tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
         y_box=y_box, u_box=u_box,
     )  # fmt: skip
+    policy = None
+    if profile is not None:
+        assert isinstance(model, DifferenceEquation)
+        assert K is not None
+        duration = profile[-1][0] if horizon is None else horizon
+        start, u = track_profile(model, profile, max(1, round(duration / model.period)))
+        L = found[0].L[:, 0]
+        policy = TubePolicy(start, u, K=K, L=L, period=model.period, model=funnel.model)
+        funnel = replace(funnel, policy=files.digest(policy.document()))
+        refuse_unmonitorable(funnel)
     trees = [design.multipliers for design in found]
     proof: Json = {} if trees[0] is None else {"multipliers": trees}
     try:
-        return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
+        return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
     except CertificateRejected as refusal:
-        raise Infeasible(f"no proved tube: {refusal}") from refusal
+        less = "; try a larger input weight" if K is not None and K.any() else ""
+        raise Infeasible(f"no proved tube: {refusal}{less}") from refusal
 
 
-def least_window(model: StableModel, train: Dataset) -> int:
-    """Samples of a window of a single recording, on which a tube is designed or measured."""
-    return LEAST_WINDOW * (_settling(model, Stepper(model), train) + REACTION)
+def least_window(model: StableModel, train: Dataset, horizon: float | None = None) -> int:
+    """Samples of a window of a single recording, on which a tube is designed or measured.
+
+    horizon: s, if an energy has to last so long on it.
+    """
+    settling = _settling(model, Stepper(model), train)
+    if horizon is not None:
+        return settling + max(1, round(horizon / model.period))
+    return LEAST_WINDOW * (settling + REACTION)
 
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
@@ -122,7 +167,7 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
     )
     measured = _above(max(measured, float(np.finfo(float).tiny)))
     level = _above(tube.safety_factor**2 * measured)
-    widths = np.sqrt((level + tube.inlet) / tube.tau)
+    widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
     return replace(
         tube, measured=measured, level=level,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
@@ -194,12 +239,15 @@ def _read(model: StableModel, bounds: Json | None) -> increments.Model:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """The increment form in floats. tree: of a proof's multipliers, with the vertices E of each of
-    its leaves in order, (count, m, m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
+    """The increment form in floats. modes: (F, H), and a second with a policy engaged.
+
+    tree: of a proof's multipliers, with the vertices E of each of its leaves in order, (count, m,
+    m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
     """
 
     F: FloatArray
     H: FloatArray
+    modes: list[tuple[FloatArray, FloatArray]]
     tree: Json | None
     leaves: list[FloatArray]
     mean: FloatArray
@@ -210,7 +258,7 @@ class _Form:
     inputs: tuple[FloatArray, FloatArray] | None
 
     @classmethod
-    def of(cls, model: StableModel, bounds: Json | None) -> "_Form":
+    def of(cls, model: StableModel, bounds: Json | None, K: FloatArray | None = None) -> "_Form":
         form = _read(model, bounds)
         proof = prove_stability(model) if bounds is None else storage_on(form)
         if proof is None:
@@ -230,8 +278,11 @@ class _Form:
         if form.linear is not None:
             B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
             inputs = B[:, None], D[:, None]
+        modes: list[tuple[FloatArray, FloatArray]] = [(F, H)]
+        if K is not None and K.any() and inputs is not None:
+            modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
         return cls(
-            F, H, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
+            F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
             H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
         )  # fmt: skip
 
@@ -307,7 +358,10 @@ def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it."""
+    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it.
+
+    at: which of the gains L is.
+    """
 
     L: FloatArray
     rho: float
@@ -315,6 +369,7 @@ class _Found:
     R: FloatArray
     tau: FloatArray
     multipliers: Json | None
+    at: int = 0
 
 
 def _best(
@@ -324,8 +379,11 @@ def _best(
     amplitudes: FloatArray,
     samples: int,
     rhos: Sequence[float],
+    start: float = 0.0,
 ) -> _Found:
     """The pair (L, ρ) whose proved forecast `samples` ahead is the narrowest.
+
+    start: the first output's error there, in the unit in which the innovations are not scaled up.
 
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
@@ -341,13 +399,21 @@ def _best(
         if not (np.isfinite(variance).all() and (variance > 0.0).all()):
             continue
         alpha = _forecast_budget([part[:, i] for part in e], R, rho, samples)
+        alpha += rho * start**2 / float(W[0, 0])
         ranked.append((float(np.mean(np.sqrt(alpha * variance) / amplitudes)), i, rho))
     tried: list[tuple[float, _Found]] = []
     for _, i, rho in sorted(ranked)[:SOLVED]:
         found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
         if found is not None:
             alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
-            tried.append((float(np.mean(np.sqrt(alpha / found.tau) / amplitudes)), found))
+            alpha += rho * start**2 / float(np.linalg.inv(found.P)[0, 0])
+            width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
+            tried.append((width, replace(found, at=i)))
+    if not tried and len(form.modes) > 1:
+        raise Infeasible(
+            "no storage function serves both the played inputs and the policy; try a larger input "
+            "weight"
+        )
     if not tried:
         raise Infeasible(
             "no storage function bounds the output by the innovations: the increments are too "
@@ -402,14 +468,16 @@ def _solved(
     moved = np.linalg.norm(np.vstack([T @ form.F[:, :m], form.H[:, :m] / sizes[:, None]]), axis=0)
     nu = 1.0 / np.where(moved > 0.0, moved, 1.0)
     S = block_diag(np.diag(nu), root)
-    F = np.hstack([T @ form.F @ S, T @ L * sizes])
-    H = np.hstack([form.H @ S / sizes[:, None], np.eye(p)])
+    modes = [
+        (np.hstack([T @ F @ S, T @ L * sizes]), np.hstack([H @ S / sizes[:, None], np.eye(p)]))
+        for F, H in form.modes
+    ]
     D = np.linalg.inv(form.mean[:, :m] * nu) if m else np.zeros((0, 0))
     leaves = [D @ E @ S for E in form.leaves]
     windows = _Windows([part / sizes for part in e], rho)
     solution = None
     for _ in range(ROUNDS if p > 1 else 1):
-        solution = _program(F, H, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
+        solution = _program(modes, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
         if solution is None:
             return None
         if p == 1 or not windows.cut(solution[1]):
@@ -457,8 +525,7 @@ class _Windows:
 
 
 def _program(
-    F: FloatArray,
-    H: FloatArray,
+    modes: list[tuple[FloatArray, FloatArray]],
     leaves: list[FloatArray],
     rho: float,
     m: int,
@@ -469,15 +536,17 @@ def _program(
 ) -> tuple[FloatArray, FloatArray, FloatArray, list[list[FloatArray]]] | None:
     """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
 
-    F: (n, m + n + p) = [F L], H: (p, m + n + p) = [H I], all in balanced units.
+    modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
+    of a linear model only.
     """
-    n, p = len(F), len(H)
+    n, p = len(modes[0][0]), len(modes[0][1])
     size = m + n + p
     P = cp.Variable((n, n), symmetric=True)
     tau = cp.Variable(p)
     R: Any = np.eye(1) if p == 1 else cp.Variable((p, p), symmetric=True)
     supply: Any = _placed(rho * P, m, size) + _placed(R, m + n, size)
-    forms = [supply - F.T @ P @ F] + [supply - tau[j] * np.outer(h, h) for j, h in enumerate(H)]
+    forms = [supply - F.T @ P @ F for F, _ in modes]
+    forms += [supply - tau[j] * np.outer(h, h) for _, H in modes for j, h in enumerate(H)]
     room = ROOM * np.eye(size)
     constraints: list[Any] = [P >> ROOM * np.eye(n)]
     if p > 1:

@@ -9,7 +9,7 @@ refused by the model or leaves the box, a new run starts. Source: docs/certifica
 import math
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,89 @@ ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 STARTING = "waiting for the first"
 
 
+def assuming(tubes: Sequence[Tube]) -> str:
+    """What they assume, in letters."""
+    return "; ".join(tube.assumption for tube in tubes)
+
+
+class Judged(NamedTuple):
+    """One funnel at one sample, over its tubes that still last; NaN where none does.
+
+    size: the largest |o_j| in half-widths, worst: that j. used: the largest part of a level, most:
+    whose.
+    """
+
+    size: float
+    used: float
+    most: int
+    worst: int
+
+
+class Stacked:
+    """The T tubes of m funnels of one model: their numbers, rounded so that no bound is missed.
+
+    owner: of each tube, its funnel's number; first: of each funnel, its first tube's.
+    """
+
+    def __init__(self, funnels: Sequence[TubeFunnel]) -> None:
+        tubes = [tube for funnel in funnels for tube in funnel.tubes]
+        self.owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
+        self.first = [self.owner.index(i) for i in range(len(funnels))]
+        p = len(tubes[0].R)
+        # Products and sums are rounded up, so that E is never below its exact value.
+        self.rho: FloatArray = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
+        self._R = np.array([tube.R for tube in tubes])
+        spread = max(
+            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
+        )
+        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
+        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
+        self.L: FloatArray = np.array([tube.L for tube in tubes])
+        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
+        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
+        self.samples = [tube.samples for tube in tubes]
+        self._rows = [
+            np.flatnonzero(np.array(self.owner) == i).tolist() for i in range(len(funnels))
+        ]
+
+    def spent(self, before: FloatArray, e: FloatArray) -> FloatArray:
+        """E⁺ = ρE + e'Re of innovations e (T, p): (T,), never below its exact value."""
+        if self._single_R is not None:
+            return np.asarray(self.rho * before + self._single_R * (e[:, 0] * e[:, 0]))
+        used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
+        return np.asarray(self.rho * before + used)
+
+    def injected(self, e: FloatArray) -> FloatArray:
+        """L e, (T, n)."""
+        if self._single_R is not None:
+            return np.asarray(self.L[:, :, 0] * e)
+        return np.asarray(np.einsum("tnp,tp->tn", self.L, e))
+
+    def left(self, deviation: FloatArray) -> bool:
+        """Whether an output is shown to have left a half-width."""
+        return bool((np.abs(deviation) / self._widths > 1.0).any())
+
+    def judged(self, count: int, deviation: FloatArray, spent: FloatArray) -> list[Judged]:
+        """Of each funnel after `count` samples. deviation: o (T, p), or (p,) if all have one."""
+        sizes, parts = np.abs(deviation) / self._widths, (spent / self._level).tolist()
+        found = []
+        for rows in self._rows:
+            lasting = [j for j in rows if (self.samples[j] or math.inf) >= count]
+            if not lasting:
+                found.append(Judged(math.nan, math.nan, rows[0], 0))
+                continue
+            place = int(sizes[lasting].argmax())
+            most = max(lasting, key=parts.__getitem__)
+            size = float(sizes[lasting].flat[place])
+            found.append(Judged(size, parts[most], most, place % sizes.shape[1]))
+        return found
+
+    def excess(self, j: int, spent: FloatArray, t: float) -> str:
+        """How tube j's assumption is broken at t (s)."""
+        level = self._level[j] / (1.0 - ROUNDING)
+        return f"innovation energy {spent[j]:.4g} above the level {level:.4g} at t = {t:g} s"
+
+
 class TubeRun:
     """Samples (t, y, u) of one run against funnels of one model; `readings` once per sample.
 
@@ -41,32 +124,18 @@ class TubeRun:
             raise DataError("the funnels start after different numbers of samples")
         if self.lags < self._stepper.lags:
             raise DataError(f"a run of this model starts after {self._stepper.lags} samples")
-        self._funnels = tuple(funnels)
-        tubes = [tube for funnel in funnels for tube in funnel.tubes]
-        self._tubes = tubes
-        self._owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
+        self._tubes = Stacked(funnels)
+        self._count = len(funnels)
         p, n = len(self._stepper.y), self._stepper.order
-        if any(tube.L.shape != (n, p) for tube in tubes):
+        if any(tube.L.shape != (n, p) for funnel in funnels for tube in funnel.tubes):
             raise DataError("the funnel is not one of this model")
-        # Products and sums are rounded up, so that E is never below its exact value.
-        self._rho = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
-        self._R = np.array([tube.R for tube in tubes])
-        spread = max(
-            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
-        )
-        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
-        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
-        self._L = np.array([tube.L for tube in tubes])
-        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
-        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
-        self._samples = [tube.samples for tube in tubes]
         self._names = [signal.name for signal in self._stepper.y]
         boxed = [f for f in funnels if f.y_box is not None and f.u_box is not None]
         self._boxes = [
             (np.array(f.y_box).T, np.array(f.u_box).T, np.tile(np.array(f.y_box), (n // p, 1)).T)
             for f in boxed
         ]
-        self._assuming = [_assumption(funnel.tubes) for funnel in funnels]
+        self._assuming = [assuming(funnel.tubes) for funnel in funnels]
         self.restart()
 
     def restart(self) -> None:
@@ -78,9 +147,11 @@ class TubeRun:
         """Collect a start again; the grid of time goes on."""
         self._start: list[tuple[FloatArray, FloatArray]] = []
         self._x: FloatArray | None = None
-        self._spent = np.zeros(len(self._tubes))
+        self._spent: FloatArray = np.zeros(len(self._tubes.owner))
         self._k = 0
-        self._fall: list[deque[tuple[float, float]]] = [deque(maxlen=TREND) for _ in self._funnels]
+        self._fall: list[deque[tuple[float, float]]] = [
+            deque(maxlen=TREND) for _ in range(self._count)
+        ]
 
     def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
         """What is said of the sample at t (s): outputs y (p,) and inputs u (n_u,), or numbers.
@@ -151,7 +222,8 @@ class TubeRun:
         if refused:
             self._begin()
             return refused
-        self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
+        self._x, self._k = after, self._k + 1
+        self._spent = self._tubes.rho * self._spent
         return ""
 
     def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
@@ -163,7 +235,7 @@ class TubeRun:
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
-            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))
+            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes.owner) + 1, 1))
             self._start = []
         return self._unknown(t, y, f"{STARTING} {self.lags} samples")
 
@@ -193,88 +265,44 @@ class TubeRun:
         e = y - outputs[:-1]
         simulated = outputs[-1]
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
-            if self._single_R is not None:
-                used = self._single_R * (e[:, 0] * e[:, 0])
-                after[:-1] += self._L[:, :, 0] * e
-            else:
-                used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
-                after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
-            self._spent = self._rho * self._spent + used
+            self._spent = self._tubes.spent(self._spent, e)
+            after[:-1] += self._tubes.injected(e)
         self._x, self._k = after, self._k + 1
         deviation = y - simulated
-        sizes = np.abs(deviation) / self._widths
-        spent = self._spent / self._level
-        if not (np.isfinite(spent).all() and np.isfinite(after).all()):
+        if not (np.isfinite(self._spent).all() and np.isfinite(after).all()):
             self._begin()
             reason = f"the model's state is not finite at t = {t:g} s"
-            if np.isfinite(simulated).all() and (sizes > 1.0).any():
+            if np.isfinite(simulated).all() and self._tubes.left(deviation):
                 away = Reading(
                     t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),
                     level=Level.NONE, reason=f"outside the tube; {reason}",
                 )  # fmt: skip
-                return [away] * len(self._funnels)
+                return [away] * self._count
             return self._unknown(t, y, reason)
         measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
         away, innovations = deviation.tolist(), e.tolist()
-        return [
-            self._reading(
-                i,
-                t,
-                sizes,
-                spent.tolist(),
-                nominal,
-                measured,
-                away + innovations[self._owner.index(i)],
-            )
-            for i in range(len(self._funnels))
-        ]
-
-    def _reading(
-        self,
-        i: int,
-        t: float,
-        sizes: FloatArray,
-        spent: list[float],
-        nominal: tuple[float, ...],
-        measured: tuple[float, ...],
-        away: list[float],
-    ) -> Reading:
-        """Of funnel i: the narrowest margin and the most that is used over the tubes that last.
-
-        away: the output error, then the innovation of the funnel's first observer.
-        """
-        lasting = [
-            j for j, owner in enumerate(self._owner)
-            if owner == i and (self._samples[j] is None or self._k <= (self._samples[j] or 0))
-        ]  # fmt: skip
-        if not lasting:
-            tube = self._tubes[self._owner.index(i)]
-            return Reading(
-                t, Status.UNKNOWN, measured=measured,
-                reason=f"the proof covers {tube.samples} samples; they are over",
-            )  # fmt: skip
-        rows = sizes[lasting]
-        place = int(rows.argmax())
-        size = float(rows.flat[place])
-        margin = 1.0 - size
-        most = max(lasting, key=spent.__getitem__)
-        reason = ""
-        status = Status.INSIDE
-        if not spent[most] <= 1.0:
-            status = Status.ASSUMPTION_VIOLATED
-            reason = (
-                f"innovation energy {self._spent[most]:.4g} above the level "
-                f"{self._tubes[most].level:.4g} at t = {t:g} s"
-            )
-        if not size <= 1.0:
-            status = Status.OUTSIDE
-            kept = "although the assumption was kept: what runs is not what was proved"
-            reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
-        return Reading(
-            t, status, margin, spent[most], self._exit(i, t, margin),
-            self._names[place % rows.shape[1]], nominal, measured,
-            Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i], away,
-        )  # fmt: skip
+        said = []
+        judged = self._tubes.judged(self._k, deviation, self._spent)
+        for i, (size, used, most, worst) in enumerate(judged):
+            if math.isnan(used):
+                over = f"the proof covers {self._tubes.samples[most]} samples; they are over"
+                said.append(Reading(t, Status.UNKNOWN, measured=measured, reason=over))
+                continue
+            margin = 1.0 - size
+            status, reason = Status.INSIDE, ""
+            if not used <= 1.0:
+                status = Status.ASSUMPTION_VIOLATED
+                reason = self._tubes.excess(most, self._spent, t)
+            if not size <= 1.0:
+                status = Status.OUTSIDE
+                kept = "although the assumption was kept: what runs is not what was proved"
+                reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+            said.append(Reading(
+                t, status, margin, used, self._exit(i, t, margin), self._names[worst],
+                nominal, measured, Level.TUBE if size <= 1.0 else Level.NONE, reason,
+                self._assuming[i], away + innovations[self._tubes.first[i]],
+            ))  # fmt: skip
+        return said
 
     def _exit(self, i: int, t: float, margin: float) -> float:
         """S until the margin is 0 if it goes on falling as over the last samples."""
@@ -286,8 +314,4 @@ class TubeRun:
 
     def _unknown(self, t: float, y: FloatArray, reason: str) -> list[Reading]:
         measured = tuple(y.tolist())
-        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * len(self._funnels)
-
-
-def _assumption(tubes: Sequence[Tube]) -> str:
-    return "; ".join(tube.assumption for tube in tubes)
+        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * self._count

@@ -22,7 +22,7 @@ from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import TubeDesign
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.design.linear import innovations
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
@@ -39,11 +39,11 @@ def held_back() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def found(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+def found(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catching:
     return catches(design, train, held_back)
 
 
-def catches(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+def catches(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catching:
     return what_it_catches(
         Monitor(design.model, design.policy, design.funnel, centre=Centre.COMMAND),
         design.model,
@@ -60,12 +60,12 @@ def row(found: Catching, fault: str) -> Row:
     return next(row for row in found.rows if row.fault == fault)
 
 
-def energies(design: TubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray:
+def energies(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray:
     e = innovations(design.model, design.policy.L[None, :], replace(trial, y=y))[:, 0]
     return np.cumsum(e**2)[: design.funnel.assumption.samples]
 
 
-def first_bad(design: TubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
+def first_bad(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
     """The first judged sample after which the energy or the command is beyond what is assumed."""
     n, (low, high) = len(design.model), design.model.u_range
     spent = energies(design, trial, y)
@@ -76,7 +76,7 @@ def first_bad(design: TubeDesign, trial: Trajectory, y: FloatArray) -> int | Non
 
 @pytest.mark.parametrize("factor", [0.6, 0.8])
 def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
-    design: TubeDesign, found: Catching, held_back: Dataset, factor: float
+    design: OutputTubeDesign, found: Catching, held_back: Dataset, factor: float
 ) -> None:
     bad = [first_bad(design, trial, factor * trial.y) for trial in held_back]
     delays = [PERIOD * k for k in bad if k is not None]
@@ -87,7 +87,7 @@ def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
 
 
 def test_untouched_trials_are_false_alarms_and_others_have_no_more(
-    design: TubeDesign, found: Catching, held_back: Dataset
+    design: OutputTubeDesign, found: Catching, held_back: Dataset
 ) -> None:
     untouched = row(found, UNTOUCHED)
     assert untouched.fault == found.rows[0].fault
@@ -114,7 +114,7 @@ def test_detectors_are_named_beside_each_sabotage_and_catch_what_they_should(
     assert row(found, "sensor x 0.6").others["box"].count > 0
 
 
-def test_copies_are_what_their_names_say(design: TubeDesign, held_back: Dataset) -> None:
+def test_copies_are_what_their_names_say(design: OutputTubeDesign, held_back: Dataset) -> None:
     trial, faults = held_back.trajectories[0], dict(SABOTAGES)
     made = {name: fault(trial, np.array([2.0]), design.model) for name, fault in faults.items()}
     y = trial.y
@@ -129,7 +129,7 @@ def test_copies_are_what_their_names_say(design: TubeDesign, held_back: Dataset)
     assert all(np.array_equal(copy.u, trial.u) for copy in made.values()), "what was commanded"
 
 
-def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: TubeDesign) -> None:
+def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTubeDesign) -> None:
     """On a trial that the model itself made, it is the model's own response to 0.8 u."""
     u = np.repeat(np.array([0.0, 0.6, 0.2, 0.5]), 20)
     full, weak = (_simulated(design, gain * u, u) for gain in (1.0, 0.8))
@@ -138,7 +138,7 @@ def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: TubeDesig
     np.testing.assert_allclose(copy.y[:, 0], weak, atol=1e-12)
 
 
-def _simulated(design: TubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
+def _simulated(design: OutputTubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
     """By the difference equation: n zeros under the full input, then the model under `applied`."""
     model, n = design.model, len(design.model)
     y, u = np.zeros(len(applied)), applied.copy()
@@ -149,7 +149,7 @@ def _simulated(design: TubeDesign, applied: FloatArray, first: FloatArray) -> Fl
 
 
 def test_widths_and_shares_are_measured_on_the_calibration_trials(
-    design: TubeDesign, train: Dataset, found: Catching
+    design: OutputTubeDesign, train: Dataset, found: Catching
 ) -> None:
     (width,) = found.widths
     assert width.half_width == design.funnel.half_width

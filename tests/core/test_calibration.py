@@ -9,7 +9,7 @@ from scipy.stats import binomtest
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials, windows
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.linear import (
     innovation_energies,
     kalman_gain,
@@ -76,7 +76,7 @@ def test_windows_of_two_pieces_of_one_recording_do_not_share_samples(train: Data
 
 
 def test_the_level_is_the_largest_energy_of_the_calibration_trials(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     scaling = calibration_trials(train, least=72).calibration
     assumption = design.funnel.assumption
@@ -88,7 +88,7 @@ def test_the_level_is_the_largest_energy_of_the_calibration_trials(
 
 
 def test_the_calibration_trials_do_not_choose_the_observer(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     """Calibration trials a hundred times noisier: the same L and P, another level."""
     split = calibration_trials(train, least=72)
@@ -96,7 +96,7 @@ def test_the_calibration_trials_do_not_choose_the_observer(
     loud = Dataset(
         tuple(replace(t, y=t.y + 0.5 * noise.standard_normal(t.y.shape)) for t in split.calibration)
     )
-    other = design_tube(
+    other = design_output_tube(
         design.model, split.design, profile=PROFILE, horizon=7.0, inlet=0.02, calibration=loud
     )
     np.testing.assert_array_equal(other.policy.L, design.policy.L)
@@ -109,15 +109,15 @@ def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
 ) -> None:
     split = calibration_trials(train, least=72)
     apart = replace(fit.model, bags=split.designed_on, training="sha256:0")
-    made = design_tube(
+    made = design_output_tube(
         apart, split.design, profile=PROFILE, horizon=7.0, calibration=split.calibration
     )
     assert "with probability at most 1/4)" in made.verdict.assumptions[1]
-    seen = design_tube(replace(fit.model, bags=split.measured_on[:2], training="sha256:0"),
+    seen = design_output_tube(replace(fit.model, bags=split.measured_on[:2], training="sha256:0"),
                        train, profile=PROFILE, horizon=7.0)  # fmt: skip
     assert "as the model was fitted to 2 of them)" in seen.verdict.assumptions[1]
     long = Dataset(synthetic_dataset(0.01, trials=1, samples=400).trajectories)
-    cut = design_tube(replace(fit.model, training="sha256:0"), long,
+    cut = design_output_tube(replace(fit.model, training="sha256:0"), long,
                       profile=PROFILE, horizon=7.0)  # fmt: skip
     said = cut.verdict.assumptions[1]
     assert "largest of 2 distinct windows" in said

@@ -10,9 +10,9 @@ import pytest
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import ContinuousTracking, LinearTube, SampledTracking, TubeDesign, design
+from nlsid_core.design import ContinuousTracking, LinearTube, SampledTracking, OutputTubeDesign, design
 from nlsid_core.design.continuous.design import design_funnel
-from nlsid_core.design.linear import design_tube
+from nlsid_core.design.tube import design_output_tube
 from nlsid_core.design.sampled.design import design_state_funnel
 from nlsid_core.designs import FUNNEL, MODEL, POLICY, PROOF, AnyDesign, Design, load_design
 from nlsid_core.errors import (
@@ -30,7 +30,7 @@ from tests.tracked import assumption, designed, tracked
 PROFILE = ((0.0, 0.0), (7.0, 0.5))
 
 
-def test_the_verb_solves_what_each_problem_says(tube: TubeDesign, train: Dataset) -> None:
+def test_the_verb_solves_what_each_problem_says(tube: OutputTubeDesign, train: Dataset) -> None:
     found = design(LinearTube(tube.model, train, PROFILE, 7.0))
     assert found.funnel.assumption.samples == round(7.0 / tube.model.period)
     assert "for 70 samples" in found.verdict.statement
@@ -45,7 +45,7 @@ def test_the_verb_solves_what_each_problem_says(tube: TubeDesign, train: Dataset
 @pytest.mark.parametrize(
     ("problem", "search"),
     [
-        (LinearTube, design_tube),
+        (LinearTube, design_output_tube),
         (SampledTracking, design_state_funnel),
         (ContinuousTracking, design_funnel),
     ],
@@ -77,7 +77,7 @@ def test_a_problem_states_what_its_search_takes(problem: type[Any], search: Any)
     ],
 )
 def test_a_tube_that_makes_no_sense_is_refused(
-    tube: TubeDesign, train: Dataset, options: dict[str, Any], reason: str
+    tube: OutputTubeDesign, train: Dataset, options: dict[str, Any], reason: str
 ) -> None:
     sensible: dict[str, Any] = {"profile": PROFILE, "horizon": 7.0}
     with pytest.raises(DataError, match=reason):
@@ -93,14 +93,14 @@ def test_a_sampled_problem_refuses_radii_that_are_not_positive(options: dict[str
 
 
 @pytest.fixture(name="tube")
-def _tube(request: pytest.FixtureRequest) -> TubeDesign:
+def _tube(request: pytest.FixtureRequest) -> OutputTubeDesign:
     """The session's tube, by a name that is not the verb's."""
-    found: TubeDesign = request.getfixturevalue("design")
+    found: OutputTubeDesign = request.getfixturevalue("design")
     return found
 
 
 @pytest.fixture(params=["linear", "sampled"])
-def any_design(request: pytest.FixtureRequest, tube: TubeDesign) -> AnyDesign:
+def any_design(request: pytest.FixtureRequest, tube: OutputTubeDesign) -> AnyDesign:
     return tube if request.param == "linear" else designed()
 
 
@@ -149,7 +149,7 @@ def test_a_proof_of_something_else_is_no_design(
         load_design(tmp_path)
 
 
-def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: TubeDesign) -> None:
+def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesign) -> None:
     narrow = replace(tube.funnel, half_widths=tube.funnel.half_widths * 0.9)
     with pytest.raises(CertificateRejected):
         Design.proved(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from nlsid_core.design import TubeDesign
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.linear import LinearFunnel
@@ -18,7 +18,7 @@ from tests.tracked import designed
 
 
 def pairs(
-    linear: TubeDesign,
+    linear: OutputTubeDesign,
 ) -> list[tuple[AnyPolicy, LinearFunnel | SampledFunnel | ContinuousFunnel]]:
     """One of each kind that has a policy."""
     sampled, (_, policy, funnel) = designed(), stage()
@@ -29,7 +29,7 @@ def pairs(
     ]
 
 
-def test_every_kind_answers_the_same_questions(design: TubeDesign) -> None:
+def test_every_kind_answers_the_same_questions(design: OutputTubeDesign) -> None:
     for policy, funnel in pairs(design):
         common: Funnel = funnel
         plan: Policy = policy
@@ -49,7 +49,7 @@ def test_every_kind_answers_the_same_questions(design: TubeDesign) -> None:
 
 
 def test_one_load_reads_every_kind_and_refuses_what_is_none(
-    design: TubeDesign, tmp_path: Path
+    design: OutputTubeDesign, tmp_path: Path
 ) -> None:
     for policy, funnel in pairs(design):
         files.write_document(tmp_path / "policy.json", policy.document())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.design.linear import innovations
 from nlsid_core.errors import CertificateMismatch
 from nlsid_core.running.comparison import Centre
@@ -17,16 +17,16 @@ from tests.conftest import PERIOD
 ROUNDING = 1e-9  # relative: the monitor evaluates in floating point
 
 
-def make_monitor(design: TubeDesign, centre: Centre = Centre.COMMAND) -> Monitor:
+def make_monitor(design: OutputTubeDesign, centre: Centre = Centre.COMMAND) -> Monitor:
     return Monitor(design.model, design.policy, design.funnel, centre=centre)
 
 
-def run(design: TubeDesign, y: np.ndarray, u: np.ndarray) -> list[Reading]:
+def run(design: OutputTubeDesign, y: np.ndarray, u: np.ndarray) -> list[Reading]:
     monitor = make_monitor(design)
     return [monitor.update(k * PERIOD, y[k], u[k]) for k in range(len(y))]
 
 
-def excite(design: TubeDesign, e: np.ndarray, engaged: np.ndarray) -> list[float]:
+def excite(design: OutputTubeDesign, e: np.ndarray, engaged: np.ndarray) -> list[float]:
     """V + e² along the error dynamics, from a start on the inlet's boundary."""
     model, policy, funnel = design.model, design.policy, design.funnel
     direction = np.ones(len(model))
@@ -39,7 +39,7 @@ def excite(design: TubeDesign, e: np.ndarray, engaged: np.ndarray) -> list[float
     return values
 
 
-def test_no_disturbance_within_the_budget_leaves_the_tube(design: TubeDesign) -> None:
+def test_no_disturbance_within_the_budget_leaves_the_tube(design: OutputTubeDesign) -> None:
     rng = np.random.default_rng(3)
     samples, budget = design.funnel.assumption.samples, design.funnel.assumption.budget
     for _ in range(300):
@@ -50,9 +50,9 @@ def test_no_disturbance_within_the_budget_leaves_the_tube(design: TubeDesign) ->
 
 
 def test_the_worst_disturbance_nearly_reaches_the_boundary(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
-    prediction = design_tube(
+    prediction = design_output_tube(
         design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0, lqr_weights=None
     )
     model, L = prediction.model, prediction.policy.L
@@ -69,7 +69,7 @@ def test_the_worst_disturbance_nearly_reaches_the_boundary(
 
 
 def test_training_trials_are_inside_and_spend_at_most_the_measured_share(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     measured_on = {name for name, _ in design.funnel.assumption.measured_on}
     shares = {}
@@ -83,7 +83,7 @@ def test_training_trials_are_inside_and_spend_at_most_the_measured_share(
 
 
 def test_the_monitor_spends_the_energy_the_design_measured(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     trial = train.trajectories[0]
     e = innovations(design.model, design.policy.L[None, :], trial)[:, 0]
@@ -94,7 +94,7 @@ def test_the_monitor_spends_the_energy_the_design_measured(
     )
 
 
-def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: TubeDesign) -> None:
+def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: OutputTubeDesign) -> None:
     model, policy = design.model, design.policy
     rng = np.random.default_rng(5)
     monitor = make_monitor(design, Centre.PROFILE)
@@ -118,7 +118,7 @@ def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: Tube
         x = model.A @ x + model.B[:, 0] * u + model.offset + policy.L * e[k]
 
 
-def test_a_command_that_is_not_the_policys_violates_the_assumption(design: TubeDesign) -> None:
+def test_a_command_that_is_not_the_policys_violates_the_assumption(design: OutputTubeDesign) -> None:
     model, policy = design.model, design.policy
     monitor = make_monitor(design, Centre.PROFILE)
     n, rest = len(model), policy.u[0]
@@ -131,7 +131,7 @@ def test_a_command_that_is_not_the_policys_violates_the_assumption(design: TubeD
 
 
 def test_a_sensor_that_reads_60_percent_is_caught_and_named(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     for trial in train:
         readings = run(design, 0.6 * trial.y[:, 0], trial.u[:, 0])
@@ -141,7 +141,7 @@ def test_a_sensor_that_reads_60_percent_is_caught_and_named(
 
 
 def test_outside_always_comes_with_a_violated_assumption(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     trial = train.trajectories[0]
     for scale in np.linspace(0.0, 2.0, 21):
@@ -164,7 +164,7 @@ def test_outside_always_comes_with_a_violated_assumption(
     ],
 )
 def test_a_sample_that_cannot_be_judged_reads_unknown_until_restarted(
-    design: TubeDesign, train: Dataset, sample: tuple[float, float, float], reason: str
+    design: OutputTubeDesign, train: Dataset, sample: tuple[float, float, float], reason: str
 ) -> None:
     trial = train.trajectories[0]
     y, u = trial.y[:, 0], trial.u[:, 0]
@@ -182,14 +182,14 @@ def test_a_sample_that_cannot_be_judged_reads_unknown_until_restarted(
     assert last.status is Status.INSIDE
 
 
-def test_a_missing_state_reads_unknown_never_inside(design: TubeDesign) -> None:
+def test_a_missing_state_reads_unknown_never_inside(design: OutputTubeDesign) -> None:
     monitor = make_monitor(design)
     reading = monitor.missing(1.0, "no speed for 0.1 s")
     assert (reading.status, reading.reason) == (Status.UNKNOWN, "no speed for 0.1 s")
     assert monitor.update(2.0, 0.0, 0.0).status is Status.UNKNOWN
 
 
-def test_beyond_the_horizon_the_proof_says_nothing(design: TubeDesign, train: Dataset) -> None:
+def test_beyond_the_horizon_the_proof_says_nothing(design: OutputTubeDesign, train: Dataset) -> None:
     trial = train.trajectories[0]
     readings = run(design, trial.y[:, 0], trial.u[:, 0])
     samples = len(design.model) + design.funnel.assumption.samples
@@ -199,7 +199,7 @@ def test_beyond_the_horizon_the_proof_says_nothing(design: TubeDesign, train: Da
 
 
 def test_a_command_outside_the_fitted_range_violates_the_assumption(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     trial = train.trajectories[0]
     u = trial.u[:, 0].copy()
@@ -209,7 +209,7 @@ def test_a_command_outside_the_fitted_range_violates_the_assumption(
     assert "outside the fitted range" in reading.reason
 
 
-def test_parts_that_do_not_belong_together_are_refused(design: TubeDesign, train: Dataset) -> None:
-    other = design_tube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
+def test_parts_that_do_not_belong_together_are_refused(design: OutputTubeDesign, train: Dataset) -> None:
+    other = design_output_tube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor(design.model, other.policy, design.funnel)

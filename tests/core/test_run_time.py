@@ -17,7 +17,7 @@ from bags.monitoring.watch import Watch
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.funnels import factor
 from nlsid_core.funnels.factor import factor_of, refuse_unmonitorable
@@ -232,7 +232,7 @@ def test_a_factor_is_exact_where_float64_has_no_digit_left() -> None:
 
 
 def test_what_float64_cannot_hold_is_refused_by_the_monitor_and_at_design(
-    design: TubeDesign, train: Dataset, monkeypatch: pytest.MonkeyPatch
+    design: OutputTubeDesign, train: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, policy, funnel = overflowing()
     S = np.array([[1.0, 1e14], [0.0, 1.0]])
@@ -252,7 +252,7 @@ def test_what_float64_cannot_hold_is_refused_by_the_monitor_and_at_design(
     with pytest.raises(DataError, match="too ill-conditioned"):
         Monitor(model, policy, funnel)
     with pytest.raises(DataError, match="too ill-conditioned"):
-        design_tube(design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0)
+        design_output_tube(design.model, train, profile=[(0.0, 0.0), (7.0, 0.5)], horizon=7.0)
 
 
 def test_a_lost_first_message_does_not_shift_the_plan() -> None:
@@ -318,7 +318,7 @@ def test_a_grid_takes_every_sample_within_the_tolerance_of_its_announced_start(
 
 
 def test_a_controller_stops_where_the_proof_ends_though_the_plan_goes_on(
-    design: TubeDesign,
+    design: OutputTubeDesign,
 ) -> None:
     samples = 20
     funnel = replace(
@@ -341,7 +341,7 @@ def test_a_controller_stops_where_the_proof_ends_though_the_plan_goes_on(
 
 
 def test_an_input_is_never_beyond_the_range_of_the_model_and_what_is_sent_is_proved(
-    design: TubeDesign,
+    design: OutputTubeDesign,
 ) -> None:
     """A robot that falls behind: the policy asks for more than the model was fitted on."""
     model, policy = design.model, design.policy
@@ -367,7 +367,7 @@ def test_an_input_is_never_beyond_the_range_of_the_model_and_what_is_sent_is_pro
 
 
 def test_a_command_between_the_plans_and_the_policys_is_one_the_proof_covers(
-    design: TubeDesign,
+    design: OutputTubeDesign,
 ) -> None:
     model, policy = design.model, design.policy
     funnel = replace(design.funnel, inlet=design.funnel.level)
