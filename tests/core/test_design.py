@@ -10,7 +10,7 @@ import pytest
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import ContinuousTracking, LinearTube, SampledTracking, OutputTubeDesign, design
+from nlsid_core.design import ContinuousTracking, OutputTube, OutputTubeDesign, SampledTracking, design
 from nlsid_core.design.continuous.design import design_funnel
 from nlsid_core.design.tube import design_output_tube
 from nlsid_core.design.sampled.design import design_state_funnel
@@ -31,9 +31,12 @@ PROFILE = ((0.0, 0.0), (7.0, 0.5))
 
 
 def test_the_verb_solves_what_each_problem_says(tube: OutputTubeDesign, train: Dataset) -> None:
-    found = design(LinearTube(tube.model, train, PROFILE, 7.0))
-    assert found.funnel.assumption.samples == round(7.0 / tube.model.period)
-    assert "for 70 samples" in found.verdict.statement
+    found = design(OutputTube(tube.model, train, profile=PROFILE, horizon=6.0))
+    assert found.funnel.tubes[1].samples == round(6.0 / tube.model.period)
+    assert "for at most its 60 samples" in found.verdict.statement
+    longer = design(OutputTube(tube.model, train, profile=PROFILE))
+    assert len(longer.funnel.tubes) == 1
+    assert "for at most its 70 samples" in longer.verdict.statement
     base = tracked()
     problem = SampledTracking(base.model, base.policy, base.feedback, assumption())
     seen: list[str] = []
@@ -45,7 +48,7 @@ def test_the_verb_solves_what_each_problem_says(tube: OutputTubeDesign, train: D
 @pytest.mark.parametrize(
     ("problem", "search"),
     [
-        (LinearTube, design_output_tube),
+        (OutputTube, design_output_tube),
         (SampledTracking, design_state_funnel),
         (ContinuousTracking, design_funnel),
     ],
@@ -67,7 +70,8 @@ def test_a_problem_states_what_its_search_takes(problem: type[Any], search: Any)
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"horizon": 100.0}, "can be measured"),
+        ({"horizon": 7.9}, "horizon 7.9 s is 79 samples; the energy can be measured"),
+        ({"inlet": 0.1, "profile": None}, "inlet is 0.1; it should be 0 without a profile"),
         ({"horizon": 0.0}, "horizon is 0.0; it should be a finite number above 0"),
         ({"safety_factor": 0.99}, "safety_factor is 0.99; it should be a finite number, at least"),
         ({"inlet": -1e-9}, "inlet is -1e-09; it should be a finite number, at least 0"),
@@ -81,7 +85,7 @@ def test_a_tube_that_makes_no_sense_is_refused(
 ) -> None:
     sensible: dict[str, Any] = {"profile": PROFILE, "horizon": 7.0}
     with pytest.raises(DataError, match=reason):
-        design(LinearTube(tube.model, train, **(sensible | options)))
+        design(OutputTube(tube.model, train, **(sensible | options)))
 
 
 @pytest.mark.parametrize("options", [{"goal": 0.0}, {"start": -1.0}, {"goal": float("nan")}])
@@ -150,14 +154,16 @@ def test_a_proof_of_something_else_is_no_design(
 
 
 def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesign) -> None:
-    narrow = replace(tube.funnel, half_widths=tube.funnel.half_widths * 0.9)
+    first, *rest = tube.funnel.tubes
+    narrower = replace(first, half_widths=first.half_widths * 0.9)
+    narrow = replace(tube.funnel, tubes=(narrower, *rest))
     with pytest.raises(CertificateRejected):
         Design.proved(
             tube.model, tube.policy, narrow, claim=tube.claim, proof=tube.proof, found=None
         )
     assert tube.decided() == tube.verdict
     with pytest.raises(CertificateRejected):
-        replace(tube, proof={"slack": -1.0}).decided()
+        replace(tube, proof={"multipliers": []}).decided()
     same = Design.proved(
         tube.model, tube.policy, tube.funnel, claim=tube.claim, proof=tube.proof, found=None
     )

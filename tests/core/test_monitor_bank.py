@@ -46,7 +46,7 @@ def test_a_bank_reads_bit_for_bit_what_each_monitor_reads_alone(
             separately = [monitor.update(t, y, u) for monitor in alone]
             assert list(map(repr, together)) == list(map(repr, separately))
             seen |= {reading.status for reading in together}
-    assert Status.UNKNOWN in seen, "the shortest horizons end before the trials do"
+    assert Status.UNKNOWN in seen, "samples that start a run"
     assert len(seen) >= 2
 
 
