@@ -73,10 +73,14 @@ class Hold:
     widths: list[list[Fraction]]
 
     @property
+    def moved(self) -> int:
+        """How many inputs are off."""
+        return len(self.widths[0]) if self.period or any(self.error) else 0
+
+    @property
     def corners(self) -> list[tuple[int, ...]]:
         """The corners of the box of δ / W."""
-        m = len(self.widths[0]) if any(map(any, self.widths)) else 0
-        return list(product((-1, 1), repeat=m))
+        return list(product((-1, 1), repeat=self.moved))
 
     def push(self, k: int, corner: tuple[int, ...]) -> list[Fraction]:
         """δ at a corner, in interval k."""
@@ -210,13 +214,14 @@ def _read_hold(
     before it starts: W is period times the largest rate there, and what e does to the largest Ke.
     """
     period, error = Fraction(0), [Fraction(0)] * field.n
-    rates: list[list[Fraction]] = [[Fraction(0)] * field.m for _ in funnel.x]
+    rates = [[Fraction(0)] * field.m for _ in funnel.x]
     if "hold" in parts:
         period = parts["hold"].number()
         rates = stated["rates"].array(len(funnel.x), field.m)
         if period <= 0 or any(rate <= 0 for row in rates for rate in row):
             raise Rejected("hold and rates should be positive")
-        if any(p[-1] != q[0] for points in (policy.u, policy.K) for p, q in pairwise(points)):
+        jumps = [p[-1] != q[0] for p, q in pairwise(policy.u)]
+        if any(jumps) or any(p[-1] != q[0] for p, q in pairwise(policy.K)):
             raise Rejected("the policy jumps at a knot: no rate bounds what holding it changes")
     if "error" in parts:
         error = parts["error"].array(field.n)
@@ -231,7 +236,8 @@ def _read_hold(
         [max(_weighed(gain[i], error) for gain in points) for i in range(field.m)]
         for points in policy.K
     ]
-    widths, first = [], 0
+    widths: list[list[Fraction]] = []
+    first = 0
     for k in range(len(funnel.x)):
         while funnel.t[first + 1] <= funnel.t[k] - period:
             first += 1
@@ -396,6 +402,8 @@ def _decide_pieces(
             raise Rejected("kappa should be positive")
         if len(_pushing(field)) < len(field.box):
             raise Rejected("w does more than add constants: kappa does not bound what it does")
+    corners = hold.moved + (0 if kappa else len(field.box))
+    _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits))
     values = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
     vertices, modes = list(product(hold.corners, values)), _modes(policy)
     names = "mu" + " mode tau" * bool(policy.limits)
@@ -432,6 +440,8 @@ def _decide_rates(
     What entries of w do that only push is taken off R; the others are at vertices.
     """
     pushing = _pushing(field)
+    corners = len(field.box) - len(pushing) + hold.moved
+    _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits), 2 * field.m)
     values = product(
         *(((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(field.box))
     )
@@ -463,6 +473,12 @@ def _decide_rates(
     return len(order)
 
 
+def _refuse_many(*counts: int) -> None:
+    combinations = prod(counts)
+    if combinations > MAX_PIECES:
+        raise Rejected(f"{combinations} intervals, vertices and modes; at most {MAX_PIECES}")
+
+
 def _modes(policy: Policy) -> list[tuple[int, ...]]:
     return list(product((0, -1, 1), repeat=len(policy.limits)))
 
@@ -492,8 +508,6 @@ def _in_order(
 
     Raises Rejected unless their parts of time cover [0, 1] for everything that is needed.
     """
-    if len(needed) > MAX_PIECES:
-        raise Rejected(f"{len(needed)} intervals, vertices and modes; at most {MAX_PIECES}")
     covered = {key: Fraction(0) for key in needed}
     names = "interval vertex level index columns squares " + names
     pieces = [piece.members(names) for piece in node.items(1, MAX_PIECES)]
