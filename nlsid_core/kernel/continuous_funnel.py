@@ -363,7 +363,7 @@ def _assumptions(field: Field, policy: Policy, bounds: list[Bounds], hold: Hold)
             f" of at most {longest} s before, and not before the start"
         )
     else:
-        obeyed += "continuously, without hold or delay"
+        obeyed += "continuously, with no hold and no delay"
     if any(hold.error):
         errors = ", ".join(f"x{i} by {text.exact(e)}" for i, e in enumerate(hold.error) if e)
         obeyed += f", measured wrong by at most: {errors}"

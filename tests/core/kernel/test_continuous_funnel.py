@@ -325,7 +325,7 @@ def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_pa
     )
     assert verdict.assumptions == (
         "the state obeys the stored equations and the stored policy is applied continuously, "
-        "without hold or delay, u0 clipped to [-1.5, 2]",
+        "with no hold and no delay, u0 clipped to [-1.5, 2]",
         "at every time w0 in [-0.125, 0.25]",
         "the equations expand others, and that the ranges of w cover what they leave out is an "
         "assumption of the vector field, computed by: by hand",
