@@ -29,6 +29,7 @@ from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
 from bags.recordings.message_types import standard_types
+from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, NlsidError
 from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
@@ -108,6 +109,7 @@ class FunnelMonitor(ManagedNode):
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
         self._watch = None
+        self._names = ""
         self._latched: tuple[State, str] | None = None
         self._heard_ns: dict[str, int] = {}  # response topic -> when its last message came
         self._run: Run | None = None
@@ -160,6 +162,7 @@ class FunnelMonitor(ManagedNode):
         )
         self._signals.clear()
         self._watch, self._digest = watch, digest
+        self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
         self._kinds, self._unfit = {}, ""
         self._frames.clear()
         self._heard_ns.clear()
@@ -315,7 +318,7 @@ class FunnelMonitor(ManagedNode):
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        numbers = reading.numbers
+        numbers = reading.numbers | self._widths.at(reading.t)
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)
@@ -397,6 +400,7 @@ class FunnelMonitor(ManagedNode):
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
             "design": self._funnel.state,
+            "signals": self._names,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
         level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
