@@ -55,7 +55,7 @@ ROUNDS = 6  # of cutting planes, most of the time 2-4
 CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
-OutputTubeDesign: TypeAlias = Design[Any, TubePolicy | None, TubeFunnel, None]
+OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
 
 
 def design_output_tube(
@@ -132,9 +132,9 @@ def design_output_tube(
         assert isinstance(model, DifferenceEquation)
         assert K is not None
         duration = profile[-1][0] if horizon is None else horizon
-        start, u = track_profile(model, profile, max(1, round(duration / model.period)))
+        at_rest, u = track_profile(model, profile, max(1, round(duration / model.period)))
         L = found[0].L[:, 0]
-        policy = TubePolicy(start, u, K=K, L=L, period=model.period, model=funnel.model)
+        policy = TubePolicy(at_rest, u, K=K, L=L, period=model.period, model=funnel.model)
         funnel = replace(funnel, policy=files.digest(policy.document()))
         refuse_unmonitorable(funnel)
     trees = [design.multipliers for design in found]

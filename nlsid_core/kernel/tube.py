@@ -7,8 +7,8 @@ At every vertex E, with multipliers N:
     diag(0, ρP, R) - [F L]'P[F L] + sym(N [E 0]) ≻ 0,
     diag(0, ρP, R) - τ_j [H_j 1_j]'[H_j 1_j] + sym(N_j [E 0]) ≻ 0.
 With E_{k+1} = ρE_k + e_k'Re_k, E_0 = 0: V(x̄_k) <= ρ^k V(x̄_0) + E_k and τ_j o_j² <= ρV + e'Re, at
-most ρ inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel may
-hold several such tubes, each with its assumption.
+most ρ inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel
+may hold several such tubes, each with its assumption.
 
 A policy's plan is the simulation from its start under its inputs u_k. Where the policy acts, the
 input is û = u_k - κKx̄, 0 <= κ <= 1: one more ν, û - u_k, whose row [1, κK] gives it, so F becomes

@@ -49,7 +49,8 @@ class Monitor:
 
     Tubes around a model's simulation are held for ever: see `TubeRun`. Around a plan, a run starts
     with the first sample, or at the stamp given to `restart`. It ends at the first sample that is
-    missing, not finite or off the grid of the start, and where the proof ends; after that every reading is unknown until `restart`.
+    missing, not finite or off the grid of the start, and where the proof ends; after that every
+    reading is unknown until `restart`.
 
     Raises CertificateMismatch if the parts do not belong together, DataError if the funnel cannot
     be monitored in float64.

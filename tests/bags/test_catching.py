@@ -66,7 +66,7 @@ def used(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> FloatArr
     e = innovations(design.model, lasting.L[None], replace(trial, y=y), design.funnel.settling)
     for_ever, ends = (energy(e[:, 0], tube) / tube.level for tube in (lasting, ending))
     ends[ending.samples :] = 0.0
-    return np.maximum(for_ever, ends)
+    return np.asarray(np.maximum(for_ever, ends))
 
 
 def first_bad(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> int | None:

@@ -90,7 +90,9 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
 def test_what_is_not_proved_has_no_tolerances(design: OutputTubeDesign, tmp_path: Path) -> None:
     design.save(tmp_path)
     funnel = files.load_document(tmp_path / FUNNEL)
-    files.write_document(tmp_path / FUNNEL, funnel | {"tubes": [funnel["tubes"][0] | {"half_widths": [1e-3]}]})
+    files.write_document(
+        tmp_path / FUNNEL, funnel | {"tubes": [funnel["tubes"][0] | {"half_widths": [1e-3]}]}
+    )
     with pytest.raises(CertificateRejected):
         tolerances(tmp_path)
 

@@ -10,10 +10,16 @@ import pytest
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import ContinuousTracking, OutputTube, OutputTubeDesign, SampledTracking, design
+from nlsid_core.design import (
+    ContinuousTracking,
+    OutputTube,
+    OutputTubeDesign,
+    SampledTracking,
+    design,
+)
 from nlsid_core.design.continuous.design import design_funnel
-from nlsid_core.design.tube import design_output_tube
 from nlsid_core.design.sampled.design import design_state_funnel
+from nlsid_core.design.tube import design_output_tube
 from nlsid_core.designs import FUNNEL, MODEL, POLICY, PROOF, AnyDesign, Design, load_design
 from nlsid_core.errors import (
     CertificateMismatch,

@@ -66,9 +66,11 @@ def test_one_load_reads_every_kind_and_refuses_what_is_none(
     files.write_document(tmp_path / "funnel.json", funnel.document() | {"kind": "round"})
     with pytest.raises(DocumentError, match="kind is 'round'"):
         load_funnel(tmp_path / "funnel.json")
-    for name, read in (("funnel", load_funnel), ("policy", load_policy)):
+    for name, reads in (("funnel", load_funnel), ("policy", load_policy)):
         document = files.load_document(tmp_path / f"{name}.json")
         files.write_document(tmp_path / f"{name}.json", document | {"kind": "linear"})
-        for reader in (read, load):
-            with pytest.raises(DocumentError, match="is now 'tube'. Make it again with `nlsid fun"):
+        for reader in (reads, load):
+            with pytest.raises(
+                DocumentError, match=r"is now 'tube'. Make it again with `nlsid fun"
+            ):
                 reader(tmp_path / f"{name}.json")

@@ -97,7 +97,9 @@ def test_the_monitor_spends_the_energy_the_design_measured(
     np.testing.assert_allclose([r.assumption for r in readings], np.maximum(*used), rtol=1e-8)
 
 
-def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: OutputTubeDesign) -> None:
+def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(
+    design: OutputTubeDesign,
+) -> None:
     model, policy = design.model, design.policy
     rng = np.random.default_rng(5)
     monitor = make_monitor(design, Centre.PROFILE)
@@ -126,7 +128,9 @@ def test_a_closed_loop_run_of_the_policy_is_inside_the_profile_tube(design: Outp
     assert "the proof covers 70 samples; they are over" in over.reason
 
 
-def test_a_command_that_is_not_the_policys_violates_the_assumption(design: OutputTubeDesign) -> None:
+def test_a_command_that_is_not_the_policys_violates_the_assumption(
+    design: OutputTubeDesign,
+) -> None:
     model, policy = design.model, design.policy
     monitor = make_monitor(design, Centre.PROFILE)
     n, rest = len(model), policy.u[0]
@@ -208,7 +212,9 @@ def test_around_the_simulation_the_tube_goes_on_after_the_plan(
     assert {r.status for r in readings[design.funnel.settling :]} == {Status.INSIDE}
 
 
-def test_parts_that_do_not_belong_together_are_refused(design: OutputTubeDesign, train: Dataset) -> None:
+def test_parts_that_do_not_belong_together_are_refused(
+    design: OutputTubeDesign, train: Dataset
+) -> None:
     other = design_output_tube(design.model, train, profile=[(0, 0), (7, 0.4)], horizon=7.0)
     with pytest.raises(CertificateMismatch, match="another policy"):
         Monitor(design.model, other.policy, design.funnel)

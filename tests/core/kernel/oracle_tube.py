@@ -269,10 +269,7 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
             return False
         if inlet < 0 or measured < 0 or factor < 1 or level < factor**2 * measured:
             return False
-        before, on = (
-            [span(t["digest"]) for t in given[k]]
-            for k in ("designed_on", "measured_on")
-        )
+        before, on = ([span(t["digest"]) for t in given[k]] for k in ("designed_on", "measured_on"))
         if not on or any(overlap(a, b) for a, b in product(before, on)):
             return False
         if not all(holds(F, H, m, tube, tree, (box, ray, hull)) for F, H in modes):
