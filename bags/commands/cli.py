@@ -438,11 +438,14 @@ def demo(
     out_dir: Annotated[
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
+    robot: Annotated[
+        str, typer.Option(help="f1tenth, a car's speed; dart, a car's yaw rate on three floors.")
+    ] = "f1tenth",
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     from bags.commands.demo import run_demo
 
-    if not run_demo(out_dir, out):
+    if not run_demo(out_dir, out, robot):
         raise typer.Exit(1)
 
 
