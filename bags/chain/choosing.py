@@ -58,6 +58,7 @@ def select_bags(
         method=base.method,
         test=trials.test,
         transient=base.transient,
+        max_rate=base.max_rate,
         allow_unproved=base.allow_unproved,
         progress=part(progress, 0.3, 0.9),
     )
@@ -134,6 +135,7 @@ def _every_method(
                 comparators=methods,
                 validation=trials.validation,
                 transient=section.transient,
+                max_rate=section.max_rate,
                 allow_unproved=True,
                 progress=progress,
             )

@@ -67,7 +67,7 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
 
 def notes(result: Identified) -> list[str]:
     """What a user should know beside the table: the search, the residuals, what was skipped."""
-    lines = [str(result.fit.history)]
+    lines = [str(result.fit.history), result.fit.slowest]
     try:
         scores = result.fit.chosen.validate(result.test)
     except DataError as reason:
@@ -140,7 +140,7 @@ def comparison_table(compared: Compared) -> Table:
 def stability(candidate: Candidate[Model]) -> str:
     """The proved rate, or that none is, in colour."""
     if candidate.proof is None:
-        return "[dark_orange3]not proved"
+        return f"[dark_orange3]{candidate.unproved}"
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 

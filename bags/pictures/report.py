@@ -185,8 +185,8 @@ for this table and the pictures below{_calibrated(calibration)}.</p>
 def _stability(chosen: Candidate[Model]) -> str:
     if chosen.proof is None:
         return (
-            '<p class="not">Not proved stable: there is no certificate for this model, and nothing '
-            "built on it is certified.</p>"
+            f'<p class="not">Not proved stable{chosen.remark and f" ({escape(chosen.remark)})"}: '
+            "there is no certificate for this model, and nothing built on it is certified.</p>"
         )
     inputs = "every input"
     if isinstance(chosen.model, StateAffineModel):

@@ -5,15 +5,16 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic
 
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, OptionError, SolverError
 from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, alike, describe
+from nlsid_core.identification.rates import default_max_rate
 from nlsid_core.identification.searches import OFFERS, methods_of
 from nlsid_core.identification.trail import Progress, Task, silent
 
@@ -27,6 +28,7 @@ def identify(
     validation: Dataset | None = None,
     test: Dataset | None = None,
     transient: int = 0,
+    max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -37,8 +39,10 @@ def identify(
     of them. comparators: what else runs beside it; None: what is quick, with the options that it
     shares with the method. `test` is only scored; so is `validation`, but by it a block cascade
     chooses its phases and knots. transient: samples at the start of every trial that are simulated
-    and not scored. executor: shares work that splits, such as moments of many bags. progress:
-    called with (what was done, fraction done).
+    and not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a sample: two
+    solutions approach each other by it or faster, and a slower proof does not count (None: the
+    time constant is the length of the longest training trial). executor: shares work that splits,
+    such as moments of many bags. progress: called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
     """
@@ -50,28 +54,33 @@ def identify(
     datasets = {"train": train, "validation": validation, "test": test}
     scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
     _refuse_other_signals(scored)
+    if max_rate is not None and not 0.0 < max_rate < 1.0:
+        raise OptionError("max_rate", max_rate, "a number between 0 and 1")
+    slowest = default_max_rate(train) if max_rate is None else max_rate
     offer = OFFERS[type(model_class)]
     quick = tuple(alike(kind, chosen) for kind in offer.comparators if kind in known)
     task = Task(
         method=chosen,
         comparators=quick if comparators is None else tuple(comparators),
+        max_rate=slowest,
         validation=validation,
         transient=transient,
         executor=executor,
         progress=silent if progress is None else progress,
     )
     trail = offer.search(train, model_class, task)
-    fit = Fit(tuple(trail.candidates), chosen, trail.history)
+    fit = Fit(tuple(trail.candidates), chosen, trail.history, max_rate=slowest)
     if fit.chosen.proof is None and not allow_unproved:
+        remark = fit.chosen.remark and f" ({fit.chosen.remark})"
         raise Infeasible(
-            f"no proof of stability for the model of {chosen.title}; try fewer lags, more or "
-            "richer data, or a method that keeps a proof (rse_certified, moment_rie)"
+            f"no proof of stability for the model of {chosen.title}{remark}; try fewer lags, more "
+            "or richer data, or a method that keeps a proof (rse_certified, moment_rie)"
         )
     errors = {
         name: {c.method.name: c.error_percent(dataset) for c in fit.candidates}
         for name, dataset in scored.items()
     }
-    return Fit(fit.candidates, chosen, fit.history, errors)
+    return replace(fit, errors=errors)
 
 
 def select(
@@ -82,6 +91,7 @@ def select(
     method: Method | None = None,
     test: Dataset | None = None,
     transient: int = 0,
+    max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -104,6 +114,7 @@ def select(
                 validation=validation,
                 test=test,
                 transient=transient,
+                max_rate=max_rate,
                 allow_unproved=allow_unproved,
                 executor=executor,
             )

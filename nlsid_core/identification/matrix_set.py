@@ -58,7 +58,8 @@ class MatrixSet:
     def start(cls, problem: StateAffineRows) -> "MatrixSet":
         """The set around G = I."""
         n, n_y = len(problem.left) - 1, len(problem.y_scale[0])
-        P = np.kron(np.diag(0.5 ** np.arange(n)), np.eye(n_y))
+        fall = 0.5 * slowest_rate(problem) ** 2
+        P = np.kron(np.diag(fall ** np.arange(n)), np.eye(n_y))
         return cls(problem, P, np.eye(n_y, (n + 1) * n_y), problem.rows.identity)
 
     @classmethod
@@ -155,7 +156,7 @@ def _coefficients(problem: StateAffineRows) -> FloatArray:
 
 def slowest_rate(problem: StateAffineRows) -> float:
     """r: V shrinks by r² a sample, or faster, in the whole set."""
-    return SLOWEST_IN_BOX if _used(problem).any() else SLOWEST_RATE
+    return min(SLOWEST_IN_BOX if _used(problem).any() else SLOWEST_RATE, problem.slowest)
 
 
 def _decrease(problem: StateAffineRows, P: FloatArray) -> FloatArray:

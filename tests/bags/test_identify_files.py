@@ -354,7 +354,7 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
 def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
     coupled: Path, tmp_path: Path
 ) -> None:
-    unproved = {"model": "monotone", "lags": 2, "method": "least_squares"}
+    unproved = {"lags": 2, "method": "least_squares", "max_rate": 0.01}
     config = write_config(tmp_path / "c.yaml", {"lags": 2})
     assert nlsid("identify", coupled, "--config", config, "--out", tmp_path).exit_code == 0
     assert (tmp_path / documents.MODEL_PROOF).exists()

@@ -146,7 +146,8 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
         def hull(part: Box, ends: Json | None) -> list[Rows] | None:
             return vertices(model, part) if ends is None else between(model, part, ends)
 
-        return F, m, box, model["kind"] == "monotone_equation", hull
+        ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
+        return F, m, box, ray, hull
     implicit = Implicit(model)
     found = implicit.everywhere()
     if found is not None:
