@@ -318,7 +318,7 @@ class FunnelMonitor(ManagedNode):
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        numbers = reading.numbers | self._widths.at(reading.t)
+        numbers = reading.numbers | self._widths.of(reading)
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)

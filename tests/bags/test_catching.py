@@ -213,7 +213,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     assert table.rows[-2].style == "dark_orange3"
     assert table.rows[0].style == ""
     assert (
-        next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 7
+        next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
         show.say_catching(console, replace(found, rows=(*found.rows, refused)), None)

@@ -46,7 +46,7 @@ def test_a_level_is_the_sum_that_its_page_states_and_online_it_is_the_same() -> 
 def test_a_level_that_makes_no_sense_is_refused() -> None:
     for change in ({"scale": 0.0}, {"fading": 1.0}, {"fading": -0.1}, {"of": "square"}):
         with pytest.raises(DataError, match="does not make sense"):
-            Term(**({"inputs": (0,)} | change))  # type: ignore[arg-type]
+            replace(TERMS[1], **change)
     with pytest.raises(DataError, match="not be negative"):
         CommandLevel(TERMS[:1], np.array([[-1.0]]))
     with pytest.raises(ShapeError):
@@ -59,7 +59,8 @@ def test_a_level_that_makes_no_sense_is_refused() -> None:
 
 def trials(count: int, seed: int, *, moved: float) -> tuple[list[FloatArray], list[FloatArray]]:
     """Squares of errors whose size is that of a fading sum of the command's changes, and noise."""
-    energies, inputs = [], []
+    energies: list[FloatArray] = []
+    inputs: list[FloatArray] = []
     for k in range(count):
         rng = np.random.default_rng((seed, k))
         u = np.repeat(rng.uniform(-1.0, 1.0, (8, 1)), 25, axis=0)
