@@ -138,8 +138,8 @@ class FunnelConfig(Section):
         Literal["auto", "constant", "commands"],
         Key(
             "whether the tube is wider while commands move it (`commands`) or as wide always "
-            "(`constant`, which fixed tolerances need); `auto`: what is narrower on average over "
-            "the training trials; without `profile`",
+            "(`constant`, which fixed tolerances need); `auto`: `commands` where that is a fifth "
+            "narrower on average over the training trials; without `profile`",
             example="constant",
         ),
     ] = "auto"

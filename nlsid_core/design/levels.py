@@ -17,11 +17,12 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.funnels.level import CHANGE, VALUE, CommandLevel, Term
 
-LevelKind = Literal["auto", "constant", "commands"]  # auto: what is narrower on average
+LevelKind = Literal["auto", "constant", "commands"]  # auto: commands if that is worth it
 FADING = (0.7, 0.85, 0.93, 0.97, 0.99)  # of sums over the past, by sample
 PROGRAMS = 4  # reweighted ones
 FLOORS = (0.001, 0.01, 0.03, 0.1, 0.3)  # of the largest E: the least constant part of a level
 PAIRS_UP_TO = 4  # inputs of which products of two are tried
+WORTH = 0.8  # of a constant level's mean half-width: a rule that gains less is mostly chance
 ADDED = 200  # samples that a round takes into a program, worst first
 ROUNDS = 20
 NEGLIGIBLE = 1e-6  # of the largest summand: a weight that is left out
@@ -54,7 +55,7 @@ def candidates(inputs: Sequence[FloatArray]) -> tuple[Term, ...]:
 def followed(
     energies: Sequence[FloatArray], inputs: Sequence[FloatArray], *, always: bool = False
 ) -> CommandLevel | None:
-    """A level for the rows of E (N, rows) of each trial, or None where a constant is narrower.
+    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`).
 
     inputs: (settling + N, n_u) of each trial, from its run's start. What is narrower, and how small
     the constant part may be, is decided by the mean half-width where each half of the trials is
@@ -73,7 +74,7 @@ def followed(
         g = np.concatenate(G) @ weights
         rows.append(weights / float(np.mean(np.sqrt(g))) ** 2)
         parts.append(tried[floor] / tried[1.0])
-    if min(parts) >= 1.0 and not always:
+    if float(np.mean(parts)) > WORTH and not always:
         return None
     shares = np.array(rows) * np.max(np.concatenate(G), axis=0)
     kept = (shares > NEGLIGIBLE * shares.max(axis=1, keepdims=True)).any(axis=0)

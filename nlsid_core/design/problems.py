@@ -66,7 +66,8 @@ class OutputTube:
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
     the range of the training trials and a tenth of it on both sides). level: "constant", or
-    "commands" for one that follows them; "auto" takes what is narrower on average over `train`.
+    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    `train`.
     Source: docs/certificate_tube.md.
     """
 
