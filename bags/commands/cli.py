@@ -135,6 +135,8 @@ def select(
     with progress_bar("selecting") as progress:
         result = select_bags(folders, settings, out_dir, options=options, progress=progress)
     out.print(show.selection_table(result.selection))
+    if result.selection.refitted:
+        out.print("the chosen class, fitted to training and validation trials together:")
     show.say_identified(out, result.identified)
 
 

@@ -12,7 +12,7 @@ from bags.monitoring.catching import Catching, Row
 from bags.monitoring.replay import Replay
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, percent
+from nlsid_core.errors import DataError, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import (
     DifferenceEquation,
@@ -216,7 +216,7 @@ def _row(candidate: Candidate[Model], fit: Fit[Model], columns: Sequence[str]) -
     cells = [
         escape(candidate.method.title),
         *(percent(fit.errors[name][candidate.method.name]) for name in columns),
-        f"{candidate.seconds * 1e3:.0f} ms",
+        duration(candidate.seconds),
         proved,
     ]
     tag = '<tr class="chosen">' if candidate is fit.chosen else "<tr>"
