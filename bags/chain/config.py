@@ -134,6 +134,15 @@ class FunnelConfig(Section):
             example=0.5,
         ),
     ] = None
+    level: Annotated[
+        Literal["auto", "constant", "commands"],
+        Key(
+            "whether the tube is wider while commands move it (`commands`) or as wide always "
+            "(`constant`, which fixed tolerances need); `auto`: `commands` where that is a fifth "
+            "narrower on average over the training trials; without `profile`",
+            example="constant",
+        ),
+    ] = "auto"
     safety_factor: Annotated[
         float,
         Field(ge=1.0, allow_inf_nan=False),
@@ -173,6 +182,8 @@ class FunnelConfig(Section):
             if self.inlet:
                 raise ValueError("inlet is for a plan: give `profile`, or leave it out")
             return self
+        if self.level == "commands":
+            raise ValueError("around a plan the level is constant: level is for no `profile`")
         times = [time for time, _ in self.profile]
         if any(later <= time for time, later in pairwise(times)):
             raise ValueError(f"profile: times should increase; they are {times}")

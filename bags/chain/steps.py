@@ -275,6 +275,7 @@ def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTu
             reaction_time=options.reaction_time,
             safety_factor=options.safety_factor,
             horizon=options.horizon,
+            level=options.level,
             box=getattr(config.identification.model_class, "box", None),
             profile=options.profile,
             inlet=options.inlet,

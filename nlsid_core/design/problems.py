@@ -8,6 +8,7 @@ from nlsid_core.arrays import ArrayLike
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
@@ -32,11 +33,14 @@ class OutputTube:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
-    the range of the training trials and a tenth of it on both sides).
+    the range of the training trials and a tenth of it on both sides). level: "constant", or
+    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    `train`.
 
     profile: of a linear model, (s, output) corners of a plan that a policy tracks, for `horizon` s,
-    else up to the last corner (None: no policy). inlet: allowed initial error of the output beside
-    the plan, in its unit. lqr_weights: of output and input, positive; None is K = 0.
+    else up to the last corner (None: no policy); its level is constant. inlet: allowed initial
+    error of the output beside the plan, in its unit. lqr_weights: of output and input, positive;
+    None is K = 0.
     Source: docs/certificate_tube.md.
     """
 
@@ -47,6 +51,7 @@ class OutputTube:
     safety_factor: float = 1.5
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
+    level: LevelKind = "auto"
     profile: Sequence[tuple[float, float]] | None = None
     inlet: float = 0.0
     lqr_weights: tuple[float, float] | None = (1.0, 1.0)
@@ -59,11 +64,14 @@ class OutputTube:
         require_at_least(self, "inlet", 0.0)
         if self.profile is not None and len(self.profile) < 2:
             raise OptionError("profile", self.profile, "two or more corners (s, output)")
+        if self.profile is not None and self.level == "commands":
+            raise OptionError("level", self.level, "constant, or auto, with a profile")
         if self.profile is None and self.inlet > 0.0:
             raise OptionError("inlet", self.inlet, "0 without a profile: the start of a plan")
         if self.lqr_weights is not None and not all(weight > 0 for weight in self.lqr_weights):
             raise OptionError("lqr_weights", self.lqr_weights, "two numbers above 0, or None")
         require_ranges(self, "box")
+        require_one_of(self, "level", get_args(LevelKind))
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,12 @@
 The kernel's reading of the model file gives F, H and the vertices E. Observers L are Kalman gains
 of the mean increment over a grid of noise ratios, ρ is taken from a grid above the square of the
 proved rate. Of all pairs those whose forecast a reaction time ahead is the narrowest are solved as
-semidefinite programs, on the training trials; the level is measured on other trials. With a plan
-of a linear model and an LQR around it, the programs hold for the closed loop as well.
+semidefinite programs, on the training trials; the level is measured on other trials.
 Source: docs/certificate_tube.md.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
@@ -25,23 +24,27 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.levels import LevelKind, followed
 from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
-from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.funnels.level import CommandLevel
+from nlsid_core.funnels.tube import Cusum, Response, Tube, TubeFunnel
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import Rejected, increments
 from nlsid_core.kernel.files import Node, parse
 from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
 from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
 
 cp: Any = cvxpy  # its functions are not seen by type checkers
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
+MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
@@ -67,6 +70,7 @@ def design_output_tube(
     safety_factor: float = 1.5,
     horizon: float | None = None,
     box: Sequence[tuple[float, float]] | None = None,
+    level: LevelKind = "auto",
     profile: Sequence[tuple[float, float]] | None = None,
     inlet: float = 0.0,
     lqr_weights: tuple[float, float] | None = (1.0, 1.0),
@@ -83,14 +87,7 @@ def design_output_tube(
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
     K: FloatArray | None = None
     if profile is not None:
-        if not isinstance(model, DifferenceEquation):
-            raise DataError(
-                f"a profile is planned for a linear model, not for a {type(model).__name__}; "
-                "leave it out for a tube around the model's simulation"
-            )
-        K = np.zeros(len(model))
-        if lqr_weights is not None:
-            K = lqr_gain(model, output_weight=lqr_weights[0], input_weight=lqr_weights[1])
+        K, level = _gain(model, lqr_weights), "constant"
     form = _Form.of(model, bounds, K)
     samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
     amplitudes = np.maximum(
@@ -98,8 +95,50 @@ def design_output_tube(
     )
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
+
+    def tube_of(design: _Found, samples: int | None) -> Tube:
+        return Tube(
+            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
+            half_widths=1.0 / np.sqrt(0.99 * design.tau), level=1.0, measured=0.0,
+            safety_factor=safety_factor, designed_on=trials.designed_on,
+            measured_on=trials.measured_on, samples=samples,
+            inlet=inlet**2 / float(np.linalg.inv(design.P)[0, 0]) if inlet else 0.0,
+        )  # fmt: skip
+
+    def proved(
+        tubes: Sequence[Tube], found: Sequence[_Found],
+        response: Response | None = None, alarm: Cusum | None = None,
+    ) -> OutputTubeDesign:  # fmt: skip
+        funnel = TubeFunnel(
+            tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
+            y_box=y_box, u_box=u_box, response=response, cusum=alarm,
+        )  # fmt: skip
+        policy = None
+        if profile is not None and K is not None:
+            assert isinstance(model, DifferenceEquation)
+            duration = profile[-1][0] if horizon is None else horizon
+            at_rest, planned = track_profile(model, profile, round(duration / model.period))
+            policy = TubePolicy(
+                at_rest, planned, K=K, L=found[0].L[:, 0], period=model.period, model=funnel.model
+            )
+            funnel = replace(funnel, policy=files.digest(policy.document()))
+            refuse_unmonitorable(funnel)
+        trees = [design.multipliers for design in found]
+        proof: Json = {} if trees[0] is None else {"multipliers": trees}
+        return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
+
+    def decided(design: _Found) -> str:
+        """Why the kernel refuses the candidate, whatever its level; empty if it is proved."""
+        try:
+            tube = tube_of(design, 1 if design.rho == 1.0 else None)
+            wide = np.sqrt((1.0 + tube.rho * tube.inlet) / (0.99 * tube.tau))
+            proved([replace(tube, half_widths=wide)], [design])
+        except CertificateRejected as refusal:
+            return str(refusal)
+        return ""
+
     start = inlet / safety_factor
-    found = [_best(form, gains, e, amplitudes, samples, form.fading(), start)]
+    found = [_best(form, gains, e, amplitudes, samples, form.fading(), decided, start)]
     lasting: list[int | None] = [None]
     if horizon is not None:
         length = max(1, round(horizon / model.period))
@@ -111,39 +150,52 @@ def design_output_tube(
             )
         lasting.append(length)
         if profile is not None:  # the policy has one observer
-            gains, e = found[0].L[None], [part[:, found[0].at : found[0].at + 1] for part in e]
-        found.append(_best(form, gains, e, amplitudes, length, [1.0], start))
+            i = found[0].at
+            gains, e = found[0].L[None], [part[:, i : i + 1] for part in e]
+            found[0] = replace(found[0], at=0)
+        found.append(_best(form, gains, e, amplitudes, length, [1.0], decided, start))
+    u = [trial.u for trial in train]
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
-        tube = Tube(
-            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
-            half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
-            safety_factor=safety_factor, designed_on=trials.designed_on,
-            measured_on=trials.measured_on, samples=samples_left,
-            inlet=0.0 if profile is None else inlet**2 / float(np.linalg.inv(design.P)[0, 0]),
-        )  # fmt: skip
+        tube = tube_of(design, samples_left)
+        if level != "constant" and samples_left is None:
+            spent = [energy(part[:, design.at], tube)[:, None] for part in e]
+            tube = replace(tube, follows=_chosen(level, spent, u))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
-    funnel = TubeFunnel(
-        tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
-        y_box=y_box, u_box=u_box,
+    if profile is not None:  # what is assumed around a plan is what is held there
+        return proved(tubes, found)
+    errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
+    response = Response(
+        np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
+        None if level == "constant" else _chosen(level, [part**2 for part in errors], u),
     )  # fmt: skip
-    policy = None
-    if profile is not None:
-        assert isinstance(model, DifferenceEquation)
-        assert K is not None
-        duration = profile[-1][0] if horizon is None else horizon
-        at_rest, u = track_profile(model, profile, max(1, round(duration / model.period)))
-        L = found[0].L[:, 0]
-        policy = TubePolicy(at_rest, u, K=K, L=L, period=model.period, model=funnel.model)
-        funnel = replace(funnel, policy=files.digest(policy.document()))
-        refuse_unmonitorable(funnel)
-    trees = [design.multipliers for design in found]
-    proof: Json = {} if trees[0] is None else {"multipliers": trees}
-    try:
-        return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
-    except CertificateRejected as refusal:
-        less = "; try a larger input weight" if K is not None and K.any() else ""
-        raise Infeasible(f"no proved tube: {refusal}{less}") from refusal
+    calibrated = [
+        innovations(model, np.stack([np.zeros_like(found[0].L), found[0].L]), t, settling)
+        for t in trials.calibration
+    ]
+    response = _scaled_response(
+        response, errors, u,
+        [part[:, 0] for part in calibrated], [t.u for t in trials.calibration],
+    )  # fmt: skip
+    own = np.concatenate([part[:, found[0].at] for part in e])
+    deviation = np.maximum(own.std(axis=0), np.finfo(float).tiny)
+    threshold = max(
+        float(cusum(safety_factor * part[:, 1] / deviation).max()) for part in calibrated
+    )
+    alarm = Cusum(deviation, DRIFT, max(threshold, DRIFT))
+    return proved(tubes, found, response, alarm)
+
+
+def _gain(model: StableModel, weights: tuple[float, float] | None) -> FloatArray:
+    """K (n,) of the policy that tracks a plan; zeros without weights."""
+    if not isinstance(model, DifferenceEquation):
+        raise DataError(
+            f"a profile is planned for a linear model, not for a {type(model).__name__}; leave it "
+            "out for a tube around the model's simulation"
+        )
+    if weights is None:
+        return np.zeros(len(model))
+    return lqr_gain(model, output_weight=weights[0], input_weight=weights[1])
 
 
 def least_window(model: StableModel, train: Dataset, horizon: float | None = None) -> int:
@@ -159,12 +211,12 @@ def least_window(model: StableModel, train: Dataset, horizon: float | None = Non
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
     """The tube with its level and half-widths from these trials, rounded up."""
-    measured = max(
-        float(
-            energy(innovations(model, tube.L[None], t, settling)[:, 0], tube)[: tube.samples].max()
-        )
-        for t in calibration
-    )
+    measured = 0.0
+    for trial in calibration:
+        spent = energy(innovations(model, tube.L[None], trial, settling)[:, 0], tube)
+        if tube.follows is not None:
+            spent = spent / tube.follows.along(trial.u)[settling:, 0]
+        measured = max(measured, float(spent[: tube.samples].max()))
     measured = _above(max(measured, float(np.finfo(float).tiny)))
     level = _above(tube.safety_factor**2 * measured)
     widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
@@ -172,6 +224,38 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
         tube, measured=measured, level=level,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
     )  # fmt: skip
+
+
+def _chosen(
+    level: LevelKind, energies: Sequence[FloatArray], inputs: Sequence[FloatArray]
+) -> CommandLevel | None:
+    """The level that follows the commands, if it is asked for or narrower on these trials."""
+    return followed(energies, inputs, always=level == "commands")
+
+
+def _scaled_response(
+    response: Response,
+    design: Sequence[FloatArray],
+    design_inputs: Sequence[FloatArray],
+    calibration: Sequence[FloatArray],
+    calibration_inputs: Sequence[FloatArray],
+) -> Response:
+    """The response with half-widths from output errors (N, p): ratios of the design's, scaled on
+    the others by one number, so that one trial exceeds all of them with the probability of one.
+    """
+
+    def parts(errors: Sequence[FloatArray], inputs: Sequence[FloatArray]) -> FloatArray:
+        """(p,): the largest |o_j| / √g_j."""
+        found = []
+        for o, u in zip(errors, inputs, strict=True):
+            g = 1.0 if response.follows is None else response.follows.along(u)[len(u) - len(o) :]
+            found.append((np.abs(o) / np.sqrt(g)).max(axis=0))
+        return np.asarray(np.maximum(np.max(found, axis=0), np.finfo(float).tiny))
+
+    sizes, largest = parts(design, design_inputs), parts(calibration, calibration_inputs)
+    scale = response.safety_factor * float((largest / sizes).max())
+    widths = np.array([_rounded_up(_above(float(w))) for w in scale * sizes])
+    return replace(response, half_widths=widths, measured=_above(float((largest / widths).max())))
 
 
 def energy(e: FloatArray, tube: Tube) -> FloatArray:
@@ -379,15 +463,16 @@ def _best(
     amplitudes: FloatArray,
     samples: int,
     rhos: Sequence[float],
+    decided: Callable[[_Found], str],
     start: float = 0.0,
 ) -> _Found:
-    """The pair (L, ρ) whose proved forecast `samples` ahead is the narrowest.
+    """The pair (L, ρ) whose forecast `samples` ahead is the narrowest of those solved and proved.
 
     start: the first output's error there, in the unit in which the innovations are not scaled up.
-
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
-    the most that E can be `samples` after 0.
+    the most that E can be `samples` after 0. SOLVED are solved; while the kernel refuses all of
+    them (`decided` says why), as many more.
     """
     ranked = []
     for i, rho in product(range(len(gains)), rhos):
@@ -401,25 +486,31 @@ def _best(
         alpha = _forecast_budget([part[:, i] for part in e], R, rho, samples)
         alpha += rho * start**2 / float(W[0, 0])
         ranked.append((float(np.mean(np.sqrt(alpha * variance) / amplitudes)), i, rho))
-    tried: list[tuple[float, _Found]] = []
-    for _, i, rho in sorted(ranked)[:SOLVED]:
-        found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
-        if found is not None:
-            alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
-            alpha += rho * start**2 / float(np.linalg.inv(found.P)[0, 0])
-            width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
-            tried.append((width, replace(found, at=i)))
-    if not tried and len(form.modes) > 1:
+    ranked.sort()
+    refused = ""
+    for first in range(0, min(len(ranked), MOST), SOLVED):
+        tried: list[tuple[float, _Found]] = []
+        for _, i, rho in ranked[first : first + SOLVED]:
+            found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
+            if found is not None:
+                alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
+                alpha += rho * start**2 / float(np.linalg.inv(found.P)[0, 0])
+                width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
+                tried.append((width, replace(found, at=i)))
+        for _, found in sorted(tried, key=lambda entry: entry[0]):
+            refused = decided(found)
+            if not refused:
+                return found
+    if len(form.modes) > 1:
         raise Infeasible(
-            "no storage function serves both the played inputs and the policy; try a larger input "
-            "weight"
+            "no proved tube serves both the played inputs and the policy; try a larger input weight"
         )
-    if not tried:
-        raise Infeasible(
-            "no storage function bounds the output by the innovations: the increments are too "
-            "different over the model's range; give a smaller range of inputs or a smaller box"
-        )
-    return min(tried, key=lambda entry: entry[0])[1]
+    if refused:
+        raise Infeasible(f"no proved tube: {refused}")
+    raise Infeasible(
+        "no storage function bounds the output by the innovations: the increments are too "
+        "different over the model's range; give a smaller range of inputs or a smaller box"
+    )
 
 
 def _mean_gramian(

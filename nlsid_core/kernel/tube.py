@@ -24,6 +24,7 @@ from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
 from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
+from .levels import CommandLevel, formula, read_level
 from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**9
@@ -33,13 +34,17 @@ MAX_PLAN = 10**6  # samples of a plan
 
 @dataclass(frozen=True)
 class Assumption:
-    """E <= level, with what measured it. samples: None is for ever, else an energy's (ρ = 1)."""
+    """E <= level g, with what measured it. samples: None is for ever, else an energy's (ρ = 1).
+
+    follows: g, 1 if it is None.
+    """
 
     level: Fraction
     samples: int | None
     measured: Fraction
     safety_factor: Fraction
     measured_on: list[Recorded]
+    follows: CommandLevel | None
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,9 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     if documents["funnel"].kind() == "linear":
         raise Rejected("a funnel of kind 'linear' is now a tube: run `nlsid funnel` again")
     made_for = {role: digests[role] for role in roles.split()[:-1]}
+    beside = "box" if planned else "box response cusum"
     funnel = documents["funnel"].document(
-        "funnel", "settling tubes", "tube", optional="box", made_for=made_for
+        "funnel", "settling tubes", "tube", optional=beside, made_for=made_for
     )
     model = read_model(documents["model"], funnel.get("box"))
     policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None
@@ -96,6 +102,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     for tube, tree in zip(tubes, trees, strict=True):
         if policy and tube.L != policy.L:
             raise Rejected("the observer of a tube is not the policy's: L is another")
+        if policy and tube.assumed.follows:
+            raise Rejected("a level that follows the commands is for a tube without a policy")
         definite(tube.P, "P")
         definite(tube.R, "R")
         for mode, moved in _modes(model, policy):
@@ -115,6 +123,10 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
         assumptions.append(label + _assumption(model, tube, fitted))
+    if "response" in funnel:
+        assumptions += _response(model, funnel["response"], fitted)
+    if "cusum" in funnel:
+        _read_cusum(model, funnel["cusum"])
     return Decision(_statement(model, policy, tubes), margin, tuple(assumptions), digests)
 
 
@@ -150,23 +162,26 @@ def _forms(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
 
 def _read(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    parts = node.members("rho L P R tau half_widths level inlet assumption")
+    parts = node.members("rho L P R tau half_widths level inlet assumption", "follows")
     rho = parts["rho"].number()
     tube = Tube(
         rho=rho, L=parts["L"].array(n, p), P=parts["P"].array(n, n), R=parts["R"].array(p, p),
         tau=parts["tau"].array(p), half_widths=parts["half_widths"].array(p),
-        inlet=parts["inlet"].number(),
-        assumed=_read_assumption(parts["assumption"], parts["level"].number(), rho),
+        inlet=parts["inlet"].number(), assumed=_read_assumption(parts, rho, len(model.u)),
     )  # fmt: skip
     if min(tube.tau) <= 0 or min(tube.half_widths) <= 0:
         raise Rejected("tau and half-widths should be positive")
     if tube.inlet < 0:
         raise Rejected("the inlet should be 0 or more")
+    if tube.assumed.follows is not None and (rho == 1 or tube.inlet):
+        raise Rejected("a level that follows the commands is for fading, without an inlet")
     return tube
 
 
-def _read_assumption(node: Node, level: Fraction, rho: Fraction) -> Assumption:
-    given = node.members("kind measured safety_factor designed_on measured_on", "samples")
+def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assumption:
+    """level, assumption and follows of a tube's members."""
+    names = "kind measured safety_factor designed_on measured_on"
+    given = parts["assumption"].members(names, "samples")
     kind = given["kind"].text()
     if kind not in ("fading", "energy"):
         raise Rejected(f"assumption {kind!r} is unknown; known: fading, energy")
@@ -175,11 +190,12 @@ def _read_assumption(node: Node, level: Fraction, rho: Fraction) -> Assumption:
     if not 0 < rho <= 1 or (kind == "energy") != (rho == 1):
         raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
     assumed = Assumption(
-        level=level,
+        level=parts["level"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
         measured=given["measured"].number(),
         safety_factor=given["safety_factor"].number(),
         measured_on=read_trials(given["measured_on"]),
+        follows=read_level(parts["follows"], inputs, 1) if "follows" in parts else None,
     )
     if assumed.measured < 0 or assumed.safety_factor < 1:
         raise Rejected("measured should be 0 or more, the safety factor 1 or more")
@@ -188,7 +204,7 @@ def _read_assumption(node: Node, level: Fraction, rho: Fraction) -> Assumption:
     if shared(assumed.measured_on, read_trials(given["designed_on"])):
         raise Rejected("a trial that the tube was designed on cannot measure its assumption")
     least = assumed.safety_factor**2 * assumed.measured
-    at_most(least, level, "the level is below safety_factor^2 x measured")
+    at_most(least, assumed.level, "the level is below safety_factor^2 x measured")
     return assumed
 
 
@@ -209,11 +225,49 @@ def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
     return Policy(plan["K"].array(len(model.u), n), plan["L"].array(n, p), len(u))
 
 
+def _response(model: Model, node: Node, fitted_to: list[Recorded] | None) -> list[str]:
+    """What is assumed of the output error itself, one line for each output."""
+    p = len(model.y)
+    parts = node.members("half_widths assumption", "follows")
+    widths = parts["half_widths"].array(p)
+    given = parts["assumption"].members("measured safety_factor designed_on measured_on")
+    follows = read_level(parts["follows"], len(model.u), p) if "follows" in parts else None
+    measured, factor = given["measured"].number(), given["safety_factor"].number()
+    measured_on = read_trials(given["measured_on"])
+    if min(widths) <= 0 or measured < 0 or factor < 1:
+        raise Rejected("a response's half-widths should be positive, its safety factor 1 or more")
+    if not measured_on:
+        raise Rejected("the response was measured on no trial")
+    if shared(measured_on, read_trials(given["designed_on"])):
+        raise Rejected("a trial that the response's level was chosen on cannot measure it")
+    at_most(factor * measured, 1, "the response is below safety_factor x measured")
+    worth = calibration(measured, factor, measured_on, fitted_to)
+    said = []
+    for j, (signal, width) in enumerate(zip(model.y, widths, strict=True)):
+        bound = signal.quantity(text.below(width))
+        g = ""
+        if follows is not None:
+            bound, g = f"({bound} sqrt(g))", f", g = {formula(follows, j, model.u)}"
+        said.append(
+            f"output error: |{signal.name} - simulated| / {bound} <= 1 at every sample{g} ({worth})"
+        )
+    return said
+
+
+def _read_cusum(model: Model, node: Node) -> None:
+    """An alarm that no claim rests on: it only has to make sense."""
+    parts = node.members("deviation drift threshold")
+    least = min(*parts["deviation"].array(len(model.y)), parts["threshold"].number())
+    if least <= 0 or parts["drift"].number() < 0:
+        raise Rejected("cusum: deviation and threshold should be positive, drift 0 or more")
+
+
 def _statement(model: Model, policy: Policy | None, tubes: list[Tube]) -> str:
     said = []
     for i, tube in enumerate(tubes, 1):
         widths = " and ".join(
             f"{signal.name} within {signal.quantity(text.above(width))}"
+            + (" sqrt(g)" if tube.assumed.follows else "")
             for signal, width in zip(model.y, tube.half_widths, strict=True)
         )
         how_long = "for ever"
@@ -276,7 +330,11 @@ def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> s
         unit = f"({model.y[0].unit})^2" if model.y[0].unit and tube.R == [[1]] else ""
         energy = "e^2" if tube.R == [[1]] else f"{text.exact(tube.R[0][0])} e^2"
     level = Signal("", unit).quantity(text.below(assumed.level))
-    bound = f"E <= {level} after every sample, E+ = {text.exact(tube.rho)} E + {energy} from 0"
+    growth = f"E+ = {text.exact(tube.rho)} E + {energy} from 0"
+    bound = f"E <= {level} after every sample, {growth}"
+    if assumed.follows is not None:
+        g = formula(assumed.follows, 0, model.u)
+        bound = f"E <= {level} g after every sample, {growth}, g = {g}"
     if assumed.samples is not None:
         bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
     worth = calibration(assumed.measured, assumed.safety_factor, assumed.measured_on, fitted_to)

@@ -15,7 +15,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, apart
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.factor import refuse_unmonitorable
+from nlsid_core.funnels.factor import UNIT, refuse_unmonitorable
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
@@ -26,7 +26,7 @@ from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.assumption import meter_of
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Level
-from nlsid_core.running.tubes import Stacked, assuming
+from nlsid_core.running.tubes import ROUNDING, assuming
 
 COMMAND_TOLERANCE = 1e-9  # relative: rounding between computing a policy's input and recording it
 
@@ -89,8 +89,8 @@ class Comparison(Protocol):
 class PlanComparison:
     """A linear model's output beside the plans of m policies, each with its funnel of tubes.
 
-    Every tube has an observer x̂. Ten funnels cost little more than one; each funnel's numbers are
-    the same bit for bit alone or stacked.
+    A policy has one observer x̂, and so have the tubes beside it. Each funnel's numbers are the same
+    bit for bit alone or with others.
     """
 
     def __init__(
@@ -101,22 +101,18 @@ class PlanComparison:
     ) -> None:
         if any(policy.period != model.period for policy in policies):
             raise CertificateMismatch("the policy has another sample time than the model")
+        if any(tube.follows is not None for funnel in funnels for tube in funnel.tubes):
+            raise CertificateMismatch("around a plan no level follows the commands")
         for funnel in funnels:
             refuse_unmonitorable(funnel)
         self.model, self._funnels = model, tuple(funnels)
         self.period, self.lags = model.period, len(model)
-        plans = [policy.plan(model) for policy in policies]
+        self._plans = [policy.plan(model) for policy in policies]
         self.last = [
-            min(plan.last, funnel.last) for plan, funnel in zip(plans, funnels, strict=True)
+            min(plan.last, funnel.last) for plan, funnel in zip(self._plans, funnels, strict=True)
         ]
-        self._tubes = Stacked(funnels)
-        longest = max(map(len, plans))
-        of = self._tubes.owner  # of each tube, its funnel's number
-        self._x_plan = np.array([_held(plan.x, longest) for plan in plans])[of]
-        self._u_plan = np.array([_held(plan.policy.u, longest) for plan in plans])[of]
-        self._y_plan = np.array([_held(plan.y, longest) for plan in plans])
-        self._K = np.array([policy.K for policy in policies])[of]
         self._step = np.vstack([model.A.T, model.B.T, model.offset])  # of a row [x̂, u, 1]
+        self._D, self._c = model.D, model.c
         self.assuming = [assuming(funnel.tubes) for funnel in funnels]
         self.over = [f"{last + 1:g} samples" for last in self.last]
         self.restart()
@@ -125,7 +121,7 @@ class PlanComparison:
         """A new run."""
         self._y_lags: list[float] = []
         self._u_lags: list[float] = []
-        self._spent: FloatArray = np.zeros(len(self._tubes.owner))
+        self._spent = [[0.0] * len(funnel.tubes) for funnel in self._funnels]
 
     def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
         """Numbers as they are."""
@@ -150,48 +146,55 @@ class PlanComparison:
         if len(self._y_lags) < len(self.model):
             return None
         x = self.model.state_after(self._y_lags, self._u_lags)
-        self._x = np.tile(x, (len(self._tubes.owner), 1))
+        self._x = [x] * len(self._funnels)
         broken = []
-        for i, funnel in enumerate(self._funnels):
-            size = funnel.start_size(x - self._x_plan[self._tubes.first[i], 0])
+        for plan, funnel in zip(self._plans, self._funnels, strict=True):
+            size = funnel.start_size(x - plan.x[0])
             far = f"started outside the inlet: {size:.3g} times as far out as its boundary"
             broken.append("" if size <= 1.0 else far)
         return broken
 
     def compare(self, when: float, t: float, y: float, u: float) -> Compared:
         """Sample k = `when` against the tubes, then every x̂ one sample on."""
-        k, model, tubes = int(when), self.model, self._tubes
-        e = (y - (self._x[:, 0] + (model.D * u + model.c)))[:, None]
-        self._spent = tubes.spent(self._spent, e)
-        planned = self._y_plan[:, k]
-        away = (y - planned)[tubes.owner][:, None]
-        judged = tubes.judged(k + 1, away, self._spent)
-        # One row at a time, so that no number depends on how many there are.
-        known = np.array([u, 1.0])
-        meant = self._u_plan[:, k] - (self._K * (self._x - self._x_plan[:, k])).sum(axis=1)
-        self._x = np.array([np.append(x, known) @ self._step for x in self._x])
-        self._x += tubes.L[:, :, 0] * e
-        broken = [
-            self._broken(k, t, u, used, most, float(meant[most])) for _, used, most, _ in judged
-        ]
-        return Compared(
-            [funnel.size for funnel in judged],
-            [funnel.used for funnel in judged],
-            [model.y.name] * len(judged),
-            broken,
-            [(centre,) for centre in planned.tolist()],
-            [[y - centre, float(e[j, 0])]
-             for centre, j in zip(planned.tolist(), tubes.first, strict=True)],
-        )  # fmt: skip
+        k, known = int(when), np.array([u, 1.0])
+        found = Compared([], [], [], [], [], [])
+        for i, plan in enumerate(self._plans):
+            x = self._x[i]
+            e = y - (float(x[0]) + self._D * u + self._c)
+            planned = float(plan.y[min(k, len(plan) - 1)])
+            size, used, most = self._held(i, k, y - planned, e)
+            found.sizes.append(size)
+            found.used.append(used)
+            found.worst.append(self.model.y.name)
+            found.broken.append(self._broken(k, t, u, i, used, most) if k <= plan.last else "")
+            found.nominal.append((planned,))
+            found.deviation.append([y - planned, e])
+            self._x[i] = np.append(x, known) @ self._step + plan.policy.L * e
+        return found
 
-    def _broken(self, k: int, t: float, u: float, used: float, most: int, meant: float) -> str:
-        """How the assumption is broken at this sample; most: the tube of which `used` is."""
-        lowest, highest = self.model.u_range
-        planned = float(self._u_plan[most, k])
+    def _held(self, i: int, k: int, away: float, e: float) -> tuple[float, float, int]:
+        """|o| in half-widths, the part of a level used and whose: the most of funnel i's tubes."""
+        size, used, most, spent = 0.0, 0.0, 0, self._spent[i]
+        for j, tube in enumerate(self._funnels[i].tubes):
+            spent[j] = (tube.rho * spent[j] + tube.R[0, 0] * e * e) * (1.0 + 8.0 * UNIT)
+            if tube.samples is not None and k >= tube.samples:
+                continue
+            size = max(size, abs(away) / (float(tube.half_widths[0]) * (1.0 - ROUNDING)))
+            part = spent[j] / (tube.level * (1.0 - ROUNDING))
+            if not part <= used:
+                used, most = part, j
+        return size, used, most
+
+    def _broken(self, k: int, t: float, u: float, i: int, used: float, most: int) -> str:
+        """How funnel i's assumption is broken at this sample; most: the tube of which `used` is."""
+        plan, (lowest, highest) = self._plans[i], self.model.u_range
+        planned, meant = float(plan.planned[k]), plan(k, self._x[i])
         low, high = min(planned, meant), max(planned, meant)
         room = COMMAND_TOLERANCE * (1.0 + abs(meant))
         if not used <= 1.0:
-            return self._tubes.excess(most, self._spent, t)
+            level = self._funnels[i].tubes[most].level
+            spent = self._spent[i][most]
+            return f"innovation energy {spent:.4g} above the level {level:.4g} at t = {t:g} s"
         if not lowest <= u <= highest:
             told = apart(u, lowest, highest)
             return f"{self.model.u.name} {told[0]} outside the fitted range [{told[1]}, {told[2]}]"
@@ -395,8 +398,3 @@ def not_the_policys(t: float, u: FloatArray, wanted: FloatArray, names: Sequence
         return ""
     i = int(np.argmax(apart))
     return f"{names[i]} {u[i]:.6g} is not the policy's {wanted[i]:.6g} at t = {t:g} s"
-
-
-def _held(plan: FloatArray, length: int) -> FloatArray:
-    """`plan` cut to `length` samples, or with its last one repeated."""
-    return plan[np.minimum(np.arange(length), len(plan) - 1)]

@@ -3,7 +3,9 @@
 Each tube has an observer, x̂⁺ = f(x̂, w) + L e, and a number, E⁺ = ρE + e'Re; the simulation x⁺ =
 f(x, w) is common to them. A sample without a measurement is a step with e = 0, and nothing is said
 of it. The simulation needs every input: where one is not known, as of a sample that never came, is
-refused by the model or leaves the box, a new run starts. Source: docs/certificate_tube.md.
+refused by the model or leaves the box, a new run starts. A level that follows the commands is a few
+more numbers of state. Beside the tubes there may be an assumption about the output error itself,
+and CUSUM of the innovation, an alarm that nothing rests on. Source: docs/certificate_tube.md.
 """
 
 import math
@@ -16,8 +18,10 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.factor import UNIT
+from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
+from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.grid import TOLERANCE
 from nlsid_core.running.reading import Level, Reading, Status
 from nlsid_core.running.stepping import Stepper
@@ -25,90 +29,8 @@ from nlsid_core.running.stepping import Stepper
 TREND = 10  # samples over which the margin's fall is taken
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
+TINY = float(np.finfo(float).tiny)  # of a level that no command opens
 STARTING = "waiting for the first"
-
-
-def assuming(tubes: Sequence[Tube]) -> str:
-    """What they assume, in letters."""
-    return "; ".join(tube.assumption for tube in tubes)
-
-
-class Judged(NamedTuple):
-    """One funnel at one sample, over its tubes that still last; NaN where none does.
-
-    size: the largest |o_j| in half-widths, worst: that j. used: the largest part of a level, most:
-    whose.
-    """
-
-    size: float
-    used: float
-    most: int
-    worst: int
-
-
-class Stacked:
-    """The T tubes of m funnels of one model: their numbers, rounded so that no bound is missed.
-
-    owner: of each tube, its funnel's number; first: of each funnel, its first tube's.
-    """
-
-    def __init__(self, funnels: Sequence[TubeFunnel]) -> None:
-        tubes = [tube for funnel in funnels for tube in funnel.tubes]
-        self.owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
-        self.first = [self.owner.index(i) for i in range(len(funnels))]
-        p = len(tubes[0].R)
-        # Products and sums are rounded up, so that E is never below its exact value.
-        self.rho: FloatArray = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
-        self._R = np.array([tube.R for tube in tubes])
-        spread = max(
-            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
-        )
-        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
-        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
-        self.L: FloatArray = np.array([tube.L for tube in tubes])
-        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
-        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
-        self.samples = [tube.samples for tube in tubes]
-        self._rows = [
-            np.flatnonzero(np.array(self.owner) == i).tolist() for i in range(len(funnels))
-        ]
-
-    def spent(self, before: FloatArray, e: FloatArray) -> FloatArray:
-        """E⁺ = ρE + e'Re of innovations e (T, p): (T,), never below its exact value."""
-        if self._single_R is not None:
-            return np.asarray(self.rho * before + self._single_R * (e[:, 0] * e[:, 0]))
-        used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
-        return np.asarray(self.rho * before + used)
-
-    def injected(self, e: FloatArray) -> FloatArray:
-        """L e, (T, n)."""
-        if self._single_R is not None:
-            return np.asarray(self.L[:, :, 0] * e)
-        return np.asarray(np.einsum("tnp,tp->tn", self.L, e))
-
-    def left(self, deviation: FloatArray) -> bool:
-        """Whether an output is shown to have left a half-width."""
-        return bool((np.abs(deviation) / self._widths > 1.0).any())
-
-    def judged(self, count: int, deviation: FloatArray, spent: FloatArray) -> list[Judged]:
-        """Of each funnel after `count` samples. deviation: o (T, p), or (p,) if all have one."""
-        sizes, parts = np.abs(deviation) / self._widths, (spent / self._level).tolist()
-        found = []
-        for rows in self._rows:
-            lasting = [j for j in rows if (self.samples[j] or math.inf) >= count]
-            if not lasting:
-                found.append(Judged(math.nan, math.nan, rows[0], 0))
-                continue
-            place = int(sizes[lasting].argmax())
-            most = max(lasting, key=parts.__getitem__)
-            size = float(sizes[lasting].flat[place])
-            found.append(Judged(size, parts[most], most, place % sizes.shape[1]))
-        return found
-
-    def excess(self, j: int, spent: FloatArray, t: float) -> str:
-        """How tube j's assumption is broken at t (s)."""
-        level = self._level[j] / (1.0 - ROUNDING)
-        return f"innovation energy {spent[j]:.4g} above the level {level:.4g} at t = {t:g} s"
 
 
 class TubeRun:
@@ -124,11 +46,38 @@ class TubeRun:
             raise DataError("the funnels start after different numbers of samples")
         if self.lags < self._stepper.lags:
             raise DataError(f"a run of this model starts after {self._stepper.lags} samples")
-        self._tubes = Stacked(funnels)
-        self._count = len(funnels)
+        self._funnels = tuple(funnels)
+        tubes = [tube for funnel in funnels for tube in funnel.tubes]
+        self._tubes = tubes
+        self._owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
         p, n = len(self._stepper.y), self._stepper.order
-        if any(tube.L.shape != (n, p) for funnel in funnels for tube in funnel.tubes):
+        if any(tube.L.shape != (n, p) for tube in tubes):
             raise DataError("the funnel is not one of this model")
+        # Products and sums are rounded up, so that E is never below its exact value.
+        self._rho = np.array([tube.rho for tube in tubes]) * (1.0 + 8.0 * UNIT)
+        self._R = np.array([tube.R for tube in tubes])
+        spread = max(
+            np.linalg.norm(np.abs(R), 2) * np.linalg.norm(np.linalg.inv(R), 2) for R in self._R
+        )
+        self._up = 1.0 + 8.0 * (p * p + 4) * UNIT * float(spread)
+        self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
+        self._L = np.array([tube.L for tube in tubes])
+        self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
+        self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
+        self._samples = [tube.samples for tube in tubes]
+        follow: dict[int, CommandLevel] = {
+            j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
+        }
+        self._responses = [funnel.response for funnel in funnels]
+        for i, response in enumerate(self._responses):
+            if response is not None and len(response.half_widths) != p:
+                raise DataError("the funnel's response is not one of this model")
+            if response is not None and response.follows is not None:
+                follow[len(tubes) + i] = response.follows
+        if any(level.inputs > len(self._stepper.u) for level in follow.values()):
+            raise DataError("the funnel's level follows inputs that the model does not have")
+        self._follow = follow
+        self._cusums = [funnel.cusum for funnel in funnels]
         self._names = [signal.name for signal in self._stepper.y]
         boxed = [f for f in funnels if f.y_box is not None and f.u_box is not None]
         self._boxes = [
@@ -147,11 +96,12 @@ class TubeRun:
         """Collect a start again; the grid of time goes on."""
         self._start: list[tuple[FloatArray, FloatArray]] = []
         self._x: FloatArray | None = None
-        self._spent: FloatArray = np.zeros(len(self._tubes.owner))
+        self._spent = np.zeros(len(self._tubes))
         self._k = 0
-        self._fall: list[deque[tuple[float, float]]] = [
-            deque(maxlen=TREND) for _ in range(self._count)
-        ]
+        self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
+        self._g: dict[int, list[float]] = {}
+        self._sums = [CusumMeter(len(self._names), c.drift) if c else None for c in self._cusums]
+        self._fall: list[deque[tuple[float, float]]] = [deque(maxlen=TREND) for _ in self._funnels]
 
     def readings(self, t: float, y: Any, u: Any) -> list[Reading]:
         """What is said of the sample at t (s): outputs y (p,) and inputs u (n_u,), or numbers.
@@ -222,8 +172,8 @@ class TubeRun:
         if refused:
             self._begin()
             return refused
-        self._x, self._k = after, self._k + 1
-        self._spent = self._tubes.rho * self._spent
+        self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
+        self._follow_command(u)
         return ""
 
     def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
@@ -233,9 +183,10 @@ class TubeRun:
                 t, y, f"outside the box in which the tube is proved, at t = {t:g} s"
             )
         self._start.append((y, u))
+        self._follow_command(u)
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
-            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes.owner) + 1, 1))
+            self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))
             self._start = []
         return self._unknown(t, y, f"{STARTING} {self.lags} samples")
 
@@ -257,6 +208,12 @@ class TubeRun:
                 return outputs, after, "outside the box in which the tube is proved"
         return outputs, after, ""
 
+    def _follow_command(self, u: FloatArray) -> None:
+        """The levels at the sample whose inputs are u (n_u,)."""
+        if self._meters:
+            now = u.tolist()
+            self._g = {j: meter.update(now) for j, meter in self._meters.items()}
+
     def _judge(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
         outputs, after, refused = self._advance(u)
         if refused:
@@ -265,44 +222,124 @@ class TubeRun:
         e = y - outputs[:-1]
         simulated = outputs[-1]
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
-            self._spent = self._tubes.spent(self._spent, e)
-            after[:-1] += self._tubes.injected(e)
+            if self._single_R is not None:
+                used = self._single_R * (e[:, 0] * e[:, 0])
+                after[:-1] += self._L[:, :, 0] * e
+            else:
+                used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
+                after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
+            self._spent = self._rho * self._spent + used
         self._x, self._k = after, self._k + 1
+        self._follow_command(u)
         deviation = y - simulated
+        level, widths = self._followed() if self._follow else (self._level, self._widths)
+        sizes = np.abs(deviation) / widths
+        with np.errstate(over="ignore"):
+            spent = self._spent / level
         if not (np.isfinite(self._spent).all() and np.isfinite(after).all()):
             self._begin()
             reason = f"the model's state is not finite at t = {t:g} s"
-            if np.isfinite(simulated).all() and self._tubes.left(deviation):
+            if np.isfinite(simulated).all() and (sizes > 1.0).any():
                 away = Reading(
                     t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),
                     level=Level.NONE, reason=f"outside the tube; {reason}",
                 )  # fmt: skip
-                return [away] * self._count
+                return [away] * len(self._funnels)
             return self._unknown(t, y, reason)
         measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
         away, innovations = deviation.tolist(), e.tolist()
-        said = []
-        judged = self._tubes.judged(self._k, deviation, self._spent)
-        for i, (size, used, most, worst) in enumerate(judged):
-            if math.isnan(used):
-                over = f"the proof covers {self._tubes.samples[most]} samples; they are over"
-                said.append(Reading(t, Status.UNKNOWN, measured=measured, reason=over))
-                continue
-            margin = 1.0 - size
-            status, reason = Status.INSIDE, ""
-            if not used <= 1.0:
-                status = Status.ASSUMPTION_VIOLATED
-                reason = self._tubes.excess(most, self._spent, t)
-            if not size <= 1.0:
-                status = Status.OUTSIDE
-                kept = "although the assumption was kept: what runs is not what was proved"
-                reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
-            said.append(Reading(
-                t, status, margin, used, self._exit(i, t, margin), self._names[worst],
-                nominal, measured, Level.TUBE if size <= 1.0 else Level.NONE, reason,
-                self._assuming[i], away + innovations[self._tubes.first[i]],
-            ))  # fmt: skip
-        return said
+        judged = _Judged(t, sizes, spent.tolist(), level, widths, nominal, measured, away)
+        return [
+            self._reading(i, judged, innovations[self._owner.index(i)])
+            for i in range(len(self._funnels))
+        ]
+
+    def _followed(self) -> tuple[FloatArray, FloatArray]:
+        """Levels (tubes,) and half-widths (tubes, p) at this sample."""
+        level, widths = self._level.copy(), self._widths.copy()
+        for j, g in self._g.items():
+            if j < len(level):
+                level[j] *= g[0]
+                widths[j] *= math.sqrt(g[0])
+        return np.maximum(level, TINY), np.maximum(widths, TINY)
+
+    def _response(self, i: int, away: list[float]) -> tuple[float, str]:
+        """The most of what is assumed of funnel i's output error that is used, and of which."""
+        response = self._responses[i]
+        if response is None:
+            return 0.0, ""
+        used, worst = 0.0, 0
+        g = self._g.get(len(self._tubes) + i)
+        for j, (error, width) in enumerate(zip(away, response.half_widths.tolist(), strict=True)):
+            bound = max(width * (1.0 if g is None else math.sqrt(g[j])), TINY) * (1.0 - ROUNDING)
+            part = abs(error) / bound
+            if not part <= used:
+                used, worst = part, j
+        if used <= 1.0:
+            return used * used, ""
+        return used * used, (
+            f"{self._names[worst]} {abs(away[worst]):.4g} from the simulation, above "
+            f"{abs(away[worst]) / used:.4g}, which is assumed"
+        )
+
+    def _alarm(self, i: int, innovation: list[float]) -> str:
+        """What CUSUM says of funnel i's first observer; empty if it does not alarm."""
+        cusum, sums = self._cusums[i], self._sums[i]
+        if cusum is None or sums is None:
+            return ""
+        z = [e / size for e, size in zip(innovation, cusum.deviation.tolist(), strict=True)]
+        reached = sums.update(z)
+        if reached <= cusum.threshold:
+            return ""
+        return (
+            f"cusum alarm: the innovations add up to {reached:.4g} standard deviations on one "
+            f"side, above {cusum.threshold:.4g}; nothing is proved of this"
+        )
+
+    def _reading(self, i: int, judged: "_Judged", innovation: list[float]) -> Reading:
+        """Of funnel i: the narrowest margin and the most that is used over the tubes that last.
+
+        innovation: of the funnel's first observer.
+        """
+        t, sizes, spent, level, widths, nominal, measured, away = judged
+        alarm = self._alarm(i, innovation)
+        lasting = [
+            j for j, owner in enumerate(self._owner)
+            if owner == i and (self._samples[j] is None or self._k <= (self._samples[j] or 0))
+        ]  # fmt: skip
+        if not lasting:
+            tube = self._tubes[self._owner.index(i)]
+            return Reading(
+                t, Status.UNKNOWN, measured=measured,
+                reason=f"the proof covers {tube.samples} samples; they are over", alarm=alarm,
+            )  # fmt: skip
+        rows = sizes[lasting]
+        place = int(rows.argmax())
+        size = float(rows.flat[place])
+        margin = 1.0 - size
+        most = max(lasting, key=spent.__getitem__)
+        response, exceeded = self._response(i, away)
+        reason = ""
+        status = Status.INSIDE
+        if not spent[most] <= 1.0:
+            status = Status.ASSUMPTION_VIOLATED
+            reason = (
+                f"innovation energy {self._spent[most]:.4g} above the level "
+                f"{level[most]:.4g} at t = {t:g} s"
+            )
+        elif exceeded:
+            status, reason = Status.ASSUMPTION_VIOLATED, f"{exceeded}, at t = {t:g} s"
+        if not size <= 1.0:
+            status = Status.OUTSIDE
+            kept = "although the assumption was kept: what runs is not what was proved"
+            reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+        return Reading(
+            t, status, margin, max(spent[most], response), self._exit(i, t, margin),
+            self._names[place % rows.shape[1]], nominal, measured,
+            Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i],
+            away + innovation, alarm,
+            tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
+        )  # fmt: skip
 
     def _exit(self, i: int, t: float, margin: float) -> float:
         """S until the margin is 0 if it goes on falling as over the last samples."""
@@ -314,4 +351,25 @@ class TubeRun:
 
     def _unknown(self, t: float, y: FloatArray, reason: str) -> list[Reading]:
         measured = tuple(y.tolist())
-        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * self._count
+        return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * len(self._funnels)
+
+
+class _Judged(NamedTuple):
+    """One sample against all tubes. sizes, widths: (tubes, p); spent, level: of each tube.
+
+    away: the output error.
+    """
+
+    t: float
+    sizes: FloatArray
+    spent: list[float]
+    level: FloatArray
+    widths: FloatArray
+    nominal: tuple[float, ...]
+    measured: tuple[float, ...]
+    away: list[float]
+
+
+def assuming(tubes: Sequence[Tube]) -> str:
+    """What they assume, in letters."""
+    return "; ".join(tube.assumption for tube in tubes)
