@@ -40,7 +40,7 @@ graph of the running processes against it. `~` is the node's name; every name ca
 node put in a namespace. Topics in *italics* are named by the funnel's model or by a parameter; here
 they are the F1TENTH car's. All nodes also have the services of a
 [lifecycle node](https://design.ros2.org/articles/node_lifecycle.html). A parameter is read when the
-node is made; those marked • can be changed while it runs. The words are explained
+node is configured; those marked • can be changed while it runs. The words are explained
 in the [glossary](glossary.md).
 """
 PATIENCE = 20.0  # s for the nodes to find each other

@@ -186,7 +186,8 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
         assert ask("funnel_monitor", "stale_after", 0.5) == ""
         assert "stale_after" in ask("funnel_monitor", "stale_after", -1.0)
         assert "warning_margin" in ask("funnel_monitor", "warning_margin", 1.5)
-        assert "read-only" in ask("funnel_monitor", "nominal", "profile")
+        refused = ask("funnel_monitor", "nominal", "profile")
+        assert refused == "nominal: read when the node is configured"
         assert ask("tracking_controller", "highest", 0.3) == ""
         assert ask("tracking_controller", "highest", 1) == "", "a whole number is a number"
         assert "is not a number" in ask("tracking_controller", "highest", "much")

@@ -201,8 +201,6 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
     def robot(name: str, push: float) -> list[str]:
         return [
             f"namespace:=/{name}",
-            f"odom:=/{name}/odom",
-            f"cmd_vel:=/{name}/cmd_vel",
             f"funnel:={funnel}",
             f"model:={funnel.with_name(documents.MODEL)}",
             "plant:=true",
