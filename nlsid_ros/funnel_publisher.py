@@ -47,12 +47,14 @@ class FunnelPublisher(ManagedNode):
         self._frame = declare_text(self, "frame", "map", "frame the tube is drawn in")
         self._watch = bool(declare(self, "watch", True, "publish again when the files change"))
         self._latched: dict[str, Publisher] = {}
+        self._check: Check | None = None
 
     def tune(self, values: Mapping[str, Any]) -> None:
         """Publish another funnel, if it is proved."""
         path = Path(values["funnel"])
         if self._latched:
             self._publish(self._load(path))
+            self._call_off()
         self._path, self._seen = path, self._files(path)
 
     def start(self) -> None:
@@ -66,7 +68,6 @@ class FunnelPublisher(ManagedNode):
                 ("nominal", JointTrajectory),
             )
         }
-        self._check: Check | None = None
         self._seen = self._files(self._path)
         self._publish(self._load(self._path))
         wall = Clock(clock_type=ClockType.STEADY_TIME)
