@@ -4,6 +4,7 @@ A command imports what it runs when it is called: `nlsid check` needs no NumPy, 
 """
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +19,9 @@ from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
 from nlsid_core.errors import NlsidError
+
+# The matrices of a search are small: threads for them wait for each other, ten times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="nlsid",
