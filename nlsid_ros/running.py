@@ -45,6 +45,14 @@ class Declared(NamedTuple):
     tunable: bool
 
 
+class PlainNode(Node):
+    """A node without a lifecycle, which remembers what it declared."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.declared: list[Declared] = []
+
+
 class ManagedNode(LifecycleNode):
     """A node with ROS 2's lifecycle: parameters and `prepare` when it is configured, `start` on
     activation, `stop` after.
@@ -313,7 +321,7 @@ def declare(
         given = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
-    if isinstance(node, ManagedNode):
+    if isinstance(node, ManagedNode | PlainNode):
         node.declared.append(declared)
     return _as_meant(declared, given)
 

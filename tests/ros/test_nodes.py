@@ -104,7 +104,7 @@ def test_the_graph_of_the_running_processes_is_the_documented_one(tmp_path: Path
         spin_until(lambda: set(names) <= set(node.get_node_names()))
         for name in names:
             expected = documented(name)
-            assert len(expected) >= 3
+            assert len(expected) >= (2 if name == "viewer" else 3), "it hears two topics"
             try:
                 spin_until(lambda n=name, e=expected: running(node, n) == e)  # type: ignore[misc]
             except AssertionError:
@@ -119,6 +119,7 @@ EACH: dict[str, dict[str, object]] = {
     "tracking_controller": {"highest": 0.4},
     "funnel_monitor": {},
     "plant": {"kind": "pendulum"},
+    "viewer": {"page": True, "port": 18_080},
 }
 
 
