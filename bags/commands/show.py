@@ -178,6 +178,8 @@ def _output_tubes(design: OutputTubeDesign) -> Table:
             f"{text.above(Fraction(width))} {signal.unit} of {signal.name}"
             for width, signal in widths
         )
+        if tube.follows is not None:
+            said += " on average, wider and narrower as the commands go: times sqrt(g)"
         table.add_row("half-width", f"{said}, {lasting}")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
@@ -206,7 +208,7 @@ def catching_table(catching: Catching) -> Table:
     detectors = list(catching.rows[0].others)
     plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trial{plural}, and how soon (median)",
+        title=f"caught of {catching.trials} held-back trial{plural}, and after how many s (median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
@@ -215,14 +217,15 @@ def catching_table(catching: Catching) -> Table:
         padding=0,  # 79 columns in all
     )
     table.add_column("fault", no_wrap=True)
-    for name in ("outside", "violated", "unknown", "after", *detectors):
+    for name in ("outside", "violated", "alarm", "unknown", "after", *detectors):
         table.add_column(name, justify="right")
     for row in catching.rows:
         if row.refused:  # the reason is said below the table
-            table.add_row(row.fault, *["-"] * (4 + len(detectors)))
+            table.add_row(row.fault, *["-"] * (5 + len(detectors)))
             continue
         funnel = row.funnel
-        counts = [str(funnel.outside), str(funnel.violated), str(funnel.unjudged)]
+        parts = (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
+        counts = [str(count) for count in parts]
         others = [_soon(row.others[name]) for name in detectors]
         least = max((other.count for other in row.others.values()), default=0)
         style = "dark_orange3" if least > funnel.count else ""
@@ -231,14 +234,15 @@ def catching_table(catching: Catching) -> Table:
 
 
 CATCHING_CAPTION = (
-    "outside and violated (what is assumed) are both caught; unknown: not judged to the end. "
+    "outside, violated (what is assumed) and alarm (only the monitor's own CUSUM, of which nothing "
+    "is proved) are all caught; unknown: not judged to the end. "
     "The others have the funnel's safety factor and calibration trials, and no more false alarms "
     "(untouched). Coloured: one of them catches more."
 )
 
 
 def _after(caught: Caught) -> str:
-    return "-" if math.isnan(caught.after) else f"{caught.after:.2f} s"
+    return "-" if math.isnan(caught.after) else f"{caught.after:.2f}"
 
 
 def _soon(caught: Caught) -> str:
