@@ -94,9 +94,7 @@ def kept_in_set(
     monotone: what was kept of ∂e/∂v + (∂e/∂v)' in scaled signals.
     """
     model = rows.model(e, f, HALF * monotone / 2.0)
-    return model, proved_in_set(
-        model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0)
-    )
+    return model, _proved(model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0))
 
 
 def implicit_equation_error(rows: ImplicitRows) -> ImplicitModel:
@@ -115,10 +113,10 @@ def least_squares_coefficients(rows: ImplicitRows) -> tuple[FloatArray, FloatArr
 
 def prove_in_set(model: ImplicitModel, rows: ImplicitRows) -> ImplicitProof | None:
     """A proof that a model of these rows is in their class's set, if the search finds one."""
-    return proved_in_set(model, rows, SMALL_DELTA)
+    return _proved(model, rows, SMALL_DELTA)
 
 
-def proved_in_set(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitProof | None:
+def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitProof | None:
     made, mean, spread = rows.model_class, *rows.units
     n_v = len(rows.y_scale[0])
     sizes = np.abs(mean) + spread
@@ -230,6 +228,7 @@ def _residual(rows: ImplicitRows) -> Objects:
 
 
 def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+    """The decisions in e of equation i, in the order of the rows' monomials."""
     if rows.model_class.set != "2.19":
         return list(variables([f"e{i}[{k}]" for k in range(len(rows.left))]))
     E = symmetric_template("E", n_v)
