@@ -142,7 +142,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     assert lines["untouched"] == ["0", "0", "0", "0", "-", "0", "-", "0", "-", "0", "-"]
     for fault in ("sensor x 0.6", "sensor x 0.8", "actuator x 0.8", "bias, 10 % of range"):
         assert int(lines[fault][0]) + int(lines[fault][1]) == 8
-        assert lines[fault][6] == "8", "CUSUM"
+        assert lines[fault][5] == "8", "CUSUM"
     assert lines["5 samples lost"][:5] == ["0", "0", "0", "8", "-"]
     assert "half-width of speed: 0.215 m/s, 0.552 of its range, 0.39 m/s" in made.output
     assert "warning: the half-width of speed, 0.215 m/s, is 0.552 of its range" in made.output
@@ -152,7 +152,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     cells = re.search(r"<td>sensor x 0.8</td>(.*?)</tr>", page).group(1)  # type: ignore[union-attr]
     said = re.findall("<td>(.*?)</td>", cells)
     assert said[:4] == lines["sensor x 0.8"][:4]
-    assert said[5] == f"8, {lines['sensor x 0.8'][7]} s"
+    assert said[5] == f"8, {lines['sensor x 0.8'][6]} s"
     assert "trial_12 sets the level" in page
     assert (out / documents.CATCHING_PLOT).read_bytes().startswith(b"\x89PNG")
 
