@@ -45,8 +45,9 @@ class Problem:
         _only(funnel, "format version kind vector_field policy t x P rho")
         if policy["t"] != funnel["t"] or policy["x"] != funnel["x"]:
             raise NotCovered("the funnel is around another nominal than the policy's")
-        self.spans = [sum(t <= start for t in field["breaks"]) for start in funnel["t"][:-1]]
-        if any(funnel["t"][0] < t < funnel["t"][-1] and t not in funnel["t"] for t in field["breaks"]):
+        self.spans = [sum(at <= start for at in field["breaks"]) for start in funnel["t"][:-1]]
+        t = funnel["t"]
+        if any(t[0] < at < t[-1] and at not in t for at in field["breaks"]):
             raise NotCovered("the dynamics change at a time that is no knot")
         rows = policy["limits"]
         if [row[0] for row in rows] != sorted({row[0] for row in rows}):
@@ -146,9 +147,8 @@ def squares(stated: dict[str, Any]) -> str:
         weights = stated.get("weights", [1] * len(factor))
         if len(weights) != len(factor):
             raise NotCovered("one weight for each row of each factor")
-        factors.append(
-            listed(f"({int(w)}, {listed(map(word, row))}%uint63)" for w, row in zip(weights, factor, strict=True))
-        )
+        rows = zip(weights, factor, strict=True)
+        factors.append(listed(f"({int(w)}, {listed(map(word, row))}%uint63)" for w, row in rows))
     return f"(word_squares {stated['unit']} {int(stated.get('scale', 1))} {listed(factors)})"
 
 
@@ -226,7 +226,8 @@ def coq(problem: Problem) -> str:
             f" {squares(piece['squares'])} {tau}."
         )
         by_segment[piece["interval"]].append(f"piece_{i}")
-    bases = (listed(map(monomial, proof.get(name, []))) for name in ("basis", "multiplier", "sides"))
+    names = ("basis", "multiplier", "sides")
+    bases = (listed(map(monomial, proof.get(name, []))) for name in names)
     out.append(
         f"Definition proof := Witness {num(proof['margin'])} {' '.join(bases)}"
         f" {listed(map(listed, by_segment))}."
@@ -235,7 +236,8 @@ def coq(problem: Problem) -> str:
         "Theorem accepted : check data proof = true.\n"
         "Proof. vm_cast_no_check (eq_refl true). Qed.\n"
         "Theorem funnel : forall x, solution data x -> forall ta t,\n"
-        "  (begin data <= ta)%R -> (ta <= t <= finish data)%R -> inside data x ta -> inside data x t.\n"
+        "  (begin data <= ta)%R -> (ta <= t <= finish data)%R ->\n"
+        "  inside data x ta -> inside data x t.\n"
         "Proof. exact (stays data proof accepted). Qed.\n"
         "Print Assumptions funnel."
     )
