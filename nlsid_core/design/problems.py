@@ -8,6 +8,7 @@ from nlsid_core.arrays import ArrayLike
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
@@ -64,7 +65,9 @@ class OutputTube:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
-    the range of the training trials and a tenth of it on both sides).
+    the range of the training trials and a tenth of it on both sides). level: "constant", or
+    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    `train`.
     Source: docs/certificate_tube.md.
     """
 
@@ -75,6 +78,7 @@ class OutputTube:
     safety_factor: float = 1.5
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
+    level: LevelKind = "auto"
 
     def __post_init__(self) -> None:
         for key in ("reaction_time", "horizon"):
@@ -82,6 +86,7 @@ class OutputTube:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
         require_ranges(self, "box")
+        require_one_of(self, "level", get_args(LevelKind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +122,11 @@ class ContinuousTracking:
     K varies between knots: "constant", "linear" or "cubic". limits: rows (input, low, high) at
     which inputs saturate; the proof then covers every mode of them.
 
+    hold: s, how old the input that is applied may be: the time between samples, and any delay
+    ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
+    assumed to act continuously). K is then linear between knots. error: (n,)
+    bounds of how much each state is measured wrong (None: not at all).
+
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
     """
@@ -131,6 +141,8 @@ class ContinuousTracking:
     R: ArrayLike | None = None
     gain: str = "constant"
     limits: ArrayLike | None = None
+    hold: float | Literal["largest"] | None = None
+    error: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         require_one_of(self, "shape", get_args(Shape))

@@ -1,8 +1,9 @@
 """How the models of each class are found: which methods there are, and the search itself."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,11 +11,19 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.fit import History, Proof, Step
-from nlsid_core.identification.implicit_class import ImplicitClass, build_implicit_rows
+from nlsid_core.identification.implicit_class import (
+    ImplicitClass,
+    ImplicitRows,
+    build_implicit_rows,
+)
+from nlsid_core.identification.implicit_descent import minimise_certified_implicit
+from nlsid_core.identification.implicit_proof import ImplicitProof
 from nlsid_core.identification.implicit_search import (
     implicit_equation_error,
+    least_squares_coefficients,
     minimise_implicit_rie,
     prove_in_set,
 )
@@ -48,11 +57,19 @@ from nlsid_core.identification.monotone import (
     least_squares_equation,
     minimise_monotone_simulation_error,
 )
+from nlsid_core.identification.monotone_descent import minimise_certified
+from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import prove_stability
-from nlsid_core.identification.starts import reflected, stable_starts
+from nlsid_core.identification.starts import (
+    as_implicit,
+    as_monotone,
+    linear_start,
+    reflected,
+    stable_starts,
+)
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
     StateAffineRows,
@@ -68,6 +85,11 @@ from nlsid_core.models import (
     StateAffineModel,
 )
 
+T = TypeVar("T", bound=Model)
+S = TypeVar("S")
+R = TypeVar("R")
+Coefficients = tuple[FloatArray, FloatArray]  # scaled e and f of an implicit model
+log = logging.getLogger(__name__)
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
 CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: corners decide
@@ -78,20 +100,33 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
-    starts = tuple(stable_starts(regression))
-    trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p), starts)
+    radius = task.searched_rate
+    starts = tuple(stable_starts(regression, radius))
+    trail.follow(
+        regression.rows,
+        lambda i: regression.model(i.theta, i.p),
+        starts,
+        lambda theta: reflected(theta, radius),
+    )
 
     def minimised(iterations: int, *, stable: bool) -> DifferenceEquation:
         """The best of the local minima from the robust simulation error and the other starts."""
-        *_, last = robust_simulation_error(regression.rows, iterations=iterations)
-        thetas = [reflected(last.theta), *(theta for _, theta in starts)]
-        if not stable:
-            thetas.append(last.theta)
+        thetas = [theta for _, theta in starts]
+        try:
+            *_, last = robust_simulation_error(regression.rows, iterations=iterations)
+        except SolverError:
+            log.info("the robust simulation error gives no start")
+        else:
+            thetas.insert(0, reflected(last.theta, radius))
+            if not stable:
+                thetas.append(last.theta)
         models = []
         for theta in thetas:
             start = regression.model(theta, SimulationError(regression.rows).at(theta).p)
             if not stable or prove_stability(start) is not None:
-                models.append(minimise_simulation_error(regression, start, stable=stable))
+                models.append(
+                    minimise_simulation_error(regression, start, stable=stable, radius=radius)
+                )
         if not models:
             raise Infeasible("no start of the search has a proof of stability")
         return min(models, key=lambda model: simulation_percent(model, train))
@@ -105,7 +140,7 @@ def state_affine(
     train: Dataset, model_class: StateAffineClass, task: Task
 ) -> Trail[StateAffineModel]:
     """State-affine models, of several inputs and outputs."""
-    problem = build_state_affine_rows(train, model_class)
+    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
     trail: Trail[StateAffineModel] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: state_affine_equation_error(problem))
     trail.add(Rie, lambda _: robust_identification_error(problem)[0])
@@ -142,7 +177,12 @@ def block_cascade(
 
     def search(_: Sem) -> tuple[BlockCascade, Proof]:
         found = identify_block_cascade(
-            train, validation, model_class, transient=task.transient, progress=task.progress
+            train,
+            validation,
+            model_class,
+            transient=task.transient,
+            slowest=min(MAX_RADIUS, task.searched_rate),
+            progress=task.progress,
         )
         *choices, last = found.choices
         steps = [Step(str(choice), choice.validation_rms) for choice in choices]
@@ -162,7 +202,7 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     refuse_unexcited(plain, model_class, template, offsets)
     trail: Trail[MonotoneEquation] = Trail(
         task,
-        lambda _: None,
+        prove_stability,
         f"mean squared simulation error by the moments, at most [{_unit(train)}²]",
     )
 
@@ -173,11 +213,13 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     def without_bias(method: MomentRie) -> MomentFit:
         return identify_from_repeats(
             train, model_class, transient=task.transient, executor=task.executor,
-            accept_untested_repeats=method.accept_untested_repeats,
+            accept_untested_repeats=method.accept_untested_repeats, slowest=task.searched_rate,
         )  # fmt: skip
 
     def biased() -> MomentFit:
-        return minimise_moment_rie(plain, model_class, template, offsets)
+        return minimise_moment_rie(
+            plain, model_class, template, offsets, slowest=task.searched_rate
+        )
 
     def equation_error() -> MonotoneEquation:
         return least_squares_equation(plain, model_class, template, offsets)
@@ -186,9 +228,45 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     trail.add_proved(Rie, lambda method: solved(method, biased()))
     if train.repeats() or isinstance(task.method, MomentRie):
         trail.add_proved(MomentRie, lambda method: solved(method, without_bias(method)))
-    starts = (equation_error, lambda: biased().model)
+
+    def straight() -> MonotoneEquation:
+        found = linear_start(train, model_class.lags, model_class.delays)
+        if found is None:
+            raise Infeasible("no linear model to start from")
+        return as_monotone(found, model_class)
+
+    starts = (equation_error, lambda: biased().model, straight)
     trail.add(Sem, lambda _: _best_minimum(starts, train))
+
+    def inside(method: CertifiedSem) -> MonotoneEquation:
+        def minimised(start: MonotoneEquation) -> MonotoneEquation | None:
+            return minimise_certified(
+                start, plain, model_class, train.trajectories,
+                slowest=task.searched_rate, steps=method.iterations,
+            )  # fmt: skip
+
+        begun = (*starts, lambda: _best_minimum(starts, train))
+        found = [model for start in begun if (model := _tried(start, minimised)) is not None]
+        return _least_error([m for m in found if prove_stability(m) is not None], train)
+
+    trail.add(CertifiedSem, inside)
     return trail
+
+
+def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | None:
+    """What a search makes of a start; None if there is no start, or it leads to nothing."""
+    try:
+        return minimised(start())
+    except (DataError, SolverError) as reason:
+        log.info("no model from this start: %s", reason)
+        return None
+
+
+def _least_error(models: Sequence[T], train: Dataset) -> T:
+    """The proved model that simulates the training data best; Infeasible if there is none."""
+    if not models:
+        raise Infeasible("no start of the search leads to a model with a proof of stability")
+    return min(models, key=lambda model: simulation_percent(model, train))
 
 
 def _best_minimum(
@@ -216,13 +294,41 @@ def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[Im
     )
 
     def search(method: Rie) -> tuple[ImplicitModel, Proof]:
-        found = minimise_implicit_rie(rows)
+        found = minimise_implicit_rie(rows, slowest=task.searched_rate)
         trail.solved(method, found.bound)
         return found.model, found.proof
 
     trail.add(LeastSquares, lambda _: implicit_equation_error(rows))
     trail.add_proved(Rie, search)
+    trail.add_proved(CertifiedSem, lambda method: _inside(rows, task, method))
     return trail
+
+
+def _inside(
+    rows: ImplicitRows, task: Task, method: CertifiedSem
+) -> tuple[ImplicitModel, ImplicitProof]:
+    """The best of the local minima of the simulation error in the set, from all starts at hand."""
+    made = rows.model_class
+
+    def bounded() -> Coefficients:
+        found = minimise_implicit_rie(rows, slowest=task.searched_rate)
+        return found.e, found.f
+
+    def straight() -> Coefficients:
+        found = linear_start(rows.dataset, made.lags, made.delays)
+        if found is None:
+            raise Infeasible("no linear model to start from")
+        return as_implicit(found, rows)
+
+    def minimised(start: Coefficients) -> tuple[ImplicitModel, ImplicitProof] | None:
+        return minimise_certified_implicit(
+            rows, start, slowest=task.searched_rate, steps=method.iterations
+        )
+
+    starts = (bounded, lambda: least_squares_coefficients(rows), straight)
+    found = [one for start in starts if (one := _tried(start, minimised)) is not None]
+    best = _least_error([model for model, _ in found], rows.dataset)
+    return next(one for one in found if one[0] is best)
 
 
 def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[ImplicitModel]:
@@ -230,20 +336,27 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
     trail: Trail[ImplicitModel] = Trail(task, lambda _: None, "equation error")
 
     def search(_: LeastSquares) -> tuple[ImplicitModel, Proof]:
-        found = identify_linear_states(train)
+        found = identify_linear_states(train, slowest=task.searched_rate)
         return found.model, found.proof
 
     trail.add_proved(LeastSquares, search)
+    if task.wanted(CertifiedSem) is not None:
+        rows = build_implicit_rows(train, ImplicitClass(1, (1,), "2.19", 1))
+        trail.add_proved(CertifiedSem, lambda method: _inside(rows, task, method))
     return trail
 
 
 @dataclass(frozen=True)
 class Offer:
-    """The methods of a class, the default first, and those that run beside what is asked for."""
+    """The methods of a class, the default first, and those that run beside what is asked for.
+
+    needs_validation: the search chooses by validation trials.
+    """
 
     search: Callable[[Dataset, Any, Task], Trail[Any]]
     methods: tuple[type[Method], ...]
     comparators: tuple[type[Method], ...]
+    needs_validation: bool = False
 
 
 OFFERS: dict[type, Offer] = {
@@ -255,12 +368,14 @@ OFFERS: dict[type, Offer] = {
         (Rse, LeastSquares, Rie, FirstRse, CertifiedRse, CertifiedSem),
         (LeastSquares, Rie, FirstRse, Rse),
     ),
-    BlockCascadeClass: Offer(block_cascade, (Sem,), ()),
+    BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     MonotoneClass: Offer(
-        monotone, (MomentRie, Rie, LeastSquares, Sem), (LeastSquares, Rie, MomentRie)
+        monotone,
+        (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),
+        (LeastSquares, Rie, MomentRie),
     ),
-    ImplicitClass: Offer(implicit, (Rie, LeastSquares), (LeastSquares, Rie)),
-    LinearStateClass: Offer(linear_states, (LeastSquares,), ()),
+    ImplicitClass: Offer(implicit, (Rie, LeastSquares, CertifiedSem), (LeastSquares, Rie)),
+    LinearStateClass: Offer(linear_states, (LeastSquares, CertifiedSem), ()),
 }
 
 
