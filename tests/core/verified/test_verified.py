@@ -35,13 +35,14 @@ def test_nothing_is_left_to_believe_in_the_theory() -> None:
 def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the theory is built, once."""
     folder = tmp_path_factory.mktemp("verified")
-    subprocess.run(["make", "-C", VERIFIED, f"BUILD={folder}"], check=True, capture_output=True)
+    command = ["make", "-C", str(VERIFIED), f"BUILD={folder}"]
+    subprocess.run(command, check=True, capture_output=True)
     return folder
 
 
 def accepted(proof: Path, build: Path) -> subprocess.CompletedProcess[str]:
     """The build of the theorem of one file."""
-    command = ["make", "-C", VERIFIED, f"BUILD={build}", f"FILE={proof}"]
+    command = ["make", "-C", str(VERIFIED), f"BUILD={build}", f"FILE={proof}"]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
