@@ -2,6 +2,7 @@
 
 import re
 
+from docs.site import linking
 from tests.house.sources import ROOT
 
 DOCS = ROOT / "docs"
@@ -36,3 +37,9 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
         if not (page.parent / target).exists()
     ]
     assert not broken
+
+
+def test_what_the_pages_of_theory_name_is_there() -> None:
+    pages = sorted(DOCS.glob("theory*.md"))
+    assert len(pages) > 2
+    assert not {page.name: found for page in pages if (found := linking.unknown(page.read_text()))}
