@@ -4,6 +4,7 @@ A command imports what it runs when it is called: `nlsid check` needs no NumPy, 
 """
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +19,9 @@ from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
 from nlsid_core.errors import NlsidError
+
+# The matrices of a search are small: threads for them wait for each other, ten times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="nlsid",
@@ -383,6 +387,50 @@ def live(
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
     raise typer.Exit(run_together(launch.commands(arguments or [])))
+
+
+@app.command()
+def view(
+    bag: Annotated[
+        Path | None, typer.Argument(help="A recording to replay; none: the live robot.")
+    ] = None,
+    page: Annotated[
+        bool, typer.Option("--page", help="A page for any browser; else a server for Foxglove.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(help="Port; 0: 8765 for Foxglove, 8080 for the page.", min=0, max=65535)
+    ] = 0,
+    monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
+    funnel: Annotated[
+        Path | None, typer.Option(help="For a recording: the funnel it is held against.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="For a recording: takes `monitor.nominal`.")
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
+    ] = 1.0,
+) -> None:
+    """Show tube, signals, margin, assumption and events, live or of a recording, until Ctrl-C."""
+    from bags.commands.viewing import view_live, view_recording
+
+    if bag is None:
+        if importlib.util.find_spec("rclpy") is None:
+            raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+        raise typer.Exit(view_live(monitor, page=page, host=host, port=port))
+    if funnel is None:
+        raise typer.BadParameter("a recording is held against a funnel: give --funnel")
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.designs import documents
+    from bags.viewing.replay import Recording
+
+    centre = show.centre_of(load_config(config) if config is not None else None)
+    recording = Recording(documents.load_proved(funnel), bag, centre=centre)
+    view_recording(recording, rate, page=page, host=host, port=port)
 
 
 @app.command()

@@ -5,6 +5,7 @@ depend on ρ̇. Source: thesis (6.4), in the sphere form.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Section:
 
     t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
     x̄ = √ρ·base·z.
-    span: which of the field's pieces holds.
+    span: which of the field's pieces holds. interval: between which knots it is.
     """
 
     t: float
@@ -38,6 +39,7 @@ class Section:
     P_rate: FloatArray
     base: FloatArray
     span: int
+    interval: int
 
 
 def section_at(
@@ -58,6 +60,7 @@ def section_at(
         P_rate=(P[k + 1] - P[k]) / h,
         base=coordinates(here, field.nonlinear_states),
         span=field.span(float(t[k])),
+        interval=k,
     )
 
 
@@ -94,19 +97,28 @@ def refuse_degree(field: VectorField) -> None:
 class LSteps:
     """L-steps of one vector field; holds the sphere program and counts what is solved.
 
-    A case is a vertex of w in a mode of the policy: every vertex in the first mode comes first.
-    limits and modes: of the policy, if its inputs are clipped.
+    A case is a vertex of w at a corner of δ in a mode of the policy: every vertex at the first
+    corner in the first mode comes first. limits and modes: of the policy, if its inputs are
+    clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
     """
 
     def __init__(
-        self, field: VectorField, policy: ContinuousPolicy | None = None, *, tolerance: float = 1e-5
+        self,
+        field: VectorField,
+        policy: ContinuousPolicy | None = None,
+        *,
+        tolerance: float = 1e-5,
+        widths: FloatArray | None = None,
     ) -> None:
         refuse_degree(field)
         self.field = field
         self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
-        self.program = sphere_program(field, reduced=len(self.limits) == 0)
+        self.widths = widths
+        corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
+        self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
+        self.program = sphere_program(field, reduced=len(self.limits) == 0 and widths is None)
         self.kappa: FloatArray | None = None
         self.vertices = field.vertices()
         self.solved = 0
@@ -124,22 +136,25 @@ class LSteps:
 
     @property
     def cases(self) -> int:
-        """Vertices times modes."""
-        return len(self.vertices) * len(self.modes)
+        """Vertices times corners times modes."""
+        return len(self.vertices) * len(self.corners) * len(self.modes)
 
-    def split(self, case: int) -> tuple[int, IntArray]:
-        """The vertex and the mode of a case."""
-        mode, vertex = divmod(case, len(self.vertices))
-        return vertex, self.modes[mode]
+    def split(self, case: int) -> tuple[int, int, IntArray]:
+        """The vertex, the corner and the mode of a case."""
+        rest, vertex = divmod(case, len(self.vertices))
+        mode, corner = divmod(rest, len(self.corners))
+        return vertex, corner, self.modes[mode]
 
     def values(self, section: Section, rho: float, case: int) -> FloatArray:
         """-Ẇ/ρ at the program's points, straight from the vector field in the case's mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
-        vertex, mode = self.split(case)
+        vertex, corner, mode = self.split(case)
         u = section.u - x_bar @ section.K.T
         for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
             if side:
                 u[:, int(i)] = low if side < 0 else high
+        if self.widths is not None:
+            u = u + self.corners[corner] * self.widths[section.interval]
         w = self.vertices[vertex]
         rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
@@ -167,7 +182,7 @@ class LSteps:
         """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         demand = section.u - x_bar @ section.K.T
-        _, mode = self.split(case)
+        *_, mode = self.split(case)
         rows = []
         for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
             above, below = demand[:, int(i)] - low, high - demand[:, int(i)]

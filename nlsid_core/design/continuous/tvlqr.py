@@ -50,7 +50,8 @@ def tvlqr(
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
-    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots.
+    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
+    "linear" is continuous.
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
@@ -79,7 +80,8 @@ def tvlqr(
     if gain == "constant":
         K = constant_on(nominal.t, after)
     elif gain == "linear":
-        K = PiecewisePolynomial(nominal.t, np.stack([after, before], axis=1))
+        inner = (before[:-1] + after[1:]) / 2  # the dynamics of two intervals may differ a little
+        K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
     else:
         K = _cubic_gain(field, nominal, S, R_inverse, rate)
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
