@@ -11,7 +11,7 @@ from docs.site import api, linking, measured, running  # noqa: E402
 
 project = "nlsid"
 author = "the nlsid maintainers"
-copyright = "the nlsid maintainers, Apache-2.0"  # noqa: A001
+copyright = "the nlsid maintainers, Apache-2.0"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["site"]
@@ -54,16 +54,16 @@ def _read(app: Any, name: str, source: list[str]) -> None:
         source[0] = running.pictures(page, folder, Path(app.srcdir) / "pictures")
 
 
-def _docstring(_: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+def _docstring(*arguments: Any) -> None:
+    _, _, name, _, _, lines = arguments
     lines[:] = api.literal(lines)
     for page in _derived.get(name, []):
         lines += ["", f"Derived in :doc:`/{page}`."]
 
 
-def _signature(
-    _: Any, what: str, name: str, thing: Any, options: Any, arguments: str | None, answer: str | None
-) -> tuple[str | None, str | None]:
-    return arguments and api.short(arguments), answer and api.short(answer)
+def _signature(*arguments: Any) -> tuple[str | None, str | None]:
+    *_, taken, returned = arguments
+    return taken and api.short(taken), returned and api.short(returned)
 
 
 def setup(app: Any) -> None:

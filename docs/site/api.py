@@ -13,7 +13,9 @@ ROOMS = (
     "polynomial", "sos", "kernel", "designs", "proofs", "documents",
 )  # fmt: skip
 
-ARRAY = re.compile(r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[[\w.\[\]]*?\]+\]")
+ARRAY = re.compile(
+    r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[[\w.\[\]]*?\]+\]"
+)
 INDEX = """# API
 
 Made from the docstrings. Nouns are frozen dataclasses and arrays, verbs are functions.
@@ -27,8 +29,11 @@ Made from the docstrings. Nouns are frozen dataclasses and arrays, verbs are fun
 def modules(package: ModuleType) -> Iterator[ModuleType]:
     """The package and all public modules in it, first those whose names it offers itself."""
     yield package
-    offered = {getattr(package, name).__module__ for name in getattr(package, "__all__", ())
-               if hasattr(getattr(package, name), "__module__")}
+    offered = {
+        getattr(package, name).__module__
+        for name in getattr(package, "__all__", ())
+        if hasattr(getattr(package, name), "__module__")
+    }
     names = [
         found.name
         for found in pkgutil.walk_packages(getattr(package, "__path__", []), f"{package.__name__}.")
@@ -50,7 +55,7 @@ def members(module: ModuleType) -> list[str]:
 
 
 def write(folder: Path) -> set[str]:
-    """Write a page for each room into `folder`; returns the full names of all that is documented."""
+    """Write a page for each room into `folder`; returns the full names of what they document."""
     folder.mkdir(parents=True, exist_ok=True)
     documented: set[str] = set()
     for room in ROOMS:

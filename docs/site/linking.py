@@ -42,8 +42,8 @@ def _found(path: str) -> str | None:
     thing = getattr(holder, name, None)
     if thing is None and name in getattr(holder, "__annotations__", {}):
         thing = holder
-    found = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
-    return ".".join(found) if all(found) and str(found[0]).startswith("nlsid_core") else None
+    where, what = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+    return f"{where}.{what}" if what and str(where).startswith("nlsid_core") else None
 
 
 def linked(text: str, documented: set[str]) -> tuple[str, set[str]]:
@@ -69,5 +69,7 @@ def unknown(text: str) -> list[str]:
     return [
         name
         for name in CODE.findall(text)
-        if "." in name and not name.startswith(("np.", "examples.", "nlsid_core")) and not home(name)
+        if "." in name
+        and not name.startswith(("np.", "examples.", "nlsid_core"))
+        and not home(name)
     ]

@@ -19,8 +19,10 @@ def page(results: Path, benchmarks: Path) -> str:
     lines = [
         "# Benchmarks",
         "",
-        "Every figure is measured beside its peer in one run, one thread, and is written by `make benchmarks` with its date, machine and commit; what",
-        "was published elsewhere is in each description. Times of one run vary by some tens of percent. Words are in the [glossary](glossary.md).",
+        "Every figure is measured beside its peer in one run, one thread, and is written by",
+        "`make benchmarks` with its date, machine and commit; what was published elsewhere is in",
+        "each description. Times of one run vary by some tens of percent. Words are in the",
+        "[glossary](glossary.md).",
         "",
     ]
     if not files:
@@ -28,8 +30,8 @@ def page(results: Path, benchmarks: Path) -> str:
     lines += ["| benchmark | measured | took | commit | peers |", "|---|---|---|---|---|"]
     for name, found in files:
         lines.append(
-            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | {found['seconds']:g} s | "
-            f"{found['commit'][:8]} | {_peers(found['result'])} |"
+            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | "
+            f"{found['seconds']:g} s | {found['commit'][:8]} | {_peers(found['result'])} |"
         )
     for name, found in files:
         module = str(found["command"][2]).removeprefix("benchmarks.")

@@ -35,6 +35,7 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
         for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
         for target in re.findall(r"\]\(([\w./-]+\.\w+)[#)]", page.read_text())
         if not (page.parent / target).exists()
+        and not target.startswith("run/")  # a block of the page makes it when the site is built
     ]
     assert not broken
 
