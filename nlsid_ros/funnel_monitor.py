@@ -318,7 +318,7 @@ class FunnelMonitor(ManagedNode):
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        numbers = reading.numbers | self._widths.at(reading.t)
+        numbers = reading.numbers | self._widths.of(reading)
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)
@@ -395,6 +395,7 @@ class FunnelMonitor(ManagedNode):
             "now": state.value,
             "worst axis": reading.worst_axis,
             "assuming": reading.assuming,
+            "alarm": reading.alarm,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
             "late commands": str(watch.pairing.late if watch else 0),
@@ -404,6 +405,9 @@ class FunnelMonitor(ManagedNode):
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
         level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
+        if reading.alarm:  # no verdict: it warns, and latches nothing
+            level = max(level, DiagnosticStatus.WARN)
+            text += f"; {reading.alarm}"
         if self._latched is not None:
             level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
             text += "".join(f"; {name}: {why}" for name, why in self._failures.items())

@@ -134,6 +134,15 @@ class FunnelConfig(Section):
             example=0.5,
         ),
     ] = None
+    level: Annotated[
+        Literal["auto", "constant", "commands"],
+        Key(
+            "whether the tube is wider while commands move it (`commands`) or as wide always "
+            "(`constant`, which fixed tolerances need); `auto`: `commands` where that is a fifth "
+            "narrower on average over the training trials; without `profile`",
+            example="constant",
+        ),
+    ] = "auto"
     safety_factor: Annotated[
         float,
         Field(ge=1.0, allow_inf_nan=False),

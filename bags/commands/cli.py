@@ -135,6 +135,8 @@ def select(
     with progress_bar("selecting") as progress:
         result = select_bags(folders, settings, out_dir, options=options, progress=progress)
     out.print(show.selection_table(result.selection))
+    if result.selection.refitted:
+        out.print("the chosen class, fitted to training and validation trials together:")
     show.say_identified(out, result.identified)
 
 
@@ -341,8 +343,9 @@ def monitor(
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside or breaks
-    the assumption, 2 if something was not judged. A tube of one output is drawn too.
+    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside, breaks the
+    assumption or raises the CUSUM alarm, 2 if something was not judged. A tube of one output is
+    drawn too.
     """
     from bags.chain.config import load_config
     from bags.commands import show
@@ -377,6 +380,9 @@ def monitor(
     for entry in replays:
         if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
+        if (alarm := entry.first_alarm) is not None:
+            said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
+            out.print(said, soft_wrap=True)
         for reading in entry.unjudged:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
@@ -384,7 +390,7 @@ def monitor(
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if drawn:
         out.print(f"wrote {picture}", soft_wrap=True)
-    if any(entry.first_bad is not None for entry in replays):
+    if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)
     if any(entry.unjudged or not entry.judged for entry in replays):
         raise typer.Exit(2)
@@ -483,11 +489,14 @@ def demo(
     out_dir: Annotated[
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
+    robot: Annotated[
+        str, typer.Option(help="f1tenth, a car's speed; dart, a car's yaw rate on three floors.")
+    ] = "f1tenth",
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     from bags.commands.demo import run_demo
 
-    if not run_demo(out_dir, out):
+    if not run_demo(out_dir, out, robot):
         raise typer.Exit(1)
 
 

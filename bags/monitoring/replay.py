@@ -84,6 +84,11 @@ class Replay:
         return next((r for r in self.judged if r.status is not Status.INSIDE), None)
 
     @property
+    def first_alarm(self) -> Reading | None:
+        """The first reading with a second alarm, which is no verdict."""
+        return next((r for r in self.judged if r.alarm), None)
+
+    @property
     def assumption(self) -> float:
         """The part of what is assumed that is used at the last judged sample; 1 is all of it."""
         return self.judged[-1].assumption if self.judged else float("nan")

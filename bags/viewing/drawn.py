@@ -6,6 +6,7 @@ from bags.designs.design import AnyDesign
 from nlsid_core.dynamics import VectorField
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.running.reading import Reading
 
 
 def signal_names(design: AnyDesign) -> tuple[str, ...]:
@@ -29,9 +30,10 @@ class HalfWidths:
             rows = [funnel.half_widths]
         self._rows = [tuple(map(float, row)) for row in rows]
 
-    def at(self, t: float) -> dict[str, float]:
-        """By name, t s into a run; of several signals with their index."""
-        row = self._rows[min(max(round(t / self._period), 0), len(self._rows) - 1)]
+    def of(self, reading: Reading) -> dict[str, float]:
+        """By name, at a reading; of several signals with their index."""
+        place = min(max(round(reading.t / self._period), 0), len(self._rows) - 1)
+        row = tuple(reading.half_widths) or self._rows[place]
         if len(row) == 1:
             return {"half_width": row[0]}
         return {f"half_width[{i}]": width for i, width in enumerate(row)}

@@ -48,4 +48,4 @@ class Recording:
         stamp_ns, reading, state = entry
         text = state.value + (f": {reading.reason}" if reading.reason else "")
         scene.say(stamp_ns, MONITOR, LEVELS[state], text, names=self._names)
-        scene.sample(stamp_ns, {**reading.numbers, **self._widths.at(reading.t)})
+        scene.sample(stamp_ns, {**reading.numbers, **self._widths.of(reading)})

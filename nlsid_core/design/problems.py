@@ -8,6 +8,7 @@ from nlsid_core.arrays import ArrayLike
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
@@ -64,7 +65,9 @@ class OutputTube:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
-    the range of the training trials and a tenth of it on both sides).
+    the range of the training trials and a tenth of it on both sides). level: "constant", or
+    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    `train`.
     Source: docs/certificate_tube.md.
     """
 
@@ -75,6 +78,7 @@ class OutputTube:
     safety_factor: float = 1.5
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
+    level: LevelKind = "auto"
 
     def __post_init__(self) -> None:
         for key in ("reaction_time", "horizon"):
@@ -82,6 +86,7 @@ class OutputTube:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
         require_ranges(self, "box")
+        require_one_of(self, "level", get_args(LevelKind))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 `select` does so for several classes and keeps the one with the least error on validation data.
 """
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -17,6 +18,8 @@ from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, al
 from nlsid_core.identification.rates import default_max_rate
 from nlsid_core.identification.searches import OFFERS, methods_of
 from nlsid_core.identification.trail import Progress, Task, silent
+
+log = logging.getLogger(__name__)
 
 
 def identify(
@@ -96,40 +99,56 @@ def select(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> "Selection[M]":
-    """Identify every class on `train` and keep the one with the least error on `validation`.
+    """Identify every class on `train`, choose by the error on `validation`, fit to both again.
 
     A class that does not fit the data or (unless `allow_unproved`) has no proof counts as
-    infinitely bad. Options are those of `identify`. Raises Infeasible if no class has a model.
+    infinitely bad. The chosen class is identified once more on both datasets together, unless it
+    needs `validation` for choices of its own. Options are those of `identify`. Raises Infeasible if
+    no class has a model.
     """
     report = silent if progress is None else progress
     tried: list[Tried[M]] = []
+
+    def fitted(data: Dataset, model_class: ModelClass[M], judged: Dataset | None) -> Fit[M]:
+        return identify(
+            data,
+            model_class,
+            method=method,
+            comparators=(),
+            validation=judged,
+            test=test,
+            transient=transient,
+            max_rate=max_rate,
+            allow_unproved=allow_unproved,
+            executor=executor,
+        )
+
     for number, model_class in enumerate(classes):
-        report(describe(model_class), number / len(classes))
+        report(describe(model_class), number / (len(classes) + 1))
         try:
-            fit = identify(
-                train,
-                model_class,
-                method=method,
-                comparators=(),
-                validation=validation,
-                test=test,
-                transient=transient,
-                max_rate=max_rate,
-                allow_unproved=allow_unproved,
-                executor=executor,
-            )
+            fit = fitted(train, model_class, validation)
         except (DataError, SolverError) as refusal:
             tried.append(Tried(model_class, None, str(refusal)))
         else:
             tried.append(Tried(model_class, fit))
-    report("done", 1.0)
     if not tried:
         raise DataError("no model class to select from")
     best = min(tried, key=lambda entry: entry.error("validation"))
     if best.fit is None:
         reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
         raise Infeasible(f"no class has a proved model: {reasons}")
-    return Selection(tuple(tried), best.model_class, best.fit)
+    report("fitting to training and validation trials", len(classes) / (len(classes) + 1))
+    refit = None
+    if not OFFERS[type(best.model_class)].needs_validation:
+        try:
+            both = Dataset((*train.trajectories, *validation.trajectories))
+            refit = fitted(both, best.model_class, None)
+        except (DataError, SolverError) as refusal:
+            log.warning("not fitted to training and validation trials together: %s", refusal)
+    report("done", 1.0)
+    return Selection(
+        tuple(tried), best.model_class, best.fit if refit is None else refit, refit is not None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,11 +166,15 @@ class Tried(Generic[M]):
 
 @dataclass(frozen=True, eq=False)
 class Selection(Generic[M]):
-    """Everything that was tried, in order, and the class with the least validation error."""
+    """Everything that was tried, in order, and the class with the least validation error.
+
+    fit: of that class, to training and validation trials together if `refitted`.
+    """
 
     tried: tuple[Tried[M], ...]
     best: ModelClass[M]
     fit: Fit[M]
+    refitted: bool
 
     @property
     def errors(self) -> tuple[float, ...]:
@@ -164,7 +187,10 @@ class Selection(Generic[M]):
             + (entry.refusal or f"{entry.error('validation'):9.2f} %")
             for entry in self.tried
         ]
-        return "\n".join(["model class, validation error", *rows, str(self.fit)])
+        on = "training and validation trials" if self.refitted else "training trials"
+        return "\n".join(
+            ["model class, validation error", *rows, f"fitted to {on}:", str(self.fit)]
+        )
 
 
 def _unknown(asked: object, model_class: object, known: Sequence[type[Method]]) -> str:

@@ -133,7 +133,8 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
         rank = int((singular > RANK_TOLERANCE * singular[0]).sum()) - 1
         raise DataError(
             f"the excitation does not excite {lags} lags: its window of {lags + 1} samples has "
-            f"rank {rank}; use richer inputs or fewer lags"
+            f"rank {rank}; use richer inputs, fewer lags, or the class state_affine with fewer "
+            "delays of the input, such as `delays: [1]`"
         )
     return Regression(
         Y=np.concatenate(outputs),

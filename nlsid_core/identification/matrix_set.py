@@ -24,7 +24,7 @@ from nlsid_core.polynomial.values import monomial_values
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
 SLOWEST_IN_BOX = 1.0 - 1e-3  # the same where w matters: the search for a proof needs more room
 GROWTH = 4.0  # of G_0 from one iterate to the next, at most, as its multiplier weighs it
-MOST_CORNERS = 256  # of the input box, an inequality for each
+MOST_CORNERS = 4096  # of the input box, a matrix for each
 LARGEST_MULTIPLIER = 100.0  # of the mean eigenvalue of P: where nothing else bounds M
 
 
@@ -90,9 +90,9 @@ class MatrixSet:
         positive[1 + n_theta :] = basis
         result = [MatrixInequality(positive)]
         decrease = _decrease(self.problem, basis)
-        for G in corners:
-            slopes = _twice_symmetric(self.M.T @ G)
-            result.append(MatrixInequality(np.concatenate([0.0 * decrease[:1], slopes, decrease])))
+        slopes = _twice_symmetric(self.M.T @ corners).transpose(1, 0, 2, 3)
+        of_P = np.broadcast_to(decrease[:, None], (n_P, *slopes.shape[1:]))
+        result.append(MatrixInequality(np.concatenate([0.0 * slopes[:1], slopes, of_P])))
         lead = len(self.M)
         scale = np.einsum("ab,viab->i", self.M[:, :lead], corners[..., :lead])  # Σ tr T G_0
         limit = np.zeros((1 + n_theta + n_P, 1, 1))
@@ -119,12 +119,13 @@ class MatrixSet:
         bounded[1 + n_P :, n_y:, :n_y] = multipliers.transpose(0, 2, 1)
         inequalities = [MatrixInequality(positive), MatrixInequality(bounded)]
         storage = _decrease(problem, np.concatenate([P[None], moves]))
-        for corner in _coefficients(problem):
-            G = np.tensordot(theta, corner, axes=1)
-            terms = _twice_symmetric(np.concatenate([M[None], multipliers]).transpose(0, 2, 1) @ G)
-            F = np.concatenate([storage, terms[1:]])
-            F[0] += terms[0]
-            inequalities.append(MatrixInequality(F))
+        G = np.einsum("i,viab->vab", theta, _coefficients(problem))
+        each = np.concatenate([M[None], multipliers]).transpose(0, 2, 1)
+        terms = _twice_symmetric(each[:, None] @ G)
+        of_P = np.broadcast_to(storage[:, None], (len(storage), *terms.shape[1:]))
+        F = np.concatenate([of_P, terms[1:]])
+        F[0] += terms[0]
+        inequalities.append(MatrixInequality(F))
         z = centre(inequalities, np.zeros(n_P + n_M))
         return MatrixSet(
             problem,
@@ -175,4 +176,4 @@ def _symmetric(entries: FloatArray, size: int) -> FloatArray:
 
 
 def _twice_symmetric(X: FloatArray) -> FloatArray:
-    return np.asarray(X + X.transpose(0, 2, 1))
+    return np.asarray(X + np.swapaxes(X, -2, -1))

@@ -262,11 +262,15 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
 
 @dataclass(frozen=True)
 class Offer:
-    """The methods of a class, the default first, and those that run beside what is asked for."""
+    """The methods of a class, the default first, and those that run beside what is asked for.
+
+    needs_validation: the search chooses by validation trials.
+    """
 
     search: Callable[[Dataset, Any, Task], Trail[Any]]
     methods: tuple[type[Method], ...]
     comparators: tuple[type[Method], ...]
+    needs_validation: bool = False
 
 
 OFFERS: dict[type, Offer] = {
@@ -278,7 +282,7 @@ OFFERS: dict[type, Offer] = {
         (Rse, LeastSquares, Rie, FirstRse, CertifiedRse, CertifiedSem),
         (LeastSquares, Rie, FirstRse, Rse),
     ),
-    BlockCascadeClass: Offer(block_cascade, (Sem,), ()),
+    BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     MonotoneClass: Offer(
         monotone, (MomentRie, Rie, LeastSquares, Sem), (LeastSquares, Rie, MomentRie)
     ),

@@ -14,7 +14,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.regressors import lagged, signal_scale
+from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.state_affine import OutOfRange
@@ -225,7 +225,7 @@ def _refuse_rank(R: FloatArray, lags: int) -> None:
     if rank < len(R):
         raise DataError(
             f"the excitation does not excite {lags} lags: its polynomial basis of {len(R)} has "
-            f"rank {rank}; use richer inputs, fewer lags or a lower degree"
+            f"rank {rank}; {FEWER}"
         )
 
 

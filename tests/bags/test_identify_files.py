@@ -210,9 +210,10 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
         few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=quiet
     )
     assert len(both.selection.tried) == 4
-    assert both.selection.fit.errors["validation"][both.selection.fit.method.name] == min(
-        both.selection.errors
-    )
+    least = both.selection.tried[int(np.argmin(both.selection.errors))]
+    assert both.selection.best is least.model_class
+    assert both.selection.fit.model.bags == tuple((t.name, t.digest) for t in both.identified.train)
+    assert len(both.identified.train) == 2, "the training and the validation trial"
 
 
 @pytest.mark.parametrize(

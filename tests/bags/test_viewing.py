@@ -428,4 +428,4 @@ def test_the_plotjuggler_layout_asks_for_what_is_published(funnel: Path) -> None
     proved = documents.load_proved(funnel)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     reading = replay_messages(proved.design, trial, centre=Centre.COMMAND)[-1].reading
-    assert asked <= set(reading.numbers | HalfWidths(proved.design).at(reading.t))
+    assert asked <= set(reading.numbers | HalfWidths(proved.design).of(reading))
