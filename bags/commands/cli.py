@@ -429,15 +429,19 @@ def live(
         list[str] | None,
         typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
     ] = None,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", help="All nodes in one process, on one executor.")
+    ] = False,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
     from bags.chain.shipped import shipped_file
-    from bags.commands.launching import LaunchFile, run_together
+    from bags.commands.launching import LaunchFile, in_one_process, run_together
 
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
-    raise typer.Exit(run_together(launch.commands(arguments or [])))
+    commands = launch.commands(arguments or [])
+    raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
 
 
 @app.command()
