@@ -41,6 +41,7 @@ cp: Any = cvxpy  # its functions are not seen by type checkers
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
+CLOSE = 1.25  # times the narrowest forecast: of these the tube that is narrowest for ever is taken
 MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
@@ -405,7 +406,7 @@ def _best(
     rhos: Sequence[float],
     decided: Callable[[_Found], str],
 ) -> _Found:
-    """The pair (L, ρ) whose forecast `samples` ahead is the narrowest of those solved and proved.
+    """The pair (L, ρ), solved and proved, of the narrowest tube with a forecast near the narrowest.
 
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
@@ -426,14 +427,19 @@ def _best(
     ranked.sort()
     refused = ""
     for first in range(0, min(len(ranked), MOST), SOLVED):
-        tried: list[tuple[float, _Found]] = []
+        tried: list[tuple[float, float, _Found]] = []
         for _, i, rho in ranked[first : first + SOLVED]:
             found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
             if found is not None:
                 alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
-                width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
-                tried.append((width, replace(found, at=i)))
-        for _, found in sorted(tried, key=lambda entry: entry[0]):
+                spent = _forecast_budget([part[:, i] for part in e], found.R, rho, None)
+                ahead, lasting = (
+                    float(np.mean(np.sqrt(most / found.tau) / amplitudes))
+                    for most in (alpha, spent)
+                )
+                tried.append((ahead, lasting, replace(found, at=i)))
+        enough = CLOSE * min((ahead for ahead, _, _ in tried), default=0.0)
+        for _, _, found in sorted(tried, key=lambda entry: (entry[0] > enough, entry[1])):
             refused = decided(found)
             if not refused:
                 return found
@@ -463,12 +469,13 @@ def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
     return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
 
 
-def _forecast_budget(e: list[FloatArray], R: FloatArray, rho: float, samples: int) -> float:
-    """max_k Σ_{i=0..h} ρ^(h-i) |e_{k+i}|²_R over all starts k, h = `samples`."""
+def _forecast_budget(e: list[FloatArray], R: FloatArray, rho: float, samples: int | None) -> float:
+    """max_k Σ_{i=0..h} ρ^(h-i) |e_{k+i}|²_R over all starts k, h = `samples`; None: all before."""
+    spent = [np.einsum("ti,ij,tj->t", part, R, part) for part in e]
+    if samples is None:
+        return max(float(lfilter([1.0], [1.0, -rho], part).max()) for part in spent)
     weights = rho ** np.arange(samples + 1)
-    return max(
-        float(np.convolve(np.einsum("ti,ij,tj->t", part, R, part), weights).max()) for part in e
-    )
+    return max(float(np.convolve(part, weights).max()) for part in spent)
 
 
 def _solved(
