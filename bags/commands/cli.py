@@ -384,15 +384,19 @@ def live(
         list[str] | None,
         typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
     ] = None,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", help="All nodes in one process, on one executor.")
+    ] = False,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
     from bags.chain.shipped import shipped_file
-    from bags.commands.launching import LaunchFile, run_together
+    from bags.commands.launching import LaunchFile, in_one_process, run_together
 
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
-    raise typer.Exit(run_together(launch.commands(arguments or [])))
+    commands = launch.commands(arguments or [])
+    raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
 
 
 @app.command()
@@ -444,11 +448,14 @@ def demo(
     out_dir: Annotated[
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
+    robot: Annotated[
+        str, typer.Option(help="f1tenth, a car's speed; dart, a car's yaw rate on three floors.")
+    ] = "f1tenth",
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     from bags.commands.demo import run_demo
 
-    if not run_demo(out_dir, out):
+    if not run_demo(out_dir, out, robot):
         raise typer.Exit(1)
 
 

@@ -95,7 +95,7 @@ def _tube(axes: Axes, replay: Replay) -> None:
         label="not inside",
     )
     since = f" from {bad[0].t:.3f} s" if bad else ""
-    axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
+    axes.set_title(f"{replay.name}:\n{replay.verdict}{since}", fontsize=8, loc="left")
 
 
 def _output(values: Sequence[float]) -> float:
