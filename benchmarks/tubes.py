@@ -213,7 +213,9 @@ RECORDED: dict[str, Callable[[Path], Case]] = {
 
 def widths(model: Any, made: Any, case: Case, amplitudes: FloatArray) -> dict[str, float]:
     """Of every form, at factor 1, per amplitude: the mean over outputs."""
-    settling, fading, ending = made.funnel.settling, *made.funnel.tubes
+    settling: int = made.funnel.settling
+    fading: Tube = made.funnel.tubes[0]
+    ending: Tube = made.funnel.tubes[1]
     still = np.zeros((1, *fading.L.shape))
     errors, others = (
         [innovations(model, still, t, settling)[:, 0] for t in data]
