@@ -131,6 +131,7 @@ class ContinuousTracking:
     R: ArrayLike | None = None
     gain: str = "constant"
     limits: ArrayLike | None = None
+    uncertain: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         require_one_of(self, "shape", get_args(Shape))

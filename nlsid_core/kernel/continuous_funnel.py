@@ -26,7 +26,8 @@ from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 
-MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
+MAX_STATES, MAX_INPUTS, MAX_LIMITED = 16, 16, 3
+MAX_UNCERTAIN, MAX_CORNERED = 32, 10  # entries of w: in all, and where their vertices decide
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
 PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
@@ -296,14 +297,17 @@ def _decide_pieces(
     """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
     kappa = None
     if "kappa" in stated:
-        kappa = stated["kappa"].array(len(field.box))
-        if any(k <= 0 for k in kappa):
+        kappa = stated["kappa"].array(len(spans), len(field.box))
+        if any(k <= 0 for row in kappa for k in row):
             raise Rejected("kappa should be positive")
         terms = [row for span in field.equations for equation in span for row, _ in equation]
         if any(any(row[1 + field.n + field.m :]) and sum(row) > 1 for row in terms):
             raise Rejected("w does more than add constants: kappa does not bound what it does")
+    elif len(field.box) > MAX_CORNERED:
+        raise Rejected(f"at most {MAX_CORNERED} entries of w are decided without kappa")
     limited = len(policy.limits)
-    vertices = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
+    middle = [tuple((a + b) / 2 for a, b in field.box)]
+    vertices = middle if kappa else list(product(*field.box))
     needed = product(range(len(spans)), range(len(vertices)), product((0, -1, 1), repeat=limited))
     combinations = len(spans) * len(vertices) * 3**limited
     if combinations > MAX_PIECES:
@@ -336,7 +340,8 @@ def _decide_pieces(
         key = ring.width, k, level, index, mode
         if key not in loops:
             loops.clear()
-            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, kappa, margin)
+            bound = kappa[k] if kappa else []
+            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, bound, margin)
         loop, piece = loops[key], pieces[number]
         c = loop.condition(multiplier, piece, stated, vertices[v])
         squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
@@ -352,7 +357,7 @@ class _Loop:
 
     def __init__(
         self, ring: Ring, field: Field, policy: Policy, funnel: Funnel, span: int,
-        place: tuple[int, int, int], mode: tuple[int, ...], kappa: list[Fraction] | None,
+        place: tuple[int, int, int], mode: tuple[int, ...], kappa: list[Fraction],
         margin: Fraction,
     ) -> None:  # fmt: skip
         (k, level, index), x = place, ring.variables
@@ -385,7 +390,7 @@ class _Loop:
         states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
         forms = [in_time(funnel.t[k : k + 2]), *states, *inputs]
         self.growth = _growth(ring, field.equations[span], Px, forms, 2 * h)
-        for j, (bound, (low, high)) in enumerate(zip(kappa or [], field.box, strict=False)):
+        for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=False)):
             unit = tuple(int(i == j) for i in range(len(field.box)))
             along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
             half = (high - low) / 2

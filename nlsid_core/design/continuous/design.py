@@ -3,20 +3,23 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
-from nlsid_core.design.continuous.lstep import sections
+from nlsid_core.design.continuous.expansion import sweep_expanded
+from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Goal, Setting, prepare
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
 from nlsid_core.design.continuous.sweep import Ends, Progress, sweep_rho
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -65,6 +68,7 @@ def design_funnel(
     R: ArrayLike | None = None,
     gain: str = "constant",
     limits: ArrayLike | None = None,
+    uncertain: ArrayLike | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
@@ -75,13 +79,14 @@ def design_funnel(
     """
     started = time.perf_counter()
     setting = prepare(
-        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits
-    )
+        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
+        uncertain=uncertain,
+    )  # fmt: skip
     if shape == "P":
         refuse_shape(setting.steps)
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
-    funnel, proved, margin = _swept(setting, progress)
+    setting, funnel, proved, margin = _swept(setting, progress)
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -155,37 +160,60 @@ def validity_caps(field: VectorField, policy: ContinuousPolicy, P: FloatArray) -
     return caps
 
 
-def _swept(setting: Setting, progress: Progress | None) -> tuple[ContinuousFunnel, Proved, float]:
-    """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
+def _swept(
+    setting: Setting, progress: Progress | None
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+    """ρ by the backward sweep, and its proof; with a larger margin where that fails.
+
+    Of dynamics that are not polynomial the setting that is returned has the field that was proved.
+    """
     steps, policy, P = setting.steps, setting.policy, setting.P
-    pairs = sections(steps.field, policy, P)
+    if setting.expansion is not None:
+        return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
+    pairs = sections(steps, policy, P)
     caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
 
-    def search(margin: float) -> tuple[FloatArray, list[Ends] | None]:
-        return sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
-                         progress=progress)  # fmt: skip
+    def search(margin: float) -> tuple[Setting, FloatArray, list[Ends] | None]:
+        found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
+                          progress=progress)  # fmt: skip
+        return setting, *found
 
     return proved_for(setting, rho_final, search)
+
+
+def _expanded(
+    setting: Setting, progress: Progress | None, margin: float
+) -> tuple[Setting, FloatArray, list[Ends] | None]:
+    """The sweep that expands the dynamics around what it finds; the setting has their field."""
+    assert setting.expansion is not None
+    steps, policy = setting.steps, setting.policy
+    found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
+                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
+    field = field_of(found.cubics, policy.t)
+    policy = replace(policy, vector_field=files.digest(field.document()))
+    proving = LSteps(field, policy, nonlinear=steps.nonlinear)
+    proving.kappa = steps.kappa
+    return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 
 
 def proved_for(
     setting: Setting,
     rho_final: float,
-    search: Callable[[float], tuple[FloatArray, list[Ends] | None]],
-) -> tuple[ContinuousFunnel, Proved, float]:
+    search: Callable[[float], tuple[Setting, FloatArray, list[Ends] | None]],
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
-    steps, policy = setting.steps, setting.policy
-    digest = files.digest(policy.document())
     margin = setting.margin(rho_final)
     proved: Proved | None = None
     for _ in range(RETRIES):
-        rho, ends = search(margin)
+        setting, rho, ends = search(margin)
+        steps, policy = setting.steps, setting.policy
+        digest = files.digest(policy.document())
         funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
         refuse_unmonitorable(funnel)
         proved = prove_pieces(steps, policy, funnel, ends)
         if not proved.unproved:
-            return funnel, proved, margin
+            return setting, funnel, proved, margin
         margin *= GROWTH
     assert proved is not None
     raise Infeasible(
