@@ -69,9 +69,7 @@ class Rates:
             raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
         names = ("t", *variable_names(n, m, len(box)))
         blank = cls(function, n, m, box, (), ())
-        symbols = [
-            _Symbol(p.exact(), frozenset([j])) for j, p in enumerate(variables(names))
-        ]
+        symbols = [_Symbol(p.exact(), frozenset([j])) for j, p in enumerate(variables(names))]
         traced = [_Symbol.made(row) for row in blank.called(symbols)]
         exact = tuple(row.cubic(names, 1 + n + m) for row in traced)
         return cls(function, n, m, box, exact, tuple(row.uses for row in traced))
@@ -105,7 +103,9 @@ class Rates:
         parts = {"t": z[0], "x": held[1 : 1 + n], "u": held[1 + n : 1 + n + m],
                  "w": held[1 + n + m :]}  # fmt: skip
         try:
-            rows = self.function(*(parts[name] for name in inspect.signature(self.function).parameters))
+            rows = self.function(
+                *(parts[name] for name in inspect.signature(self.function).parameters)
+            )
             rows = list(np.asarray(rows, dtype=object).reshape(-1)) if isinstance(
                 rows, np.ndarray) else list(rows)  # fmt: skip
         except NlsidError:
@@ -147,7 +147,9 @@ class Rates:
                 return whole
         except (TypeError, ValueError, IndexError):
             pass
-        return np.array([called(x, u, w) for x, u, w in zip(X, U, W, strict=True)], dtype=np.float64)
+        return np.array(
+            [called(x, u, w) for x, u, w in zip(X, U, W, strict=True)], dtype=np.float64
+        )
 
     def on(self, low: FloatArray, high: FloatArray, times: tuple[float, float]) -> "Cubic":
         """The cubics on the box low ≤ (x, u) ≤ high, (n + m,), and the times; DataError if none."""
@@ -202,7 +204,9 @@ class Cubic:
     @property
     def bounds(self) -> FloatArray:
         """(n,) of what the cubics leave out; 0 for exact rates."""
-        return np.array([self.rows[i].bound if i in self.rows else 0.0 for i in range(self.rates.n)])
+        return np.array(
+            [self.rows[i].bound if i in self.rows else 0.0 for i in range(self.rates.n)]
+        )
 
     def __call__(self, t: float, X: FloatArray, U: FloatArray, w: FloatArray) -> FloatArray:
         """ẋ (N, n) of the cubics at X (N, n) and U (N, m), with w (n_w + remainders,)."""
@@ -242,7 +246,11 @@ class Cubic:
     def nonlinear_states(self) -> tuple[int, ...]:
         """What `VectorField.nonlinear_states` is, whatever coefficients vanish on this box."""
         n, last = self.rates.n, 1 + self.rates.n + self.rates.m
-        rows = [[j for j in used if 0 < j < last] for row in self.rows.values() for used in row.monomials]
+        rows = [
+            [j for j in used if 0 < j < last]
+            for row in self.rows.values()
+            for used in row.monomials
+        ]
         for p in self.rates.exact:
             exponents = [] if p is None else p.exponents[:, 1:last].tolist()
             rows += [[1 + j for j, e in enumerate(row) for _ in range(e)] for row in exponents]
@@ -406,7 +414,11 @@ class _Symbol:
 
     def _power(self, power: Any) -> "_Symbol":
         try:
-            p = None if self.p is None or self.p.degree * power > MAX_TOTAL_DEGREE else self.p**power
+            p = (
+                None
+                if self.p is None or self.p.degree * power > MAX_TOTAL_DEGREE
+                else self.p**power
+            )
         except NotPolynomial:
             p = None
         return _Symbol(p, self.uses)
@@ -419,7 +431,7 @@ class _Symbol:
         raise TypeError("a comparison: which branch holds is not known on a whole box")
 
     __pow__ = _power
-    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __bool__ = _refused  # type: ignore
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __bool__ = _refused
     __hash__ = None  # type: ignore[assignment]
     __abs__ = sqrt = sin = cos = tan = exp = log = tanh = arctan = arctan2 = fabs = _unknown
     absolute = _unknown

@@ -165,6 +165,11 @@ class VectorField:
         """
         if len(self.uncertain) and not self.is_pushed:
             return tuple(range(self.n))
+        return self.curved_states
+
+    @property
+    def curved_states(self) -> tuple[int, ...]:
+        """`nonlinear_states` where w is not taken at its corners."""
         found: set[int] = set()
         for equations in self.pieces:
             for p in equations:
@@ -182,9 +187,13 @@ class VectorField:
         Then 2|x̄'Pg|r ≤ r(κ(x̄'Pg)² + 1/κ) bounds what each does, and no corner is needed.
         """
         many = MANY_PUSHES if self.n <= FEW_STATES else 1
-        return len(self.uncertain) >= many and all(
-            self.pushes(span) is not None for span in range(len(self.pieces))
-        )
+        return len(self.uncertain) >= many and self.only_pushes
+
+    @property
+    def only_pushes(self) -> bool:
+        """True if there is a w and it does nothing but add constants to ẋ."""
+        spans = range(len(self.pieces))
+        return len(self.uncertain) > 0 and all(self.pushes(span) is not None for span in spans)
 
     def pushes(self, span: int) -> FloatArray | None:
         """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""

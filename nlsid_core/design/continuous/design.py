@@ -192,7 +192,7 @@ def _expanded(
                            rho_final=setting.rho_final, progress=progress)  # fmt: skip
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
-    proving = LSteps(field, policy, nonlinear=steps.nonlinear)
+    proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed)
     proving.kappa = steps.kappa
     return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 

@@ -68,9 +68,7 @@ class Diagnosis:
         )
 
 
-def diagnosed(
-    steps: LSteps, sections: Sequence[Section], rhos: Sequence[float]
-) -> Diagnosis:
+def diagnosed(steps: LSteps, sections: Sequence[Section], rhos: Sequence[float]) -> Diagnosis:
     """The terms at the one of these instants, with these ρ, where least is left. ρ is linear."""
     h = abs(sections[-1].t - sections[0].t) or 1.0
     growth = (rhos[-1] - rhos[0]) / h
@@ -123,7 +121,7 @@ def _terms(
         len(steps.local[section.interval].rates.uncertain) if section.interval in steps.local else 0
     )  # fmt: skip
     if steps.kappa is not None:
-        pushed = -steps.pushed(section, x_bar) / rho
+        pushed = -steps.from_pushes(section, x_bar) / rho
     else:
         pushed = np.zeros((len(x_bar), len(centre)))
         for j, value in enumerate(steps.vertices[vertex].tolist()):

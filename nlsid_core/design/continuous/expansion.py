@@ -23,6 +23,7 @@ NEAR = 1.01  # of the largest ρ: closer is not worth another expansion
 STEP = 1.3  # of ρ, while the largest is bracketed
 FALL = 0.98  # of ρ, squared at each further try
 MAX_TRIES = 10  # of exact L-steps a knot
+BACK, MAX_BACK = 0.8, 40  # of ρ, where the interval before cannot take it; how often
 LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
 
 
@@ -95,23 +96,30 @@ def sweep_expanded(
     margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the time and why.
     """
     K = len(P)
-    rho = np.empty(K)
-    rho[-1] = rho_final
-    ends: list[Ends] = []
-    cubics: list[Cubic] = []
-    known: Ends | None = None
-    ratio = 1.0
-    for k in range(K - 2, -1, -1):
+    rho, caps = np.full(K, rho_final), np.full(K, np.inf)
+    ends: dict[int, Ends] = {}
+    k, back = K - 2, 0
+    while k >= 0:
         pair = (section_at(steps, policy, P, k, 0.0), section_at(steps, policy, P, k, 1.0))
         step = _Interval(expansion, steps, policy, P, k, pair, float(rho[k + 1]), margin)
-        found, known = step.largest(ratio, known)
-        ratio = found / rho[k + 1]
-        rho[k] = found
-        ends.append(known)
-        cubics.append(steps.local[k])
+        ratio = rho[k + 1] / rho[k + 2] if k + 2 < K else 1.0
+        try:
+            rho[k], ends[k] = step.largest(ratio, ends.get(k + 1), float(caps[k]))
+        except Infeasible:
+            # What ρ_{k+1} leaves at the end of this interval may be too much for its feedback.
+            back += 1
+            if back > MAX_BACK:
+                raise
+            caps[k + 1] = BACK * rho[k + 1]
+            if k == K - 2:
+                rho[-1] = caps[-1]
+            else:
+                k += 1
+            continue
         if progress is not None:
             progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
-    return Swept(rho, ends[::-1], cubics[::-1])
+        k -= 1
+    return Swept(rho, [ends[k] for k in range(K - 1)], [steps.local[k] for k in range(K - 1)])
 
 
 @dataclass(eq=False)
@@ -160,12 +168,12 @@ class _Interval:
         left = self.slack(rho, min(s.m for s in at_start), min(s.m for s in at_end))
         return left, Ends(at_start, at_end)
 
-    def largest(self, ratio: float, known: Ends | None) -> tuple[float, Ends]:
-        """The largest ρ at the start, nearly, and its L-steps.
+    def largest(self, ratio: float, known: Ends | None, cap: float) -> tuple[float, Ends]:
+        """The largest ρ ≤ cap at the start, nearly, and its L-steps.
 
         Where a bound from the last programs promises what the next do not keep, ρ falls anyway.
         """
-        rho, most, fall = self.after * ratio, np.inf, FALL
+        rho, most, fall = min(self.after * ratio, cap), cap, FALL
         for _ in range(MAX_TRIES):
             if known is not None:
                 rho = self.bracketed(min(rho, most), known, most)
@@ -211,4 +219,3 @@ class _Interval:
         rho = float(levels[int(np.argmax(values))])
         self.expand(rho)
         return diagnosed(self.steps, self.pair, (rho, self.after))
-

@@ -101,7 +101,8 @@ class LSteps:
 
     A case is a vertex of w in a mode of the policy: every vertex in the first mode comes first.
     limits and modes: of the policy, if its inputs are clipped. nonlinear: the states that the
-    programs take as such, the field's or more. local: what the dynamics are on an interval, where
+    programs take as such, the field's or more. pushed: whether what w does is bounded, not taken at
+    its corners; only where it adds constants to ẋ (None: the field's `is_pushed`). local: what the dynamics are on an interval, where
     a search expands them anew; else they are the field. kappa: (intervals, n_w), if w only pushes.
     """
 
@@ -111,11 +112,14 @@ class LSteps:
         policy: ContinuousPolicy | None = None,
         *,
         nonlinear: tuple[int, ...] | None = None,
+        pushed: bool | None = None,
         tolerance: float = 1e-5,
     ) -> None:
         refuse_degree(field)
         self.field = field
-        self.nonlinear = field.nonlinear_states if nonlinear is None else nonlinear
+        self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
+        taken = field.curved_states if self.pushed else field.nonlinear_states
+        self.nonlinear = taken if nonlinear is None else nonlinear
         self.local: dict[int, Cubic] = {}
         self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
@@ -123,7 +127,7 @@ class LSteps:
         self.program = sphere_program(field, self.nonlinear, reduced=len(self.limits) == 0)
         self.kappa: FloatArray | None = None
         self.solved = 0
-        if field.is_pushed and policy is not None:
+        if self.pushed and policy is not None:
             self.kappa = np.ones((len(policy.t) - 1, len(field.uncertain)))
             self.vertices = field.uncertain.mean(axis=1)[None]
         else:
@@ -178,10 +182,10 @@ class LSteps:
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
         if self.kappa is not None:
-            W_rate += self.pushed(section, x_bar).sum(axis=1)
+            W_rate += self.from_pushes(section, x_bar).sum(axis=1)
         return np.asarray(-W_rate / rho - self._from_defect(section, rho))
 
-    def pushed(self, section: Section, x_bar: FloatArray) -> FloatArray:
+    def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
         """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""
         assert self.kappa is not None
         kappa = self.kappa[section.interval]

@@ -58,7 +58,9 @@ def plan_motion(
     """
     ends = [np.asarray(part, dtype=np.float64) for part in (start, end)]
     if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
-        raise DataError(f"start and end should be states (n,), are {ends[0].shape}, {ends[1].shape}")
+        raise DataError(
+            f"start and end should be states (n,), are {ends[0].shape}, {ends[1].shape}"
+        )
     if not seconds > 0:
         raise DataError(f"seconds should be above 0, is {seconds}")
     if u is None and m is None and not isinstance(dynamics, VectorField):
@@ -129,7 +131,9 @@ class _Mesh:
         """(n + m,) what is a large change of each entry."""
         spread = np.ptp(z, axis=0)
         inputs = np.where(np.isfinite(self.box).all(axis=1), np.ptp(self.box, axis=1), np.inf)
-        spread[self.n :] = np.where(np.isfinite(inputs), inputs / 2, np.maximum(np.abs(self.rest), 1))
+        spread[self.n :] = np.where(
+            np.isfinite(inputs), inputs / 2, np.maximum(np.abs(self.rest), 1)
+        )
         return np.where(spread > 0, spread, 1.0)
 
     def defects(self, z: FloatArray) -> FloatArray:
@@ -207,9 +211,7 @@ class _Mesh:
                     break
         return z
 
-    def _step(
-        self, z: FloatArray, sizes: FloatArray, trust: float
-    ) -> tuple[FloatArray, float]:
+    def _step(self, z: FloatArray, sizes: FloatArray, trust: float) -> tuple[FloatArray, float]:
         """The step (K, n + m) of one convex program, and the merit it promises."""
         n, width, K = self.n, z.shape[1], len(z)
         m, count = width - n, (K - 1) * n
@@ -251,7 +253,7 @@ class _Mesh:
             worst = float(np.abs(d).max(initial=0.0))
             if worst <= SETTLED:
                 break
-            J = (sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, len(z))))
+            J = sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, len(z)))
             J = J.tocsc()[:, np.flatnonzero(free.ravel())]
             normal = (J @ J.T + 1e-13 * sp.eye(J.shape[0])).tocsc()
             try:
@@ -270,6 +272,9 @@ class _Mesh:
             )
         u, (low, high) = z[:, n:], self.box.T
         reach = (high - low) * (1 / KEPT - 1) / 2
-        if ((u > high + np.where(np.isfinite(reach), reach, 0)) | (u < low - np.where(np.isfinite(reach), reach, 0))).any():
+        if (
+            (u > high + np.where(np.isfinite(reach), reach, 0))
+            | (u < low - np.where(np.isfinite(reach), reach, 0))
+        ).any():
             raise Infeasible("the motion needs more than the limits: give more seconds")
         return z

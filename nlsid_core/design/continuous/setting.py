@@ -33,6 +33,7 @@ START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rat
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
 TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 DECAY = 3.0  # c of the thesis's first guess for the satellite
+ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 
 
@@ -107,10 +108,12 @@ def prepare(
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
     refuse_saturated(policy)
+    many_cases = expansion is not None or len(policy.limits) > 0
+    pushed = field.only_pushes and (field.is_pushed or many_cases)
     nonlinear = None
-    if expansion is not None and (field.is_pushed or not len(field.uncertain)):
+    if expansion is not None and (pushed or not len(field.uncertain)):
         nonlinear = expansion.nonlinear_states()
-    steps = LSteps(field, policy, nonlinear=nonlinear)
+    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
     rho_final, target = _final(steps, policy, S, wanted, expansion)
     return Setting(steps, policy, S, rho_final, target, expansion)
 
@@ -227,7 +230,11 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
                 f"the goal should be {n} half-widths, or an ellipsoid's ({n}, {n}) matrix; its "
                 f"shape is {wanted.P.shape}"
             )
-        wanted = Goal(wanted.centre, definite(wanted.P, n, "the goal's matrix", strict=True))
+        P = (wanted.P + wanted.P.T) / 2
+        skew = np.abs(wanted.P - P).max(initial=0.0)
+        if not skew <= ASYMMETRY * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0:
+            raise DataError("the goal's matrix should be symmetric positive definite")
+        wanted = Goal(wanted.centre, P)
         d = nominal.x.ends()[-1] - wanted.centre
         if d @ wanted.P @ d >= 1:
             raise DataError(

@@ -158,7 +158,9 @@ def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePol
     to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
                           for s in share])  # fmt: skip
     for start, end in itertools.pairwise(t):
-        values = np.array([np.ravel(np.asarray(u(float(start + s * (end - start))), float)) for s in share])
+        values = np.array(
+            [np.ravel(np.asarray(u(float(start + s * (end - start))), float)) for s in share]
+        )
         pieces.append(np.linalg.solve(to_values, values))
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]

@@ -100,7 +100,7 @@ def random_claim(rng: np.random.Generator) -> Files:
     if limited:
         proof["sides"] = first
     if pushed:
-        proof["kappa"] = rng.uniform(0.5, 2, n_w).tolist()
+        proof["kappa"] = rng.uniform(0.5, 2, (intervals, n_w)).tolist()
     modes = product((-1, 0, 1), repeat=limited)
     vertices = 1 if pushed else 2**n_w
     for k, mode, vertex in product(range(intervals), modes, range(vertices)):
