@@ -120,11 +120,11 @@ def satellite() -> Written:
 def van_der_pol() -> Written:
     """The oscillator run backward in time, without an input, from the origin's region."""
 
-    def rate(x: Any, u: Any) -> Any:
+    def rate(x: Any) -> Any:
         return [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]]
 
     times = np.linspace(0, 4, 31)
-    motion = integrate_nominal(rate, lambda t: np.zeros(0), t=times, start=[0, 0])
+    motion = integrate_nominal(rate, lambda _: np.zeros(0), t=times, start=[0, 0])
     return rate, design(ContinuousTracking(rate, motion, goal=[0.5, 0.5]))
 
 
@@ -196,7 +196,7 @@ PROBLEMS: dict[str, Callable[[], Written]] = {
 }
 
 
-class True_:
+class Truth:
     """The equations as they are written, for simulations."""
 
     def __init__(self, function: Callable[..., Any], found: FunnelDesign, given: int) -> None:
@@ -244,7 +244,7 @@ def run(name: str, starts: int) -> dict[str, Any]:
         verdict = check(found.save(folder)[-1])
         check_seconds = time.process_time() - used
     given = 3 if name.startswith("dubins") else 0
-    truth, rng = True_(function, found, given), np.random.default_rng(5)
+    truth, rng = Truth(function, found, given), np.random.default_rng(5)
     later = len(found.funnel.t) // 2
     runs = [
         simulate_boundary(truth, found.policy, found.funnel, starts=count, rng=rng, knot=knot,

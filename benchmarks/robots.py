@@ -6,6 +6,7 @@ DIR holds dart, emps, kuka_kr300, schunk_arm, ur10_panda and cougars_auv; the F1
 the project. Tables are imported as bags once, to the cache. `options` are those of `nlsid init`;
 `lines_of_yaml_edited` counts what was changed in the file that it wrote. Test bags are unseen; a
 false alarm is one of them that is not inside, `caught` are copies of them with a broken sensor.
+DART has a tube for each of six random splits besides, and counts what is flagged on each floor.
 """
 
 import os
@@ -30,19 +31,16 @@ from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import replay_bag
-from bags.recordings.message_types import standard_types
-from bags.recordings.writer import BagWriter
-from bags.samples import f1tenth
+from bags.samples import convert_dart, f1tenth
 from bags.setup.candidates import look
-from bags.setup.proposal import choose, propose
+from bags.setup.proposal import Proposal, choose, propose
 from bags.setup.written import yaml_text
-from bags.signals.expressions import Expression, derivative
+from bags.signals.expressions import Expression
 from bags.signals.reader import read_signals
 from bags.tools.edit import split
 from bags.tools.importing import import_tables
 from benchmarks.cache import cache_folder
 from benchmarks.machine import describe
-from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import NlsidError
 from nlsid_core.running.reading import Status
 
@@ -50,18 +48,13 @@ JOINTS = "sensor_msgs/msg/JointState"
 TWIST = "geometry_msgs/msg/TwistStamped"
 SCHUNK_TRIALS = range(5, 101, 5)  # of 100 repeats of a few motions
 PARTS = 5  # of a robot's only recording
-DART_SECOND = 1.0 / 20.0  # s between samples of the car's motion
-DART_WINDOW = 0.2  # s, of the slopes that make speed and yaw rate of the motion capture's poses
-DART_ROLES = {
-    "rubbery": (
-        "81_throttle_ramps", "80_circles_rubbery_floor", "91_free_driving_16_sept_2024",
-        "free_driving_steer_rate_testing_16_sept_2024", "circles_27_sept_2024_fast_ramp",
-    ),
-    "controls": ("83_4_april_2025_MPCC_rosbag", "83_9_april_2025_MPCCPP_rosbag"),
-    "tape": ("81_circles_tape_and_tiles",),
-    "slippery": ("83_16_april_2025_slippery_floor",),
-}  # fmt: skip
-DART_PART = 30.0  # s: the drives are cut into parts of this length
+DART_INPUTS = (
+    "/command:twist.angular.z|lag(0.1 s) * /motion:twist.linear.x",
+    "/motion:twist.linear.x",
+)
+DART_MODEL = {"model": "state_affine", "lags": 2, "delays": [1], "right_degree": 4}
+DART_KINDS = {"20240909": "ramps", "20240904": "circles", "20240927": "circles", "20240916": "free"}
+DART_SPLITS = 6
 
 
 @dataclass(frozen=True)
@@ -152,69 +145,30 @@ def cougars_bags(folder: Path, cache: Path) -> list[Path]:
 
 
 def dart_bags(folder: Path, cache: Path) -> list[Path]:
-    """The car on the rubbery floor, its drives in parts."""
+    """Every drive of the car on the rubbery floor."""
     return dart_drives(folder, cache, "rubbery")
 
 
-def dart_drives(folder: Path, cache: Path, role: str) -> list[Path]:
-    """Parts of the drives on one floor."""
-    made = []
-    for name in DART_ROLES[role]:
-        for file in sorted((folder / name).glob("*.csv")):
-            bag = cache / f"{role}_{name[:2]}_{file.stem}".replace(".", "_")
-            if not bag.is_dir():
-                write_drive(file, bag)
-            made += parts(bag, DART_PART)
-    return made
+def dart_drives(folder: Path, cache: Path, floor: str) -> list[Path]:
+    """Every drive on one floor, converted once as those that ship are."""
+    drives = cache / "drives"
+    if not drives.is_dir():
+        with tempfile.TemporaryDirectory(dir=cache) as name:
+            for drive in convert_dart.drives(folder):
+                convert_dart.convert(drive, Path(name) / "drives" / drive.name)
+            (Path(name) / "drives").rename(drives)
+    return sorted(drives.glob(f"{floor}_*"))
 
 
-def write_drive(file: Path, bag: Path) -> None:
-    """One drive as commands and motion, every 50 ms by the motion capture's clock.
-
-    Speed and yaw rate are the slopes of positions and yaw over the last DART_WINDOW s, as a monitor
-    would have them. `/drive` has the measured speed beside the steering command, for a model whose
-    inputs both are. Rows before the first pose and with repeated times are left out.
-    """
-    with file.open(encoding="utf-8-sig") as stream:
-        titles = stream.readline().strip().split(",")
-    table = np.genfromtxt(file, delimiter=",", skip_header=1)
-    columns = dict(zip(titles, table.T, strict=True))
-    t = columns["vicon time"]
-    later = np.concatenate([[True], np.diff(t) > 0])
-    t, rows = t[later] - t[0], np.flatnonzero(later)
-    grid = np.arange(t[0], t[-1], DART_SECOND)
-    stamps: IntArray = 1_700_000_000 * 10**9 + np.rint(grid * 1e9).astype(np.int64)
-
-    def on_grid(name: str) -> FloatArray:
-        values = np.unwrap(columns[name][rows]) if "yaw" in name else columns[name][rows]
-        found: FloatArray = np.interp(grid, t, values)
-        return found
-
-    rates = [derivative(on_grid(n), stamps, DART_WINDOW) for n in ("vicon x", "vicon y")]
-    yaw_rate = derivative(on_grid("vicon yaw"), stamps, DART_WINDOW)
-    before = np.maximum(np.searchsorted(t, grid, side="right") - 1, 0)  # commands are held
-    throttle, steering = (columns[name][rows][before] for name in ("throttle", "steering"))
-    with BagWriter(bag) as writer:
-        for k in np.flatnonzero(np.isfinite(yaw_rate)):
-            motion = {"x": float(np.hypot(rates[0][k], rates[1][k])), "yaw": float(yaw_rate[k])}
-            command = {"x": float(throttle[k]), "yaw": float(steering[k])}
-            drive = {"x": motion["x"], "yaw": command["yaw"]}
-            for topic, numbers in (("/command", command), ("/drive", drive), ("/odom", motion)):
-                stamp = int(stamps[k])
-                data = twist(stamp, numbers["x"], numbers["yaw"])
-                writer.write(topic, TWIST, data, log_time_ns=stamp, publish_time_ns=stamp)
-
-
-def twist(stamp_ns: int, x: float, yaw: float) -> bytes:
-    """A TwistStamped with linear.x and angular.z."""
-    kinds = standard_types().types
-    vector = kinds["geometry_msgs/msg/Vector3"]
-    seconds, rest = divmod(stamp_ns, 10**9)
-    header = kinds["std_msgs/msg/Header"](
-        kinds["builtin_interfaces/msg/Time"](seconds, rest), "base"
-    )
-    body = kinds["geometry_msgs/msg/Twist"](vector(x, 0.0, 0.0), vector(0.0, 0.0, yaw))
-    return bytes(standard_types().serialize_cdr(kinds[TWIST](header, body), TWIST))
+def dart_split(bags: list[Path], seed: int) -> dict[str, list[str]]:
+    """Each kind of drive is shuffled and dealt in turn to training, calibration and test."""
+    rng = np.random.default_rng(seed)
+    dealt: tuple[list[str], ...] = ([], [], [])
+    for kind in dict.fromkeys(DART_KINDS.values()):
+        mine = [bag.name for bag in bags if DART_KINDS[bag.name.split("_")[1]] == kind]
+        for turn, k in enumerate(rng.permutation(len(mine))):
+            dealt[turn % 3].append(mine[k])
+    return {"calibration": dealt[1], "test": dealt[2]}
 
 
 def imported(bag: Path, files: Sequence[Path], signals: Sequence[str], *, period: float) -> Path:
@@ -248,10 +202,7 @@ ROBOTS = (
         ("/odom:twist.twist.linear.x", "/odom:pose.pose.orientation.yaw|unwrap|derivative(0.12 s)"),
         ("/cmd_vel:twist.linear.x", "/steering_command:position[name=steering]"),
     ),
-    Robot("DART steering to yaw rate", "dart", dart_bags, ("/odom:twist.angular.z",),
-          ("/command:twist.angular.z",)),
-    Robot("DART yaw rate by steering and speed", "dart", dart_bags, ("/odom:twist.angular.z",),
-          ("/drive:twist.angular.z", "/drive:twist.linear.x")),
+    Robot("DART yaw rate", "dart", dart_bags, ("/motion:twist.angular.z",), DART_INPUTS),
     Robot("Schunk arm", "schunk_arm", schunk_bags),
     Robot("EMPS slide", "emps", emps_bags),
     Robot("KUKA KR300", "kuka_kr300", kuka_bags),
@@ -296,7 +247,8 @@ def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
             step = "monitor"
             row |= held_against(config, test, out)
             if robot.folder == "dart":
-                row |= floors(config, folder, mine, out)
+                step = "floors"
+                row |= floors(robot, bags, folder, mine)
     except NlsidError as error:
         row["refused"] = f"{step}: {error}"
     finally:
@@ -306,11 +258,15 @@ def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
 
 def initialised(robot: Robot, bags: list[Path], path: Path) -> Config:
     """What `nlsid init --yes` writes for this robot, read again."""
+    path.write_text(yaml_text(proposed(robot, bags)))
+    return load_config(path)
+
+
+def proposed(robot: Robot, bags: list[Path]) -> Proposal:
+    """What `nlsid init --yes` proposes for this robot."""
     found = look(bags)
     responses, excitations = choose(found, robot.responses, robot.excitations)
-    proposal = propose(bags, found, responses=responses, excitations=excitations, robot=robot.name)
-    path.write_text(yaml_text(proposal))
-    return load_config(path)
+    return propose(bags, found, responses=responses, excitations=excitations, robot=robot.name)
 
 
 def spread(bags: list[Path], signal: str) -> float:
@@ -341,13 +297,42 @@ def held_against(config: Config, test: list[Path], out: Path) -> dict[str, Any]:
     }
 
 
-def floors(config: Config, folder: Path, cache: Path, out: Path) -> dict[str, str]:
-    """How many drives on other floors are flagged."""
-    said = {}
-    for role in ("controls", "tape", "slippery"):
-        verdicts = [flagged(config, bag, out) for bag in dart_drives(folder, cache, role)]
-        said[f"flagged_{role}"] = f"{sum(verdicts)} of {len(verdicts)}"
-    return said
+def floors(robot: Robot, bags: list[Path], folder: Path, cache: Path) -> dict[str, Any]:
+    """How many drives are flagged over DART_SPLITS random splits, by floor.
+
+    Rubbery drives are those of the test split. The section `identification` is edited for these.
+    """
+    counts = {floor: [0, 0] for floor in ("rubbery", "control", "tape", "slippery")}
+    errors, widths = [], []
+    proposal = proposed(robot, bags)
+    for seed in range(DART_SPLITS):
+        content = proposal.content | {
+            "identification": DART_MODEL,
+            "split": dart_split(bags, seed),
+        }
+        config = Config.model_validate(content)
+        with tempfile.TemporaryDirectory() as name:
+            out = Path(name)
+            fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
+            errors.append(fit.fit.errors["test"][fit.fit.chosen.method.name])
+            made = design_funnel_files(out / documents.MODEL, config, out)
+            widths.append(float(made.funnel.half_widths[0]))
+            for floor, count in counts.items():
+                held = [
+                    bag
+                    for bag in dart_drives(folder, cache, floor)
+                    if floor != "rubbery" or bag.name in config.split.test
+                ]
+                count[0] += sum(flagged(config, bag, out) for bag in held)
+                count[1] += len(held)
+    edited = len(DART_MODEL.keys() | proposal.content["identification"].keys())
+    return {
+        "lines_of_yaml_edited": edited - 1,  # `model` stays
+        "splits": DART_SPLITS,
+        "split_errors": errors,
+        "split_half_widths": widths,
+        **{f"flagged_{floor}": f"{n} of {of}" for floor, (n, of) in counts.items()},
+    }
 
 
 def flagged(config: Config, bag: Path, out: Path) -> bool:

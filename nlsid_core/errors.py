@@ -71,3 +71,8 @@ def apart(*numbers: float) -> tuple[str, ...]:
 def percent(error: float) -> str:
     """A model's error in %, as text; from 1000 % on the model diverges and digits say nothing."""
     return f"{error:.2f} %" if error < 1000.0 else "diverges"
+
+
+def duration(seconds: float) -> str:
+    """A time of processing, in ms below a second."""
+    return f"{seconds * 1e3:.0f} ms" if seconds < 1.0 else f"{seconds:.1f} s"

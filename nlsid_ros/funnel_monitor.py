@@ -1,11 +1,11 @@
 """Node `funnel_monitor`: holds the live state against the latched funnel.
 
-Subscribes to the funnel, its model and its policy, and to the two signals by the model's own field
-paths, on message stamps. Publishes ~/margin (sensor_msgs/JointState: stamped, named numbers) for
-every sample, ~/events when the state changes, and /diagnostics at once when it does, otherwise
-once a second. Leaving the funnel calls `stop_service` and `snapshot_service`. Missing, stale or NaN
-state is unknown (STALE), never inside. What is outside, or violates the assumption, stays so until
-`~/restart`, which begins a new run.
+Subscribes to the funnel, its model and its policy, and to the topics of its signals, of which there
+may be several, by the model's own field paths, on message stamps. Publishes ~/margin
+(sensor_msgs/JointState: stamped, named numbers) for every sample, ~/events when the state changes,
+and /diagnostics at once when it does, otherwise once a second. Leaving the funnel calls
+`stop_service` and `snapshot_service`. Missing, stale or NaN state is unknown (STALE), never inside.
+What is outside, or violates the assumption, stays so until `~/restart`, which begins a new run.
 """
 
 import sys
@@ -29,8 +29,7 @@ from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
 from bags.recordings.message_types import standard_types
-from bags.signals.signal import SignalPath
-from bags.signals.vector import SignalVector
+from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, NlsidError
 from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
@@ -106,12 +105,13 @@ class FunnelMonitor(ManagedNode):
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
         self._signals = Lane(self)
-        self._paths: dict[str, SignalPath | SignalVector] = {}
-        self._kinds: dict[str, str] = {}  # role -> the type it is subscribed with
+        self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
+        self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
         self._watch = None
+        self._names = ""
         self._latched: tuple[State, str] | None = None
-        self._frame_heard = self._frame
+        self._heard_ns: dict[str, int] = {}  # response topic -> when its last message came
         self._run: Run | None = None
         waiting = Reading(0.0, Status.UNKNOWN, reason="waiting for a design")
         self._said: tuple[Reading, State] = waiting, State.UNKNOWN
@@ -160,14 +160,15 @@ class FunnelMonitor(ManagedNode):
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
-        signals = {"excitation": design.command, "response": design.response}
         self._signals.clear()
         self._watch, self._digest = watch, digest
-        self._paths, self._kinds, self._unfit = signals, {}, ""
-        self._frame_heard = self._frame
+        self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
+        self._kinds, self._unfit = {}, ""
+        self._frames.clear()
+        self._heard_ns.clear()
         self._deadlines.clear()
         self._tell(f"no {design.name} yet")
-        self.get_logger().info(f"watching {design.response} and {design.command}")
+        self.get_logger().info(f"watching {watch.pairing}")
         self._begin()
 
     def _on_news(self) -> None:
@@ -198,29 +199,29 @@ class FunnelMonitor(ManagedNode):
         self._publish(self._watch.begin(self._run.start_ns))
 
     def _connect(self) -> None:
-        """Subscribe to the signals, each with a type that its publishers have and that carries it.
+        """Subscribe to the signals' topics, each with a type that is published and carries them.
 
         A subscription whose type is no longer published is replaced.
         """
         if self._watch is None:
             return
-        for role, path in self._paths.items():
-            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(path.topic))
+        for topic in self._watch.pairing.topics:
+            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
             kinds = list(dict.fromkeys(publisher.topic_type for publisher in publishers))
-            if not kinds or self._kinds.get(role) in kinds:
+            if not kinds or self._kinds.get(topic) in kinds:
                 continue
             try:
-                kind = self._fitting(path.topic, kinds)
+                kind = self._fitting(topic, kinds)
             except BagError as error:
                 if str(error) != self._unfit:
                     self._unfit = str(error)
                     self.get_logger().error(str(error))
                     self._tell(str(error))
                 continue
-            self._kinds[role], self._unfit = kind, ""
-            callback = partial(self._on_signal, role, path)
+            self._kinds[topic], self._unfit = kind, ""
+            callback = partial(self._on_signal, topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.subscribe(message_class(kind), path.topic, callback, profile)
+            self._signals.subscribe(message_class(kind), topic, callback, profile)
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
         """The first of the types that carries the signals; BagError about the last if none does."""
@@ -234,43 +235,42 @@ class FunnelMonitor(ManagedNode):
             return kind
         raise unfit
 
-    def _on_signal(self, role: str, path: SignalPath | SignalVector, message: Any) -> None:
-        """Decode stamp and value, and judge whatever samples are complete."""
+    def _on_signal(self, topic: str, message: Any) -> None:
+        """Decode stamp and values, and judge whatever samples are complete."""
         watch = self._watch
         if watch is None:
             return
         logged = watch.pairing.clock == "log"
         stamp_ns = self.get_clock().now().nanoseconds if logged else stamp_ns_of(message)
+        responds = topic in watch.pairing.response_topics
+        if responds and not logged and (reason := self._distrust(topic, stamp_ns, message)):
+            self._publish(watch.refuse(stamp_ns, reason))
+            return
         try:
-            value = path.value(message)
+            judged = watch.message(topic, stamp_ns, message)
         except BagError as error:
             self._publish(watch.missing(str(error)))
             return
-        if role == "excitation":
-            self._publish(watch.excitation(stamp_ns, value))
+        self._publish(judged)
+        if not responds:
             return
-        if not logged and (reason := self._distrust(stamp_ns, message)):
-            self._publish(watch.refuse(stamp_ns, reason))
-            return
-        self._heard_ns = self._patience.now().nanoseconds
+        heard_ns = self._heard_ns[topic] = self._patience.now().nanoseconds
         if self._stale.is_canceled():
             self._stale.reset()
-        judged = watch.response(stamp_ns, value)
-        self._publish(judged)
         if not judged:
             if watch.is_waiting:  # also before the first command, without which there is no sample
                 self._say(Reading(0.0, Status.UNKNOWN, reason=WAITING), State.UNKNOWN)
-            due = self._heard_ns + round(self._command_wait * 1e9)
+            due = heard_ns + round(self._command_wait * 1e9)
             self._deadlines.append((due, stamp_ns))
             if self._release.is_canceled():
-                self._release_in(due - self._heard_ns)
+                self._release_in(due - heard_ns)
 
-    def _distrust(self, stamp_ns: int, message: Any) -> str:
+    def _distrust(self, topic: str, stamp_ns: int, message: Any) -> str:
         """Why a response is not to be judged though its number could be; empty if it is."""
         frame = frame_of(message)
-        self._frame_heard = self._frame_heard or frame
-        if frame != self._frame_heard:
-            return f"the response is in frame '{frame}', not in '{self._frame_heard}'"
+        wanted = self._frames.setdefault(topic, self._frame or frame)
+        if frame != wanted:
+            return f"the response is in frame '{frame}', not in '{wanted}'"
         if self._allow_old_stamps:
             return ""
         return off_clock(stamp_ns, self.get_clock(), self._stale_after)
@@ -291,9 +291,10 @@ class FunnelMonitor(ManagedNode):
             self._release_in(self._deadlines[0][0] - now)
 
     def _on_stale(self) -> None:
-        """The response stopped coming, or did so a while ago: look again when it would have."""
+        """A response stopped coming, or did so a while ago: look again when it would have."""
         patience_ns = round(self._stale_after * 1e9)
-        ahead_ns = self._heard_ns + patience_ns - self._patience.now().nanoseconds
+        heard_ns = min(self._heard_ns.values(), default=0)
+        ahead_ns = heard_ns + patience_ns - self._patience.now().nanoseconds
         self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
         if ahead_ns > 0:  # a reset wakes the executor, so it is not done with every message
             self._stale.reset()
@@ -317,7 +318,7 @@ class FunnelMonitor(ManagedNode):
         self._judged += 1
         message = JointState()
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        numbers = reading.numbers
+        numbers = reading.numbers | self._widths.of(reading)
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)
@@ -394,14 +395,19 @@ class FunnelMonitor(ManagedNode):
             "now": state.value,
             "worst axis": reading.worst_axis,
             "assuming": reading.assuming,
+            "alarm": reading.alarm,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
             "design": self._funnel.state,
+            "signals": self._names,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }
         level, text = LEVELS[state], state.value + (f": {reading.reason}" if reading.reason else "")
+        if reading.alarm:  # no verdict: it warns, and latches nothing
+            level = max(level, DiagnosticStatus.WARN)
+            text += f"; {reading.alarm}"
         if self._latched is not None:
             level, text = DiagnosticStatus.ERROR, self._latched[0].value + f": {self._latched[1]}"
             text += "".join(f"; {name}: {why}" for name, why in self._failures.items())
@@ -420,7 +426,7 @@ class FunnelMonitor(ManagedNode):
             self._run = self._latched = None
             self._unanswered.clear()
             self._failures.clear()
-            self._frame_heard = self._frame
+            self._frames.clear()
             self._deadlines.clear()
             self._tell("restarted")
         return answer

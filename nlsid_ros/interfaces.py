@@ -4,6 +4,7 @@ python -m nlsid_ros.interfaces > docs/nodes.md
 """
 
 import json
+import socket
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,6 +31,7 @@ from nlsid_ros.plant import PlantNode
 from nlsid_ros.running import ManagedNode
 from nlsid_ros.tracking_controller import TrackingController
 from nlsid_ros.trajectory_recorder import TrajectoryRecorder
+from nlsid_ros.viewer import Viewer
 
 HEAD = """# Every node's topics, services and parameters
 
@@ -43,7 +45,11 @@ in the [glossary](glossary.md).
 """
 PATIENCE = 20.0  # s for the nodes to find each other
 SIGNALS = {"/odom", "/cmd_vel"}
-LISTENS = {"funnel_monitor": SIGNALS, "trajectory_recorder": {"/odom"}}
+LISTENS = {
+    "funnel_monitor": SIGNALS,
+    "tracking_controller": {"/odom"},
+    "trajectory_recorder": {"/odom"},
+}
 
 
 def interfaces(folder: Path) -> str:
@@ -109,7 +115,14 @@ def example_nodes(folder: Path) -> list[tuple[str, Callable[[], ManagedNode], di
             },
         ),
         ("plant", PlantNode, {"model": str(folder / documents.MODEL)}),
+        ("viewer", Viewer, {"page": True, "port": _free_port()}),
     ]
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port: int = server.getsockname()[1]
+    return port
 
 
 def _heard(node: ManagedNode) -> set[str]:

@@ -1,7 +1,7 @@
 """Which model to take: orders and bases tried on validation bags, methods scored on test bags."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bags.chain.config import Config
@@ -10,6 +10,7 @@ from bags.chain.steps import Identified, Progress, Trials, part, read_trials, wr
 from bags.designs import documents
 from bags.pictures.choices import Scored, draw_comparison, draw_selection
 from bags.pictures.report import report_available
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.files import write_atomically
 from nlsid_core.identification import Fit, Model, Selection, describe, identify, select
@@ -58,9 +59,13 @@ def select_bags(
         method=base.method,
         test=trials.test,
         transient=base.transient,
+        max_rate=base.max_rate,
         allow_unproved=base.allow_unproved,
         progress=part(progress, 0.3, 0.9),
     )
+    if selection.refitted:
+        both = Dataset((*trials.train.trajectories, *trials.validation.trajectories))
+        trials = replace(trials, train=both, validation=None)
     identified = write_identified(selection.fit, trials, config, out, progress=progress)
     if report_available():
         picture = out / documents.SELECTION_PLOT
@@ -134,6 +139,7 @@ def _every_method(
                 comparators=methods,
                 validation=trials.validation,
                 transient=section.transient,
+                max_rate=section.max_rate,
                 allow_unproved=True,
                 progress=progress,
             )

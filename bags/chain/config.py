@@ -18,7 +18,7 @@ from bags.chain.sections import (
     SignalConfig,
     read_yaml,
 )
-from bags.signals.expressions import Expression
+from bags.signals.expressions import parse_factors
 from bags.signals.sampling import Sampler, sampled_path
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.identification import BlockCascadeClass, LinearClass
@@ -134,6 +134,15 @@ class FunnelConfig(Section):
             example=0.5,
         ),
     ] = None
+    level: Annotated[
+        Literal["auto", "constant", "commands"],
+        Key(
+            "whether the tube is wider while commands move it (`commands`) or as wide always "
+            "(`constant`, which fixed tolerances need); `auto`: `commands` where that is a fifth "
+            "narrower on average over the training trials; without `profile`",
+            example="constant",
+        ),
+    ] = "auto"
     safety_factor: Annotated[
         float,
         Field(ge=1.0, allow_inf_nan=False),
@@ -299,7 +308,7 @@ def _signal_refusals(config: Config) -> Iterator[str]:
                     yield f"{where}.{what}: '{text}' is that of {seen[text]} too"
                 seen[text] = where
             try:
-                several = Expression.parse(signal.path).path.every
+                several = any(factor.path.every for factor in parse_factors(signal.path))
             except BagError as error:
                 sound = False
                 yield f"{where}.path: {error}"
@@ -357,17 +366,6 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"excitation, not by a {kind.__name__} with {said}; leave out `profile` for a tube "
             "around the model's simulation, or use `nlsid track` for a measured state"
         )
-    if config.funnel is not None:
-        for role, signals in (
-            ("response", config.signals.response),
-            ("excitation", config.signals.excitation),
-        ):
-            topics = sorted({signal.path.partition(":")[0] for signal in signals})
-            if len(topics) > 1:
-                yield (
-                    f"funnel: a monitor reads every {role} from one topic, not from "
-                    f"{', '.join(topics)}; publish them in one message, or leave out `funnel`"
-                )
     if kind is BlockCascadeClass and not config.split.validation:
         yield "split.validation: a block_cascade chooses its knots on validation trials; name bags"
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):

@@ -47,7 +47,11 @@ CLASSES: dict[str, type] = {
     "linear_states": LinearStateClass,
 }
 RANGES = ("input_range", "box")  # options of which one [low, high] is the range of one signal
-OWN = {"transient": Annotated[int, Field(ge=0)], "allow_unproved": bool}  # of every section
+OWN = {  # of every section
+    "transient": Annotated[int, Field(ge=0)],
+    "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
+    "allow_unproved": bool,
+}
 
 Progress = Callable[[str, float], None]
 
@@ -56,6 +60,8 @@ Progress = Callable[[str, float], None]
 class IdentificationConfig:
     """What to identify, and how. transient: samples at the start of each trial not scored.
 
+    max_rate: the slowest rate a sample of the models that are searched (None: the time constant is
+    the length of the longest training trial).
     allow_unproved: write a model without a proof of stability too; nothing is certified then.
     given: the section itself, as a mapping.
     """
@@ -64,6 +70,7 @@ class IdentificationConfig:
     method: Method
     given: Mapping[str, object]
     transient: int = 0
+    max_rate: float | None = None
     allow_unproved: bool = False
 
     def identify(
@@ -82,6 +89,7 @@ class IdentificationConfig:
             validation=validation,
             test=test,
             transient=self.transient,
+            max_rate=self.max_rate,
             allow_unproved=self.allow_unproved,
             progress=progress,
         )

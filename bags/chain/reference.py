@@ -40,6 +40,7 @@ IDENTIFICATION = """
 | `model` | the class of models | `linear` |
 | `method` | how it is fitted | the first of the class's |
 | `transient` | samples at the start of each trial that are not scored | `0` |
+| `max_rate` | slowest rate a sample that counts, in (0, 1) | exp(-1/samples of the longest trial) |
 | `allow_unproved` | write a model without a proof of stability too | `false` |
 """
 REQUIRED = {"lags": 1}  # options without a default, so that a class can be made and asked

@@ -282,6 +282,7 @@ def design_funnel_files(
                 reaction_time=options.reaction_time,
                 safety_factor=options.safety_factor,
                 horizon=options.horizon,
+                level=options.level,
                 box=getattr(config.identification.model_class, "box", None),
             )
         )

@@ -4,6 +4,7 @@ A command imports what it runs when it is called: `nlsid check` needs no NumPy, 
 """
 
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -18,6 +19,9 @@ from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
 from nlsid_core.errors import NlsidError
+
+# The matrices of a search are small: threads for them wait for each other, ten times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="nlsid",
@@ -131,6 +135,8 @@ def select(
     with progress_bar("selecting") as progress:
         result = select_bags(folders, settings, out_dir, options=options, progress=progress)
     out.print(show.selection_table(result.selection))
+    if result.selection.refitted:
+        out.print("the chosen class, fitted to training and validation trials together:")
     show.say_identified(out, result.identified)
 
 
@@ -292,8 +298,9 @@ def monitor(
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
-    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside or breaks
-    the assumption, 2 if something was not judged. A tube of one output is drawn too.
+    Status 0 if all of every bag is inside with the assumption kept, 1 if one is outside, breaks the
+    assumption or raises the CUSUM alarm, 2 if something was not judged. A tube of one output is
+    drawn too.
     """
     from bags.chain.config import load_config
     from bags.commands import show
@@ -328,6 +335,9 @@ def monitor(
     for entry in replays:
         if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
+        if (alarm := entry.first_alarm) is not None:
+            said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
+            out.print(said, soft_wrap=True)
         for reading in entry.unjudged:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
@@ -335,7 +345,7 @@ def monitor(
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if drawn:
         out.print(f"wrote {picture}", soft_wrap=True)
-    if any(entry.first_bad is not None for entry in replays):
+    if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)
     if any(entry.unjudged or not entry.judged for entry in replays):
         raise typer.Exit(2)
@@ -386,15 +396,62 @@ def live(
 
 
 @app.command()
+def view(
+    bag: Annotated[
+        Path | None, typer.Argument(help="A recording to replay; none: the live robot.")
+    ] = None,
+    page: Annotated[
+        bool, typer.Option("--page", help="A page for any browser; else a server for Foxglove.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; 0.0.0.0: everyone on the network may look.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(help="Port; 0: 8765 for Foxglove, 8080 for the page.", min=0, max=65535)
+    ] = 0,
+    monitor: Annotated[str, typer.Option(help="The node that is shown.")] = "funnel_monitor",
+    funnel: Annotated[
+        Path | None, typer.Option(help="For a recording: the funnel it is held against.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="For a recording: takes `monitor.nominal`.")
+    ] = None,
+    rate: Annotated[
+        float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
+    ] = 1.0,
+) -> None:
+    """Show tube, signals, margin, assumption and events, live or of a recording, until Ctrl-C."""
+    from bags.commands.viewing import view_live, view_recording
+
+    if bag is None:
+        if importlib.util.find_spec("rclpy") is None:
+            raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+        raise typer.Exit(view_live(monitor, page=page, host=host, port=port))
+    if funnel is None:
+        raise typer.BadParameter("a recording is held against a funnel: give --funnel")
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.designs import documents
+    from bags.viewing.replay import Recording
+
+    centre = show.centre_of(load_config(config) if config is not None else None)
+    recording = Recording(documents.load_proved(funnel), bag, centre=centre)
+    view_recording(recording, rate, page=page, host=host, port=port)
+
+
+@app.command()
 def demo(
     out_dir: Annotated[
         Path, typer.Option("--out", help="Folder for everything the demo makes.")
     ] = Path("nlsid-demo"),
+    robot: Annotated[
+        str, typer.Option(help="f1tenth, a car's speed; dart, a car's yaw rate on three floors.")
+    ] = "f1tenth",
 ) -> None:
     """Run the whole chain on the shipped bags, then live over ROS 2 where rclpy is there."""
     from bags.commands.demo import run_demo
 
-    if not run_demo(out_dir, out):
+    if not run_demo(out_dir, out, robot):
         raise typer.Exit(1)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
 
@@ -15,10 +15,11 @@ from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
+from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign, TubeDesign
-from nlsid_core.errors import DataError, percent
+from nlsid_core.errors import DataError, duration, percent
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.kernel import text
@@ -32,6 +33,10 @@ COLOURS = {
     Status.ASSUMPTION_VIOLATED.value: "dark_orange3",
     Status.UNKNOWN.value: "magenta",
 }
+COMPARISON_CAPTION = """\
+free run: simulated; +k: predicted k samples ahead. residual: coloured (not
+white), follows the input u, or both, at 99 %. rate: proved, a sample; forgets:
+its time constant. time: of the processor."""
 STABILITY = "proved rate a sample (time constant)"
 
 
@@ -58,7 +63,7 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
         table.add_row(
             candidate.method.title,
             percent(fit.errors["test"][candidate.method.name]),
-            f"{candidate.seconds * 1e3:.0f} ms",
+            duration(candidate.seconds),
             stability(candidate),
             style="bold" if candidate is fit.chosen else "",
         )
@@ -67,7 +72,7 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
 
 def notes(result: Identified) -> list[str]:
     """What a user should know beside the table: the search, the residuals, what was skipped."""
-    lines = [str(result.fit.history)]
+    lines = [str(result.fit.history), result.fit.slowest]
     try:
         scores = result.fit.chosen.validate(result.test)
     except DataError as reason:
@@ -101,46 +106,51 @@ def selection_table(selection: Selection[Model]) -> Table:
     return table
 
 
-def comparison_table(compared: Compared) -> Table:
-    """Every method of every class, scored on the same samples of the test trials."""
-    labels = list(dict.fromkeys(row.label for row in compared.rows))
+def comparison_table(compared: Compared) -> Group:
+    """Every method of every class, scored on the same samples: a table a class, 80 columns."""
     left_out = f"after their first {compared.skipped_at_start} samples"
-    title = [f"{len(compared.trials.test)} test trials {left_out}"]
-    if len(labels) == 1:
-        title = [*labels, *title]
-    table = Table(title=": ".join(title), title_justify="left", collapse_padding=True)
-    table.add_column("method" if len(labels) == 1 else "model class, method", min_width=13)
-    table.add_column("free run", justify="right")
+    parts: list[Table | str] = [f"{len(compared.trials.test)} test trials {left_out}; errors in %"]
     horizons = list(compared.rows[0].scores.prediction_percent)
-    for horizon in horizons:
-        table.add_column(f"{horizon} ahead", justify="right")
-    table.add_column("residual")
-    table.add_column(STABILITY, min_width=9)
-    table.add_column("time", justify="right")
-    label = ""
-    for row in compared.rows:
-        if len(labels) > 1 and row.label != label:
-            label = row.label
-            table.add_section()
-            table.add_row(f"[bold]{escape(label)}[/bold]")
-        scores = row.scores
-        flaws = [] if scores.white else ["not white"]
-        flaws += [] if scores.independent else ["follows the input"]
-        table.add_row(
-            row.candidate.method.name,
-            percent(scores.simulation_percent),
-            *(percent(scores.prediction_percent[k]) for k in horizons),
-            ", ".join(flaws) or "white, independent",
-            stability(row.candidate),
-            f"{row.candidate.seconds * 1e3:.0f} ms",
-        )
-    return table
+    for label in dict.fromkeys(row.label for row in compared.rows):
+        table = Table(title=escape(label), title_justify="left", box=SIMPLE_HEAD, padding=0)
+        table.add_column("method", min_width=13, no_wrap=True)
+        for name in ("free run", *(f"+{k}" for k in horizons)):
+            table.add_column(name, justify="right", min_width=6, no_wrap=True)
+        table.add_column("residual", min_width=9)
+        table.add_column("rate", min_width=6)
+        table.add_column("forgets", justify="right", min_width=7, no_wrap=True)
+        table.add_column("time", justify="right", min_width=7, no_wrap=True)
+        for row in compared.rows:
+            if row.label == label:
+                table.add_row(*_compared(row, horizons))
+        parts.append(table)
+    parts.append(COMPARISON_CAPTION)
+    return Group(*parts)
+
+
+def _compared(row: Scored, horizons: Sequence[int]) -> list[str]:
+    """The cells of one method."""
+    scores, candidate = row.scores, row.candidate
+    flaws = {(True, True): "-", (False, True): "coloured", (True, False): "follows u"}
+    rate, forgets = "[dark_orange3]none", ""
+    if candidate.proof is not None:
+        rate, _, rest = stated_rate(candidate.proof, candidate.model.period).partition(" (")
+        rate, forgets = (f"[green]{rate}", rest.rstrip(")")) if rest else ("[green]proved", "")
+    errors = (scores.simulation_percent, *(scores.prediction_percent[k] for k in horizons))
+    return [
+        candidate.method.name,
+        *(percent(error).removesuffix(" %") for error in errors),
+        flaws.get((scores.white, scores.independent), "both"),
+        rate,
+        forgets,
+        duration(candidate.seconds),
+    ]
 
 
 def stability(candidate: Candidate[Model]) -> str:
     """The proved rate, or that none is, in colour."""
     if candidate.proof is None:
-        return "[dark_orange3]not proved"
+        return f"[dark_orange3]{candidate.unproved}"
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
@@ -168,6 +178,8 @@ def _output_tubes(design: OutputTubeDesign) -> Table:
             f"{text.above(Fraction(width))} {signal.unit} of {signal.name}"
             for width, signal in widths
         )
+        if tube.follows is not None:
+            said += " on average, wider and narrower as the commands go: times sqrt(g)"
         table.add_row("half-width", f"{said}, {lasting}")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
@@ -196,7 +208,7 @@ def catching_table(catching: Catching) -> Table:
     detectors = list(catching.rows[0].others)
     plural = "s" if catching.trials > 1 else ""
     table = Table(
-        title=f"caught of {catching.trials} held-back trial{plural}, and how soon (median)",
+        title=f"caught of {catching.trials} held-back trial{plural}, and after how many s (median)",
         caption=CATCHING_CAPTION,
         title_justify="left",
         caption_justify="left",
@@ -205,14 +217,15 @@ def catching_table(catching: Catching) -> Table:
         padding=0,  # 79 columns in all
     )
     table.add_column("fault", no_wrap=True)
-    for name in ("outside", "violated", "unknown", "after", *detectors):
+    for name in ("outside", "violated", "alarm", "unknown", "after", *detectors):
         table.add_column(name, justify="right")
     for row in catching.rows:
         if row.refused:  # the reason is said below the table
-            table.add_row(row.fault, *["-"] * (4 + len(detectors)))
+            table.add_row(row.fault, *["-"] * (5 + len(detectors)))
             continue
         funnel = row.funnel
-        counts = [str(funnel.outside), str(funnel.violated), str(funnel.unjudged)]
+        parts = (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
+        counts = [str(count) for count in parts]
         others = [_soon(row.others[name]) for name in detectors]
         least = max((other.count for other in row.others.values()), default=0)
         style = "dark_orange3" if least > funnel.count else ""
@@ -221,14 +234,15 @@ def catching_table(catching: Catching) -> Table:
 
 
 CATCHING_CAPTION = (
-    "outside and violated (what is assumed) are both caught; unknown: not judged to the end. "
+    "outside, violated (what is assumed) and alarm (only the monitor's own CUSUM, of which nothing "
+    "is proved) are all caught; unknown: not judged to the end. "
     "The others have the funnel's safety factor and calibration trials, and no more false alarms "
     "(untouched). Coloured: one of them catches more."
 )
 
 
 def _after(caught: Caught) -> str:
-    return "-" if math.isnan(caught.after) else f"{caught.after:.2f} s"
+    return "-" if math.isnan(caught.after) else f"{caught.after:.2f}"
 
 
 def _soon(caught: Caught) -> str:

@@ -85,22 +85,22 @@ class WiredDesign(Generic[M, P, F]):
 
     @property
     def response(self) -> SignalPath | SignalVector:
-        """Where the outputs or the state are read; BagError if they are not on one topic."""
+        """Where a policy reads outputs or state; BagError if they are not on one topic."""
         if isinstance(self.model, VectorField):
             return self._wired().response
-        return _read_at(self.signals[0], single=self._is_single)
+        return _read_at(self.signals[0], single=self.is_single)
 
     @property
     def command(self) -> SignalPath | SignalVector:
-        """Where the inputs are read and written; BagError if they are not on one topic."""
+        """Where a policy writes the inputs; BagError if they are not on one topic."""
         if isinstance(self.model, VectorField):
             return self._wired().command
-        return _read_at(self.signals[1], single=self._is_single)
+        return _read_at(self.signals[1], single=self.is_single)
 
     @property
-    def _is_single(self) -> bool:
+    def is_single(self) -> bool:
         """One output and one input of an identified model: numbers, not vectors."""
-        measured = isinstance(self.model, StateModel | TrapezoidalModel)
+        measured = isinstance(self.model, StateModel | TrapezoidalModel | VectorField)
         return not measured and all(len(part) == 1 for part in self.signals)
 
     @property

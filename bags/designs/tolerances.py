@@ -174,6 +174,11 @@ def tolerances(folder: Path | str) -> Tolerances:
     else:
         given = design.model.y
         signals = (given,) if isinstance(given, Signal) else given
+        if isinstance(funnel, TubeFunnel) and any(tube.follows for tube in funnel.tubes):
+            raise DataError(
+                f"{folder}: the tube's half-width follows the commands, and a tolerance is one "
+                "number; design it with `funnel: {level: constant}` for tolerances"
+            )
         path = goal = funnel.half_widths
         about = "what the model simulates from the commands that were sent, not with the commands"
         if not isinstance(funnel, TubeFunnel):

@@ -108,18 +108,19 @@ class Caught:
     """In how many of the trials, by which status, and s from the fault to the alarm (median).
 
     unjudged: trials of which a part is unknown and nothing bad was seen. after: NaN if none was
-    caught.
+    caught. alarmed: by the monitor's second alarm alone, which no proof rests on.
     """
 
     outside: int = 0
     violated: int = 0
     unjudged: int = 0
     after: float = float("nan")
+    alarmed: int = 0
 
     @property
     def count(self) -> int:
-        """How many were caught, in either way."""
-        return self.outside + self.violated
+        """How many were caught, in any way."""
+        return self.outside + self.violated + self.alarmed
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,8 @@ class Width:
     """One output's half-width beside its range, and its largest error on the calibration trials.
 
     range: of the trials given, in the output's unit as are the others. error: of the simulation.
+    half_width: on average over the calibration trials, where it follows the commands between
+    `least` and `most`.
     """
 
     name: str
@@ -144,11 +147,16 @@ class Width:
     half_width: float
     range: float
     error: float
+    least: float | None = None
+    most: float | None = None
 
     @property
     def said(self) -> str:
-        """The half-width with its unit, rounded up."""
-        return f"{_up(self.half_width)} {self.unit}".strip()
+        """The half-width with its unit, rounded up, and how it changes with the commands."""
+        mean = f"{_up(self.half_width)} {self.unit}".strip()
+        if self.least is None or self.most is None:
+            return mean
+        return f"{mean} on average, {_up(self.least)} to {_up(self.most)} as the commands go"
 
     @property
     def part(self) -> str:
@@ -225,10 +233,16 @@ class Catching:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """The judged part of a run: when each sample was, what is bad first, and the residuals."""
+    """The judged part of a run: when each sample was, what is bad first, and the residuals.
+
+    alarm: the first reading with the monitor's second alarm. widths: (N, p) where half-widths
+    follow the commands, else (0, p).
+    """
 
     t: FloatArray
     bad: Reading | None
+    alarm: Reading | None
+    widths: FloatArray
     lost: bool
     residuals: Residuals
     share: float
@@ -258,7 +272,7 @@ def what_it_catches(
     judged = [run.residuals for run in scaling if len(run.t)]
     if not judged or not any(len(run.t) for run in clean):
         raise DataError("the monitor judges no sample of the trials; are they shorter than lags?")
-    false_alarms = sum(run.bad is not None for run in clean)
+    false_alarms = sum(run.bad is not None or run.alarm is not None for run in clean)
     untouched = [run.residuals for run in clean if len(run.t)]
     detectors = [
         Detector.calibrated(name, judged, factor).quieter(untouched, false_alarms)
@@ -275,10 +289,15 @@ def what_it_catches(
         onsets = [float(copy.t[copy.onset]) for copy in copies]
         rows.append(_row(name, runs, onsets, detectors))
     errors = np.max([np.abs(run.error).max(axis=0) for run in judged], axis=0)
-    named = zip(first.y_names, first.y_units, half_widths, ranges, errors, strict=True)
+    following = np.concatenate([run.widths for run in scaling])
+    limits: list[tuple[float | None, float | None]] = [(None, None)] * p
+    if len(following):
+        half_widths = following.mean(axis=0).tolist()
+        limits = list(zip(following.min(axis=0), following.max(axis=0), strict=True))
+    named = zip(first.y_names, first.y_units, half_widths, ranges, errors, limits, strict=True)
     shares = {trial.name: run.share for trial, run in zip(calibration, scaling, strict=True)}
     return Catching(
-        tuple(Width(n, u, float(w), float(r), float(e)) for n, u, w, r, e in named),
+        tuple(Width(n, u, float(w), float(r), float(e), *ends) for n, u, w, r, e, ends in named),
         tuple(rows),
         len(held_back),
         factor,
@@ -304,7 +323,8 @@ def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
     times: list[float] = []
     innovation: list[Sequence[float]] = []
     error: list[FloatArray] = []
-    bad, lost, share = None, False, 0.0
+    widths: list[Sequence[float]] = []
+    bad, alarm, lost, share = None, None, False, 0.0
     for k, (t, y, u) in enumerate(zip(copy.t.tolist(), copy.y, copy.u, strict=True)):
         if k in copy.lost:
             continue
@@ -317,10 +337,14 @@ def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
         innovation.append(reading.deviation[-p:])
         error.append(np.subtract(reading.measured, reading.nominal))
         share = max(share, reading.assumption)
+        if reading.half_widths:
+            widths.append(reading.half_widths)
+        if alarm is None and reading.alarm:
+            alarm = reading
         if bad is None and reading.status is not Status.INSIDE:
             bad = reading
     residuals = Residuals(np.reshape(innovation, (-1, p)), np.reshape(error, (-1, p)))
-    return _Run(np.array(times), bad, lost, residuals, share)
+    return _Run(np.array(times), bad, alarm, np.reshape(widths, (-1, p)), lost, residuals, share)
 
 
 def _row(
@@ -335,12 +359,15 @@ def _row(
         max(onset, float(run.t[0])) if len(run.t) else onset
         for run, onset in zip(runs, onsets, strict=True)
     ]
-    alarms = [None if run.bad is None else run.bad.t for run in runs]
+    alarms = [
+        min((r.t for r in (run.bad, run.alarm) if r is not None), default=None) for run in runs
+    ]
     funnel = Caught(
         statuses.count(Status.OUTSIDE),
         statuses.count(Status.ASSUMPTION_VIOLATED),
-        sum(run.lost and run.bad is None for run in runs),
+        sum(run.lost and run.bad is None and run.alarm is None for run in runs),
         _delay(alarms, starts),
+        sum(run.bad is None and run.alarm is not None for run in runs),
     )
     others = {}
     for detector in detectors:

@@ -84,6 +84,11 @@ class Replay:
         return next((r for r in self.judged if r.status is not Status.INSIDE), None)
 
     @property
+    def first_alarm(self) -> Reading | None:
+        """The first reading with a second alarm, which is no verdict."""
+        return next((r for r in self.judged if r.alarm), None)
+
+    @property
     def assumption(self) -> float:
         """The part of what is assumed that is used at the last judged sample; 1 is all of it."""
         return self.judged[-1].assumption if self.judged else float("nan")
@@ -155,7 +160,7 @@ def replay_messages(
     stamped = [entry for said in _fed(watch, bag, announced=announced) for entry in said]
     stamped += watch.end()
     if not stamped:
-        raise BagError(f"{bag}: no sample with both {design.response} and {design.command}")
+        raise BagError(f"{bag}: no sample with all of {watch.pairing}")
     return stamped
 
 
@@ -180,8 +185,7 @@ def _fed(watch: Watch, bag: Path, *, announced: bool) -> Iterator[list[Stamped]]
             except BagError as error:
                 raise BagError(f"{bag}: {error}") from error
         run_topics = _run_topics(source) if announced else []
-        topics = [*run_topics, design.response.topic, design.command.topic]
-        for message in source.messages(topics):
+        for message in source.messages([*run_topics, *watch.pairing.topics]):
             if message.topic in run_topics:
                 run = _run(message, source)
                 if run.funnel == digest:
@@ -189,10 +193,7 @@ def _fed(watch: Watch, bag: Path, *, announced: bool) -> Iterator[list[Stamped]]
                 continue
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
             decoded = decode(message.data, *source.types_on(message.topic))
-            if message.topic == design.response.topic:
-                yield watch.response(stamp_ns, design.response.value(decoded))
-            if message.topic == design.command.topic:
-                yield watch.excitation(stamp_ns, design.command.value(decoded))
+            yield watch.message(message.topic, stamp_ns, decoded)
 
 
 def _run_topics(source: Bag) -> list[str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from bags.designs.design import AnyDesign
 from bags.signals.grid import seconds
 from bags.signals.sampling import NOT_FINITE, Sample
-from bags.signals.signal import SignalPath
 from nlsid_core.running.alarm import Alarm, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
@@ -50,8 +49,9 @@ class Watch:
         self.design = design
         self.monitor = design.monitor(centre)
         self.pairing = design.sampler()
-        self._single = isinstance(design.response, SignalPath)
-        self._framed = isinstance(design.response, SignalPath) and design.response.framed
+        self._single = design.is_single
+        self._count = len(self.pairing.responses)
+        self._framed = any(signal.path.framed for signal in self.pairing.responses)
         self._alarm = Alarm(options)
         self._announced = announced
         self.restart()
@@ -67,7 +67,7 @@ class Watch:
         self._alarm.restart()
         self.origin_ns: int | None = None
         self._newest_ns = 0
-        self._newest: tuple[int, tuple[float, ...]] | None = None
+        self._newest: dict[str, tuple[int, tuple[float, ...]]] = {}  # of each response topic
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
         self._start_ns: int | None = None
         self._running = not self._announced
@@ -91,25 +91,41 @@ class Watch:
             self.origin_ns = start_ns
         return self._judge([sample for sample in recent if sample.stamp_ns >= start_ns])
 
+    def message(self, topic: str, stamp_ns: int, message: Any) -> list[Stamped]:
+        """Feed a decoded message of a checked topic; the readings that can be given now, in order.
+
+        Raises BagError if it lacks an element that a signal names.
+        """
+        return self._take(topic, stamp_ns, self.pairing.numbers(topic, message))
+
     def response(self, stamp_ns: int, y: Any) -> list[Stamped]:
-        """Feed a response; the readings that can be given now, in order."""
-        self._newest_ns = max(self._newest_ns, stamp_ns)
-        before = self.pairing.late_responses
-        numbers = _numbers(y)
-        newest, self._newest = self._newest, (stamp_ns, tuple(numbers))
-        if newest is not None and newest[0] == stamp_ns and newest != self._newest:
-            return self.missing(f"{self.design.name} has two values at one stamp")
-        readings = self._judge(self.pairing.respond(stamp_ns, numbers))
-        if self.origin_ns is None and not any(map(math.isfinite, numbers)) and not self._framed:
-            return self.missing(f"{self.design.name} is {y}")  # and no sample was before it
-        if self.pairing.late_responses > before:
-            back = seconds(self._newest_ns, stamp_ns)
-            readings += self.missing(f"time went back by {back:g} s on {self.design.response}")
-        return readings
+        """Feed every response as one message; the readings that can be given now, in order."""
+        return self._take("", stamp_ns, dict(enumerate(_numbers(y))))
 
     def excitation(self, stamp_ns: int, u: Any) -> list[Stamped]:
-        """Feed a command; the readings that can be given now, in order."""
-        return self._judge(self.pairing.excite(stamp_ns, _numbers(u)))
+        """Feed every command as one message; the readings that can be given now, in order."""
+        return self._take("", stamp_ns, dict(enumerate(_numbers(u), start=self._count)))
+
+    def _take(self, topic: str, stamp_ns: int, numbers: Mapping[int, float]) -> list[Stamped]:
+        measured = tuple(value for k, value in numbers.items() if k < self._count)
+        if not measured:
+            return self._judge(self.pairing.take(stamp_ns, numbers))
+        if self._framed and not any(map(math.isfinite, measured)):
+            return []  # the message has other transforms
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        before = self.pairing.late_responses
+        newest, self._newest[topic] = self._newest.get(topic), (stamp_ns, measured)
+        if newest is not None and newest[0] == stamp_ns and newest != self._newest[topic]:
+            return self.missing(f"{self.design.name} has two values at one stamp")
+        readings = self._judge(self.pairing.take(stamp_ns, numbers))
+        if self.origin_ns is None and not any(map(math.isfinite, measured)):
+            said = ", ".join(f"{value:g}" for value in measured)
+            return self.missing(f"{self.design.name} is {said}")  # and no sample was before it
+        if self.pairing.late_responses > before:
+            back = seconds(self._newest_ns, stamp_ns)
+            where = topic or self.pairing.responses[0]
+            readings += self.missing(f"time went back by {back:g} s on {where}")
+        return readings
 
     def flush(self, until_ns: int | None = None) -> list[Stamped]:
         """Stop waiting for commands: responses stamped up to `until_ns` (None: all)."""

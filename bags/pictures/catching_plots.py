@@ -55,6 +55,7 @@ def _caught(axes: Axes, found: Catching) -> None:
     for label, color, counts in (
         ("outside", BLUE, [row.funnel.outside for row in rows]),
         ("assumption violated", "#7fb0d9", [row.funnel.violated for row in rows]),
+        ("alarm (CUSUM)", "#b9d6b0", [row.funnel.alarmed for row in rows]),
         ("unknown", "#e8d9c4", [row.funnel.unjudged for row in rows]),
     ):
         axes.barh(places, counts, height, left=left, color=color, label=f"funnel: {label}")

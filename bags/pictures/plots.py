@@ -76,7 +76,8 @@ def _tube(axes: Axes, replay: Replay) -> None:
     judged = [r for r in replay.readings if r.status is not Status.UNKNOWN]
     t = np.array([r.t for r in judged])
     nominal = np.array([_output(r.nominal) for r in judged])
-    width = replay.half_width
+    widths = [r.half_widths[0] if r.half_widths else replay.half_width for r in judged]
+    width = np.array(widths)
     axes.fill_between(
         t, nominal - width, nominal + width, color=BLUE, alpha=0.18, lw=0, label="proved tube"
     )
@@ -94,7 +95,7 @@ def _tube(axes: Axes, replay: Replay) -> None:
         label="not inside",
     )
     since = f" from {bad[0].t:.3f} s" if bad else ""
-    axes.set_title(f"{replay.name}: {replay.verdict}{since}", fontsize=8, loc="left")
+    axes.set_title(f"{replay.name}:\n{replay.verdict}{since}", fontsize=8, loc="left")
 
 
 def _output(values: Sequence[float]) -> float:

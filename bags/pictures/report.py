@@ -12,7 +12,7 @@ from bags.monitoring.catching import Catching, Row
 from bags.monitoring.replay import Replay
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, percent
+from nlsid_core.errors import DataError, duration, percent
 from nlsid_core.identification import Candidate, Fit, ImplicitProof, Model, stated_rate
 from nlsid_core.models import (
     DifferenceEquation,
@@ -95,7 +95,7 @@ def _catching(catching: Catching, drawn: str) -> str:
     """The section of the report."""
     detectors = list(catching.rows[0].others)
     head = "".join(f"<th>{escape(name)}</th>" for name in ("outside", "assumption violated",
-                   "unknown", "after", *detectors))  # fmt: skip
+                   "alarm", "unknown", "after", *detectors))  # fmt: skip
     rows = "".join(_catching_row(row, detectors) for row in catching.rows)
     widths = "; ".join(
         f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
@@ -106,8 +106,9 @@ def _catching(catching: Catching, drawn: str) -> str:
 <p>Half-width: {widths}.</p>{wide}
 <table><thead><tr><th>fault</th>{head}</tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Of {catching.trials} trials that neither the model nor the funnel was made on,
-sabotaged: how many are caught, and how soon after the fault (median). <i>Outside</i> the tube and
-<i>assumption violated</i> are both caught; <i>unknown</i>: not judged to the end. CUSUM and 3σ
+sabotaged: how many are caught, and how soon after the fault (median). <i>Outside</i> the tube,
+<i>assumption violated</i> and <i>alarm</i>, the monitor's own CUSUM alone, of which nothing is
+proved, are all caught; <i>unknown</i>: not judged to the end. CUSUM and 3σ
 watch the innovation, the box the difference from the nominal. Their thresholds have the same
 calibration trials and safety factor as the funnel's level, and are raised until they have no more
 false alarms on the untouched trials.</p>
@@ -117,10 +118,13 @@ false alarms on the untouched trials.</p>
 
 def _catching_row(row: Row, detectors: Sequence[str]) -> str:
     if row.refused:
-        return f'<tr><td>{escape(row.fault)}</td><td colspan="7">{escape(row.refused)}</td></tr>'
+        return f'<tr><td>{escape(row.fault)}</td><td colspan="8">{escape(row.refused)}</td></tr>'
     funnel = row.funnel
     cells = [
-        *(str(count) for count in (funnel.outside, funnel.violated, funnel.unjudged)),
+        *(
+            str(count)
+            for count in (funnel.outside, funnel.violated, funnel.alarmed, funnel.unjudged)
+        ),
         "-" if math.isnan(funnel.after) else f"{funnel.after:.2f} s",
     ]
     for name in detectors:
@@ -181,8 +185,8 @@ for this table and the pictures below{_calibrated(calibration)}.</p>
 def _stability(chosen: Candidate[Model]) -> str:
     if chosen.proof is None:
         return (
-            '<p class="not">Not proved stable: there is no certificate for this model, and nothing '
-            "built on it is certified.</p>"
+            f'<p class="not">Not proved stable{chosen.remark and f" ({escape(chosen.remark)})"}: '
+            "there is no certificate for this model, and nothing built on it is certified.</p>"
         )
     inputs = "every input"
     if isinstance(chosen.model, StateAffineModel):
@@ -212,7 +216,7 @@ def _row(candidate: Candidate[Model], fit: Fit[Model], columns: Sequence[str]) -
     cells = [
         escape(candidate.method.title),
         *(percent(fit.errors[name][candidate.method.name]) for name in columns),
-        f"{candidate.seconds * 1e3:.0f} ms",
+        duration(candidate.seconds),
         proved,
     ]
     tag = '<tr class="chosen">' if candidate is fit.chosen else "<tr>"

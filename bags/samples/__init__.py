@@ -3,7 +3,16 @@
 from importlib.resources import files
 from pathlib import Path
 
-__all__ = ["f1tenth", "schunk"]
+__all__ = ["dart", "f1tenth", "schunk"]
+
+
+def dart(floor: str = "*") -> list[Path]:
+    """The 24 bags of a DART car, `rubbery_...`, `control_...`, `tape_...`, `slippery_...`.
+
+    floor: those of one. See the README beside them.
+    """
+    folder = Path(str(files("bags.samples"))) / "dart"
+    return sorted(folder.glob(f"{floor}_20*"))
 
 
 def f1tenth() -> list[Path]:

@@ -21,7 +21,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found
-from bags.signals.expressions import Expression
+from bags.signals.expressions import factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -207,8 +207,7 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
 def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
     unstamped = []
     for signals in chosen.values():
-        for signal in signals:
-            expression = Expression.parse(signal.path)
+        for expression in (e for signal in signals for e in parse_factors(signal.path)):
             msgtype, types = bag.types_on(expression.path.topic)
             expression.path.check(msgtype, types)
             if not is_stamped(msgtype, types) and msgtype != "tf2_msgs/msg/TFMessage":
@@ -235,7 +234,8 @@ def _read(
     types: Mapping[str, Definition] | None,
 ) -> _Read:
     y_paths = [signal.path for signal in chosen["response"]]
-    u_paths = [signal.path for signal in chosen["excitation"]]
+    drives = [factors(signal.path) for signal in chosen["excitation"]]
+    u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
     steps, held, bands, ranges, u_steps = [], [], [], [], []
     repeated = 0
     for path in bags:
@@ -254,7 +254,7 @@ def _read(
             ages = np.diff(np.append(stamps[stamps < last], last)) / 1e9
             held.append(float(ages.max(initial=0.0)))
             u_steps.append(np.diff(stamps) / 1e9)
-        ranges.append([(read[n].values.min(), read[n].values.max()) for n in u_paths])
+        ranges.append([_range([read[name] for name in parts]) for parts in drives])
     every, u_every = np.concatenate(steps), np.concatenate(u_steps)
     if not len(every):
         raise BagError(f"{y_paths[0]} has one sample a bag; a period needs two")
@@ -272,6 +272,15 @@ def _read(
         u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
         topics=len({name.partition(":")[0] for name in y_paths}),
     )
+
+
+def _range(parts: Sequence[Samples]) -> tuple[float, float]:
+    """The least and the greatest that a product of signals can be."""
+    low, high = 1.0, 1.0
+    for part in parts:
+        ends = [x * y for x in (low, high) for y in (part.values.min(), part.values.max())]
+        low, high = float(min(ends)), float(max(ends))
+    return low, high
 
 
 def _band(samples: Samples) -> float:
@@ -467,13 +476,5 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
 
 
 def _say_funnel(proposal: Proposal) -> None:
-    for role, signals in proposal.content["signals"].items():
-        topics = sorted({signal["path"].partition(":")[0] for signal in signals})
-        if len(topics) > 1:
-            proposal.walls.append(
-                f"a monitor reads every {role} from one topic, and these are on "
-                f"{', '.join(topics)}: a model is identified and proved, without a tube"
-            )
-            return
     proposal.content["funnel"] = {"safety_factor": SAFETY}
     proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less"

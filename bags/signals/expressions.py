@@ -7,15 +7,22 @@ from left to right, and use no later sample, so that a monitor gives the same nu
 - `unwrap`: an angle in rad without jumps of a turn.
 - `derivative(T s)`: the slope over the last T s, see `derivative`.
 
-Three more say when the signal is sampled (`bags.signals.sampling`) and change no number:
+These say when the signal is sampled (`bags.signals.sampling`):
 
 - `clock(log)`: its stamps are the times of logging (live: of arrival), not the header's.
 - `hold(T s)`: a sample takes the latest value, if that is at most T s old.
 - `linear(T s)`: a sample is interpolated between values at most T s apart.
+- `delay(T s)`: of what drives, a value holds from T s after its stamp on.
+- `lag(T s)`: of what drives, a sample takes what a first-order lag of time constant T makes of the
+  held values, beginning at the first of them.
+
+What drives may be a product, `A * B`, of signals with operations of their own: the product of their
+values in a sample.
 """
 
 import re
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -28,9 +35,12 @@ from bags.signals.units import UNITS, conversion, implied_unit, per_second
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
-OPERATIONS: Final = ("unit", "to", "unwrap", "derivative", "clock", "hold", "linear")
-TIMED: Final = ("derivative", "hold", "linear")  # these take a time
-SAMPLING: Final = ("clock", "hold", "linear")
+OPERATIONS: Final = (
+    "unit", "to", "unwrap", "derivative", "clock", "hold", "linear", "delay", "lag",
+)  # fmt: skip
+TIMED: Final = ("derivative", "hold", "linear", "delay", "lag")  # these take a time
+SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
+DRIVING: Final = ("delay", "lag")  # of what drives only
 SIGNAL_CLOCKS: Final = ("header", "log")
 TURN: Final = 2.0 * np.pi
 MIN_SAMPLES: Final = 3  # two give a slope without any smoothing
@@ -38,6 +48,8 @@ BLOCK: Final = 2**20  # samples of neighbourhoods laid side by side at once
 
 _OPERATION: Final = re.compile(r"\s*([a-z]+)\s*(?:\(([^()|]{1,40})\))?\s*", re.ASCII)
 _SECONDS: Final = re.compile(r"(\d+(?:\.\d*)?(?:e-?\d+)?)\s*(ms|s)", re.ASCII)
+_TIMES: Final = re.compile(r"\s+\*\s+", re.ASCII)
+MOST_FACTORS: Final = 4
 
 
 @dataclass(frozen=True)
@@ -67,8 +79,11 @@ class Expression:
         signal = SignalPath.parse(path.rstrip() if parts else path)
         operations = tuple(_operation(part, text) for part in parts)
         names = [operation.name for operation in operations]
-        if names.count("clock") > 1 or sum(names.count(name) for name in ("hold", "linear")) > 1:
+        once = (("clock",), ("hold", "linear"), ("delay",), ("lag",))
+        if any(sum(names.count(name) for name in group) > 1 for group in once):
             raise BagError(f"'{text}' says twice when the signal is sampled")
+        if "lag" in names and "linear" in names:
+            raise BagError(f"'{text}': a lag is of held values; leave out linear")
         return cls(signal, operations)
 
     def __str__(self) -> str:
@@ -100,6 +115,12 @@ class Expression:
         if self.operation(*kinds) is not None:
             return self
         return replace(self, operations=(*self.operations, Operation(name, unit, window)))
+
+    @property
+    def delay_ns(self) -> int:
+        """Ns after its stamp from which a value holds."""
+        found = self.operation("delay")
+        return 0 if found is None else round(found.window * 1e9)
 
     def unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the result ("" if nothing implies one); BagError if one cannot be converted.
@@ -164,6 +185,24 @@ class Expression:
             return conversion(of, to)
         except BagError as error:
             raise BagError(f"{self}: {error}") from error
+
+
+def factors(text: str) -> tuple[str, ...]:
+    """The signals that `A * B` multiplies, one for a text without ` * `."""
+    found = tuple(_TIMES.split(text.strip()))
+    if len(found) > MOST_FACTORS:
+        raise BagError(f"'{text}' has {len(found)} factors; at most {MOST_FACTORS} are read")
+    return found if len(found) > 1 else (text,)
+
+
+def product(texts: Iterable[str]) -> str:
+    """The text whose `factors` these are."""
+    return " * ".join(texts)
+
+
+def parse_factors(text: str) -> tuple[Expression, ...]:
+    """Each factor of a signal's text; BagError says what is wrong with one."""
+    return tuple(Expression.parse(factor) for factor in factors(text))
 
 
 class Running:

@@ -12,7 +12,7 @@ from typing import Any, Final, overload
 import numpy as np
 
 from bags.recordings.definitions import Definition
-from bags.signals.expressions import Expression
+from bags.signals.expressions import Expression, factors, product
 from bags.signals.reader import (
     HEADER_STAMP,
     LOG_TIME,
@@ -21,7 +21,7 @@ from bags.signals.reader import (
     read_signals,
     stamp_text,
 )
-from bags.signals.sampling import Sample, Sampler, one_clock, sampled_path
+from bags.signals.sampling import Sample, Sampler, held_values, one_clock, sampled_path
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
@@ -51,7 +51,7 @@ def seconds(stamp_ns: IntArray | int, origin_ns: int) -> FloatArray | float:
 
 def to_trajectories(
     responses: Sequence[Samples],
-    excitations: Sequence[Samples],
+    excitations: Sequence[Samples | Sequence[Samples]],
     *,
     period: float | None = None,
     max_gap: float | None = None,
@@ -74,9 +74,12 @@ def to_trajectories(
     they raise DataError, or with `split_gaps` end one trajectory and begin the next.
 
     Raises DataError, saying where, if stamps repeat, a gap is too long, a response that is not
-    resampled is not sampled at the period, or fewer than two samples are left.
+    resampled is not sampled at the period, or fewer than two samples are left. An excitation of
+    several samples is their product.
     """
     label = name or "signals"
+    parts = [(e,) if isinstance(e, Samples) else tuple(e) for e in excitations]
+    drives = [samples for part in parts for samples in part]
     if not responses or not excitations:
         raise DataError(f"{label}: needs at least one response and one excitation")
     for samples in responses:
@@ -87,12 +90,12 @@ def to_trajectories(
     where = f"{label}: {responses[0].path}"
     period_ns = _period_ns(base, period, where, on_grid=on_grid)
     gap_ns = round(DEFAULT_MAX_GAP * period_ns if max_gap is None else max_gap * 1e9)
-    held = [_held_for(samples, gap_ns) for samples in excitations]
-    sampler = Sampler(signals, held, period=period_ns / 1e9)
-    found = list(_sampled(sampler, [*responses, *excitations]))
+    held = [product(_held_for(samples, gap_ns) for samples in part) for part in parts]
+    sampler = Sampler(list(map(str, signals)), held, period=period_ns / 1e9)
+    found = list(_sampled(sampler, [*responses, *drives]))
     complete = [k for k, sample in enumerate(found) if not sample.missing]
     if len(complete) < 2:
-        raise DataError(_no_overlap(label, responses, excitations, len(complete)))
+        raise DataError(_no_overlap(label, responses, drives, len(complete)))
     last = complete[-1]
     left_out = sampler.incomplete + len(found) - last - 1
     if left_out and not split_gaps:
@@ -111,15 +114,15 @@ def to_trajectories(
         _trajectory(
             run,
             sampler,
-            excitations,
+            parts,
             period_ns=period_ns,
             gap_ns=gap_ns,
             label=label,
             labels={
                 "y_units": tuple(samples.unit for samples in responses),
-                "u_units": tuple(samples.unit for samples in excitations),
+                "u_units": tuple(part[0].unit if len(part) == 1 else "" for part in parts),
                 "y_paths": tuple(samples.path for samples in responses),
-                "u_paths": tuple(map(str, held)),
+                "u_paths": tuple(held),
                 "name": name if len(runs) == 1 else f"{name}.{k}",
                 "group": group if len(runs) == 1 else "",
                 "digest": digest,
@@ -130,10 +133,9 @@ def to_trajectories(
     ]
 
 
-def _held_for(samples: Samples, gap_ns: int) -> Expression:
-    """The excitation with a limit to how long it is held, as its text says it."""
-    signal = Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9)
-    return Expression.parse(str(signal))
+def _held_for(samples: Samples, gap_ns: int) -> str:
+    """The excitation's text with a limit to how long it is held."""
+    return str(Expression.parse(samples.path).sampled("hold", window=gap_ns / 1e9))
 
 
 def _sampled(sampler: Sampler, signals: Sequence[Samples]) -> Iterator[Sample]:
@@ -168,7 +170,7 @@ def _whole_runs(found: Sequence[Sample], gap_ns: int) -> Iterator[list[Sample]]:
 def _trajectory(
     run: Sequence[Sample],
     sampler: Sampler,
-    excitations: Sequence[Samples],
+    drives: Sequence[Sequence[Samples]],
     *,
     period_ns: int,
     gap_ns: int,
@@ -198,7 +200,18 @@ def _trajectory(
         if filled:
             before = np.searchsorted(at, grid, side="right") - 1
             at_ns = stamps[rows[before]] + period_ns * (grid - at[before])
-            u = np.column_stack([_held(samples, at_ns) for samples in excitations])
+            u = np.column_stack(
+                [
+                    np.prod(
+                        [
+                            held_values(samples, signal, at_ns.tolist())
+                            for samples, signal in zip(part, rules, strict=True)
+                        ],
+                        axis=0,
+                    )
+                    for part, rules in zip(drives, sampler.excitations, strict=True)
+                ]
+            )
             log.warning("%s: %d of %d samples filled in between others", where, filled, len(grid))
     t = seconds(period_ns * np.arange(len(y)), 0)
     if filled:
@@ -206,7 +219,7 @@ def _trajectory(
         labels = labels | {"provenance": canonical(origin).decode()}
     names = {
         "y_names": labels["y_paths"],
-        "u_names": tuple(samples.path for samples in excitations),
+        "u_names": tuple(product(samples.path for samples in part) for part in drives),
     }
     return Trajectory(t=t, y=y, u=u, **names, **labels)
 
@@ -235,11 +248,6 @@ def _points(stamps: IntArray, period_ns: int, where: str) -> list[tuple[int, int
             f"off a grid of {period_ns / 1e9:g} s; set grid.resample to linear or last"
         )
     return points
-
-
-def _held(samples: Samples, at_ns: IntArray) -> FloatArray:
-    """The latest command at or before each time; the sampler has refused those held too long."""
-    return samples.values[np.searchsorted(samples.stamp_ns, at_ns, side="right") - 1]
 
 
 def _no_overlap(
@@ -333,7 +341,8 @@ def _read_trials(
         role: [sampled_path(text, **rule, response=role == "responses") for text in paths]
         for role, paths in signals.items()
     }
-    named = [text for paths in texts.values() for text in paths]
+    named = [part for paths in texts.values() for text in paths for part in factors(text)]
+    named = list(dict.fromkeys(named))
     if several := [text for text in named if Expression.parse(text).path.every]:
         raise BagError(f"{several[0]} is several signals; name one element of it for each")
     wanted = one_clock([Expression.parse(text) for text in named])
@@ -351,7 +360,7 @@ def _read_trials(
     responses = [read[text] for text in texts["responses"]]
     trials = to_trajectories(
         responses,
-        [read[text] for text in texts["excitations"]],
+        [[read[part] for part in factors(text)] for text in texts["excitations"]],
         period=options["period"],
         max_gap=options["max_gap"],
         split_gaps=options["split_gaps"],

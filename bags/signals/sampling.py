@@ -18,7 +18,9 @@ besides the model has to be known:
 - If every response has one of them, samples lie on a grid of one period from the first stamp at
   which every signal has a value. `hold`: the latest value at or before, at most T s old.
   `linear`: on the line between the values before and after, at most T s apart.
-- An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`.
+- An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`;
+  `|delay(T s)` adds T to its stamp, `|lag(T s)` filters what is held, `A * B` multiplies two such.
+- Signals may come from any number of topics, each of one or more of them.
 - The first sample is the first with every signal; what came before it is counted, not given.
   Later a signal that is missing is NaN, and `missing` says which and why.
 
@@ -28,13 +30,21 @@ so that is when every topic has been seen at or after it.
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from rosbags.typesys.store import Typestore
 
 from bags.recordings.message_types import header_stamp_ns, is_stamped
-from bags.signals.expressions import Expression, Running
+from bags.signals.expressions import (
+    DRIVING,
+    Expression,
+    Running,
+    factors,
+    parse_factors,
+    product,
+)
+from bags.signals.reader import Samples
 from nlsid_core.errors import BagError, apart
 
 MATCH: Final = 0.05  # periods between stamps of one sample on two topics; a loop's usual scatter
@@ -69,11 +79,11 @@ class Sampler:
         *,
         period: float,
     ) -> None:
-        self.responses = tuple(map(_expression, responses))
-        self.excitations = tuple(map(_expression, excitations))
-        signals = (*self.responses, *self.excitations)
+        self.responses = tuple(map(_response, responses))
+        self.excitations = tuple(map(_factors, excitations))
         if not self.responses or not self.excitations:
             raise BagError("name at least one response and one excitation")
+        signals = (*self.responses, *(factor for part in self.excitations for factor in part))
         self.clock = one_clock(signals)
         self.topics = tuple(dict.fromkeys(signal.path.topic for signal in signals))
         self.period_ns = round(period * 1e9)
@@ -85,6 +95,7 @@ class Sampler:
                 "or |linear(T s), or none"
             )
         self.on_grid = all(gridded)
+        self.response_topics = tuple(dict.fromkeys(s.path.topic for s in self.responses))
         self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
         self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
         for k, signal in enumerate(signals):
@@ -92,11 +103,15 @@ class Sampler:
         self._signals = signals
         self.restart()
 
+    def __str__(self) -> str:
+        driving = [product(map(str, part)) for part in self.excitations]
+        return ", ".join([*map(str, self.responses), *driving])
+
     def restart(self) -> None:
         """Forget everything but the signals."""
         n = len(self.responses)
         match_ns = round(MATCH * self.period_ns)
-        matches = [0, *[match_ns] * (n - 1), *[None] * len(self.excitations)]
+        matches = [0, *[match_ns] * (n - 1), *[None] * (len(self._signals) - n)]
         self._kept = [_Kept(s, m) for s, m in zip(self._signals, matches, strict=True)]
         self._running: dict[int, Running] = {
             k: self._signals[k].numbers.running(unit) for k, unit in self._recorded.items()
@@ -128,34 +143,42 @@ class Sampler:
 
     def message(self, topic: str, stamp_ns: int, message: Any) -> list[Sample]:
         """Take a decoded message of a checked topic; the samples that are certain now."""
-        for k in self._on[topic]:
-            self._operate(k, stamp_ns, self._signals[k].path.value(message))
+        return self.take(stamp_ns, self.numbers(topic, message))
+
+    def numbers(self, topic: str, message: Any) -> dict[int, float]:
+        """The numbers of a decoded message by their signals; BagError as `SignalPath.value`.
+
+        Signals are counted through responses first, then every factor of the excitations.
+        """
+        return {k: self._signals[k].path.value(message) for k in self._on[topic]}
+
+    def take(self, stamp_ns: int, numbers: Mapping[int, float]) -> list[Sample]:
+        """Take numbers of one message as `numbers` gives them; the samples certain now."""
+        for k, value in numbers.items():
+            self._operate(k, stamp_ns, value)
         return self._release(-math.inf)
 
     def respond(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
         """Take every response as read from one message; the samples that are certain now."""
-        for k, value in enumerate(values):
-            self._operate(k, stamp_ns, value)
-        return self._release(-math.inf)
+        return self.take(stamp_ns, dict(enumerate(values)))
 
     def excite(self, stamp_ns: int, values: Sequence[float]) -> list[Sample]:
-        """Take every excitation as read from one message; the samples that are certain now."""
-        for k, value in enumerate(values, start=len(self.responses)):
-            self._operate(k, stamp_ns, value)
-        return self._release(-math.inf)
+        """Take every factor of the excitations from one message; the samples certain now."""
+        return self.take(stamp_ns, dict(enumerate(values, start=len(self.responses))))
 
     def feed(self, k: int, stamp_ns: int, value: float) -> list[Sample]:
-        """Take a number of signal k (responses first), its operations done already."""
+        """Take a number of signal k (as `numbers` counts), its operations done already."""
         self._add(k, stamp_ns, value)
         return self._release(-math.inf)
 
     @property
     def newest_command_ns(self) -> float:
         """The newest stamp of a command; -inf before the first."""
-        return max(kept.newest_ns for kept in self._kept[len(self.responses) :])
+        commands = self._kept[len(self.responses) :]
+        return max(kept.newest_ns - kept.delay_ns for kept in commands)
 
     def flush(self, until_ns: int | None = None) -> list[Sample]:
-        """Stop waiting: the samples up to `until_ns` (None: all) as things are.
+        """Stop waiting: for commands of samples up to `until_ns`, or for anything (None).
 
         None: on a grid, up to the last stamp that every response has reached.
         """
@@ -171,7 +194,7 @@ class Sampler:
         running = self._running.get(k)
         if running is None:
             running = self._running[k] = self._signals[k].numbers.running("")
-        if running.remembers and stamp_ns <= self._kept[k].newest_ns:
+        if running.remembers and stamp_ns + self._kept[k].delay_ns <= self._kept[k].newest_ns:
             self._count_late(k, stamp_ns)
             return
         self._add(k, stamp_ns, running.update(stamp_ns, value))
@@ -186,6 +209,7 @@ class Sampler:
 
     def _add(self, k: int, stamp_ns: int, value: float) -> None:
         kept = self._kept[k]
+        stamp_ns += kept.delay_ns
         if k == 0 and not self.on_grid:
             at = bisect_left(self._waiting, stamp_ns)
             if stamp_ns == self._released_ns or self._waiting[at : at + 1] == [stamp_ns]:
@@ -200,13 +224,18 @@ class Sampler:
         kept.add(stamp_ns, value)
 
     def _release(self, until_ns: float) -> list[Sample]:
-        """The samples that are certain, or stamped up to `until_ns`."""
+        """The samples that are certain, or up to `until_ns` certain but for their commands.
+
+        Infinite: all, as things are.
+        """
         given: list[Sample] = []
+        n = len(self.responses)
         while True:
             stamp_ns = self._next_stamp()
             if stamp_ns is None:
                 return given
-            if stamp_ns > until_ns and not all(kept.is_certain(stamp_ns) for kept in self._kept):
+            awaited = self._kept[:n] if stamp_ns <= until_ns else self._kept
+            if until_ns < math.inf and not all(kept.is_certain(stamp_ns) for kept in awaited):
                 return given
             self._take_stamp(stamp_ns)
             values = [kept.value_at(stamp_ns) for kept in self._kept]
@@ -216,9 +245,14 @@ class Sampler:
             elif not self._started:
                 self.incomplete += 1
                 continue
-            n = len(self.responses)
             missing = "" if all(map(math.isfinite, values)) else self._why(stamp_ns, values)
-            given.append(Sample(stamp_ns, tuple(values[:n]), tuple(values[n:]), missing))
+            u = self._multiplied(values[n:])
+            given.append(Sample(stamp_ns, tuple(values[:n]), u, missing))
+
+    def _multiplied(self, values: Sequence[float]) -> tuple[float, ...]:
+        """The excitations from the values of all their factors."""
+        left = iter(values)
+        return tuple(math.prod(next(left) for _ in part) for part in self.excitations)
 
     def _next_stamp(self) -> int | None:
         if not self.on_grid:
@@ -249,12 +283,22 @@ class _Kept:
         self.linear = rule is not None and rule.name == "linear"
         self.limit_ns: float = math.inf if rule is None else round(rule.window * 1e9)
         self.match_ns = match_ns if rule is None else None
+        lag = signal.operation("lag")
+        self.lag_ns: float = 0.0 if lag is None else lag.window * 1e9
+        self.delay_ns = signal.delay_ns
         self.stamps: list[int] = []
         self.values: list[float] = []
+        self.targets: list[float] = []  # with a lag, what the values go to
         self.newest_ns: float = -math.inf
         self.first_ns: int | None = None
 
     def add(self, stamp_ns: int, value: float) -> None:
+        if self.lag_ns:
+            if stamp_ns < self.newest_ns:
+                return  # what it made of later values is given already
+            reached = self._lagged(stamp_ns, -1) if self.stamps else value
+            self.targets.append(value)
+            value = reached if math.isfinite(reached) else value
         if stamp_ns >= self.newest_ns:
             self.stamps.append(stamp_ns)
             self.values.append(value)
@@ -264,7 +308,7 @@ class _Kept:
             self.stamps.insert(at, stamp_ns)
             self.values.insert(at, value)
         if len(self.stamps) > HISTORY:
-            del self.stamps[0], self.values[0]
+            del self.stamps[0], self.values[0], self.targets[:1]
         if self.first_ns is None and math.isfinite(value):
             self.first_ns = stamp_ns
 
@@ -284,16 +328,23 @@ class _Kept:
         after = bisect_right(self.stamps, stamp_ns)
         if not after:
             return math.nan
-        del self.stamps[: after - 1], self.values[: after - 1]
+        del self.stamps[: after - 1], self.values[: after - 1], self.targets[: after - 1]
         before_ns, value = self.stamps[0], self.values[0]
         if before_ns == stamp_ns:
             return value
         if not self.linear:
+            value = self._lagged(stamp_ns, 0) if self.lag_ns else value
             return value if stamp_ns - before_ns <= self.limit_ns else math.nan
         if len(self.stamps) < 2 or self.stamps[1] - before_ns > self.limit_ns:
             return math.nan
         share = (stamp_ns - before_ns) / (self.stamps[1] - before_ns)
         return value + (self.values[1] - value) * share
+
+    def _lagged(self, stamp_ns: int, k: int) -> float:
+        """What the lag reaches at `stamp_ns` from value k, its target held."""
+        target = self.targets[k]
+        left = math.exp((self.stamps[k] - stamp_ns) / self.lag_ns)
+        return target + (self.values[k] - target) * left
 
     def why(self, stamp_ns: int) -> str:
         """Why there is no value, in words."""
@@ -333,8 +384,12 @@ def sampled_path(
     """A signal's text with a configuration's `clock` and `grid` written into it.
 
     resample: `none`, `last` or `linear` for responses, over at most `max_gap` s. hold: s for which
-    an excitation is held. What the text says itself stays.
+    an excitation is held; each factor of a product is. What the text says itself stays.
     """
+    parts = factors(text)
+    if len(parts) > 1:
+        rule = {"clock": clock, "resample": resample, "hold": hold, "max_gap": max_gap}
+        return product(sampled_path(part, **rule, response=response) for part in parts)  # type: ignore[arg-type]
     signal = Expression.parse(text)
     if clock != "header":
         signal = signal.sampled("clock", unit=clock)
@@ -347,5 +402,26 @@ def sampled_path(
     return text if signal == Expression.parse(text) else str(signal)
 
 
-def _expression(signal: str | Expression) -> Expression:
-    return Expression.parse(signal) if isinstance(signal, str) else signal
+def held_values(samples: Samples, signal: Expression, at_ns: Sequence[int]) -> list[float]:
+    """What an excitation recorded as `samples` is at each of `at_ns`, ascending, however old."""
+    kept, k = _Kept(signal, None), 0
+    kept.limit_ns = math.inf
+    stamps, numbers = samples.stamp_ns.tolist(), samples.values.tolist()
+    found = []
+    for at in at_ns:
+        while k < len(stamps) and stamps[k] + kept.delay_ns <= at:
+            kept.add(stamps[k] + kept.delay_ns, numbers[k])
+            k += 1
+        found.append(kept.value_at(at))
+    return found
+
+
+def _response(signal: str | Expression) -> Expression:
+    found = _factors(signal)
+    if len(found) > 1 or any(found[0].operation(name) for name in DRIVING):
+        raise BagError(f"{signal}: products, delay and lag are for what drives, not for a response")
+    return found[0]
+
+
+def _factors(signal: str | Expression) -> tuple[Expression, ...]:
+    return parse_factors(signal) if isinstance(signal, str) else (signal,)

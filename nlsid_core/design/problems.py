@@ -8,6 +8,7 @@ from nlsid_core.arrays import ArrayLike
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import GAINS
+from nlsid_core.design.levels import LevelKind
 from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
@@ -64,7 +65,9 @@ class OutputTube:
     of the innovations' amplitude over the largest measured, at least 1. horizon: s, for a second
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
-    the range of the training trials and a tenth of it on both sides).
+    the range of the training trials and a tenth of it on both sides). level: "constant", or
+    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    `train`.
     Source: docs/certificate_tube.md.
     """
 
@@ -75,6 +78,7 @@ class OutputTube:
     safety_factor: float = 1.5
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
+    level: LevelKind = "auto"
 
     def __post_init__(self) -> None:
         for key in ("reaction_time", "horizon"):
@@ -82,6 +86,7 @@ class OutputTube:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
         require_ranges(self, "box")
+        require_one_of(self, "level", get_args(LevelKind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +115,15 @@ class SampledTracking:
 class ContinuousTracking:
     """The largest funnel around a nominal motion that ends in a goal, proved for every t.
 
-    dynamics: a VectorField, or a polynomial function of some of t, x, u, w. goal: an ellipsoid, or
-    its matrix around the nominal's end (None: the largest set that the closed loop keeps at the
-    end). policy: None is a time-varying LQR with Q (n, n) and R (m, m) (None: identities), and P(t)
-    its cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's
-    K varies between knots: "constant", "linear" or "cubic". limits: rows (input, low, high) at
-    which inputs saturate; the proof then covers every mode of them.
+    dynamics: a VectorField, or a function of some of t, x, u, w, named so; one that is no
+    polynomial is expanded on every interval around what the funnel needs there, see
+    `dynamics.taylor`. uncertain: rows (low, high) of the w of such a function. goal: half-widths
+    (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal` (None: the largest set
+    that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
+    R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
+    given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
+    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one pair (low, high)
+    for each input, at which inputs saturate; the proof then covers every mode of them.
 
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.

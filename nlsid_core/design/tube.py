@@ -9,7 +9,7 @@ Source: docs/certificate_tube.md.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import product
@@ -24,20 +24,24 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.levels import LevelKind, followed
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
-from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.funnels.level import CommandLevel
+from nlsid_core.funnels.tube import Cusum, Response, Tube, TubeFunnel
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import Rejected, increments
 from nlsid_core.kernel.files import Node, parse
 from nlsid_core.models import BlockCascade, ImplicitModel, StableModel
+from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
 
 cp: Any = cvxpy  # its functions are not seen by type checkers
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
+MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
@@ -63,6 +67,7 @@ def design_output_tube(
     safety_factor: float = 1.5,
     horizon: float | None = None,
     box: Sequence[tuple[float, float]] | None = None,
+    level: LevelKind = "auto",
 ) -> OutputTubeDesign:
     """The funnel that `OutputTube` describes; its options are these.
 
@@ -81,30 +86,68 @@ def design_output_tube(
     )
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
-    found = [_best(form, gains, e, amplitudes, samples, form.fading())]
+
+    def tube_of(design: _Found, samples: int | None) -> Tube:
+        return Tube(
+            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
+            half_widths=1.0 / np.sqrt(0.99 * design.tau), level=1.0, measured=0.0,
+            safety_factor=safety_factor, designed_on=trials.designed_on,
+            measured_on=trials.measured_on, samples=samples,
+        )  # fmt: skip
+
+    def proved(
+        tubes: Sequence[Tube], found: Sequence[_Found],
+        response: Response | None = None, alarm: Cusum | None = None,
+    ) -> OutputTubeDesign:  # fmt: skip
+        funnel = TubeFunnel(
+            tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
+            y_box=y_box, u_box=u_box, response=response, cusum=alarm,
+        )  # fmt: skip
+        trees = [design.multipliers for design in found]
+        proof: Json = {} if trees[0] is None else {"multipliers": trees}
+        return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
+
+    def decided(design: _Found) -> str:
+        """Why the kernel refuses the candidate, whatever its level; empty if it is proved."""
+        try:
+            proved([tube_of(design, 1 if design.rho == 1.0 else None)], [design])
+        except CertificateRejected as refusal:
+            return str(refusal)
+        return ""
+
+    found = [_best(form, gains, e, amplitudes, samples, form.fading(), decided)]
     lasting: list[int | None] = [None]
     if horizon is not None:
         lasting.append(length := max(1, round(horizon / model.period)))
-        found.append(_best(form, gains, e, amplitudes, length, [1.0]))
+        found.append(_best(form, gains, e, amplitudes, length, [1.0], decided))
+    u = [trial.u for trial in train]
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
-        tube = Tube(
-            rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
-            half_widths=np.ones(len(design.tau)), level=1.0, measured=1.0,
-            safety_factor=safety_factor, designed_on=trials.designed_on,
-            measured_on=trials.measured_on, samples=samples_left,
-        )  # fmt: skip
+        tube = tube_of(design, samples_left)
+        if level != "constant" and samples_left is None:
+            spent = [energy(part[:, design.at], tube)[:, None] for part in e]
+            tube = replace(tube, follows=_chosen(level, spent, u))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
-    funnel = TubeFunnel(
-        tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
-        y_box=y_box, u_box=u_box,
+    errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
+    response = Response(
+        np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
+        None if level == "constant" else _chosen(level, [part**2 for part in errors], u),
     )  # fmt: skip
-    trees = [design.multipliers for design in found]
-    proof: Json = {} if trees[0] is None else {"multipliers": trees}
-    try:
-        return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
-    except CertificateRejected as refusal:
-        raise Infeasible(f"no proved tube: {refusal}") from refusal
+    calibrated = [
+        innovations(model, np.stack([np.zeros_like(found[0].L), found[0].L]), t, settling)
+        for t in trials.calibration
+    ]
+    response = _scaled_response(
+        response, errors, u,
+        [part[:, 0] for part in calibrated], [t.u for t in trials.calibration],
+    )  # fmt: skip
+    own = np.concatenate([part[:, found[0].at] for part in e])
+    deviation = np.maximum(own.std(axis=0), np.finfo(float).tiny)
+    threshold = max(
+        float(cusum(safety_factor * part[:, 1] / deviation).max()) for part in calibrated
+    )
+    alarm = Cusum(deviation, DRIFT, max(threshold, DRIFT))
+    return proved(tubes, found, response, alarm)
 
 
 def least_window(model: StableModel, train: Dataset) -> int:
@@ -114,12 +157,12 @@ def least_window(model: StableModel, train: Dataset) -> int:
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
     """The tube with its level and half-widths from these trials, rounded up."""
-    measured = max(
-        float(
-            energy(innovations(model, tube.L[None], t, settling)[:, 0], tube)[: tube.samples].max()
-        )
-        for t in calibration
-    )
+    measured = 0.0
+    for trial in calibration:
+        spent = energy(innovations(model, tube.L[None], trial, settling)[:, 0], tube)
+        if tube.follows is not None:
+            spent = spent / tube.follows.along(trial.u)[settling:, 0]
+        measured = max(measured, float(spent[: tube.samples].max()))
     measured = _above(max(measured, float(np.finfo(float).tiny)))
     level = _above(tube.safety_factor**2 * measured)
     widths = np.sqrt((level + tube.inlet) / tube.tau)
@@ -127,6 +170,38 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
         tube, measured=measured, level=level,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
     )  # fmt: skip
+
+
+def _chosen(
+    level: LevelKind, energies: Sequence[FloatArray], inputs: Sequence[FloatArray]
+) -> CommandLevel | None:
+    """The level that follows the commands, if it is asked for or narrower on these trials."""
+    return followed(energies, inputs, always=level == "commands")
+
+
+def _scaled_response(
+    response: Response,
+    design: Sequence[FloatArray],
+    design_inputs: Sequence[FloatArray],
+    calibration: Sequence[FloatArray],
+    calibration_inputs: Sequence[FloatArray],
+) -> Response:
+    """The response with half-widths from output errors (N, p): ratios of the design's, scaled on
+    the others by one number, so that one trial exceeds all of them with the probability of one.
+    """
+
+    def parts(errors: Sequence[FloatArray], inputs: Sequence[FloatArray]) -> FloatArray:
+        """(p,): the largest |o_j| / √g_j."""
+        found = []
+        for o, u in zip(errors, inputs, strict=True):
+            g = 1.0 if response.follows is None else response.follows.along(u)[len(u) - len(o) :]
+            found.append((np.abs(o) / np.sqrt(g)).max(axis=0))
+        return np.asarray(np.maximum(np.max(found, axis=0), np.finfo(float).tiny))
+
+    sizes, largest = parts(design, design_inputs), parts(calibration, calibration_inputs)
+    scale = response.safety_factor * float((largest / sizes).max())
+    widths = np.array([_rounded_up(_above(float(w))) for w in scale * sizes])
+    return replace(response, half_widths=widths, measured=_above(float((largest / widths).max())))
 
 
 def energy(e: FloatArray, tube: Tube) -> FloatArray:
@@ -307,7 +382,10 @@ def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it."""
+    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it.
+
+    at: which of the gains L is.
+    """
 
     L: FloatArray
     rho: float
@@ -315,6 +393,7 @@ class _Found:
     R: FloatArray
     tau: FloatArray
     multipliers: Json | None
+    at: int = 0
 
 
 def _best(
@@ -324,12 +403,14 @@ def _best(
     amplitudes: FloatArray,
     samples: int,
     rhos: Sequence[float],
+    decided: Callable[[_Found], str],
 ) -> _Found:
-    """The pair (L, ρ) whose proved forecast `samples` ahead is the narrowest.
+    """The pair (L, ρ) whose forecast `samples` ahead is the narrowest of those solved and proved.
 
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
-    the most that E can be `samples` after 0.
+    the most that E can be `samples` after 0. SOLVED are solved; while the kernel refuses all of
+    them (`decided` says why), as many more.
     """
     ranked = []
     for i, rho in product(range(len(gains)), rhos):
@@ -342,18 +423,26 @@ def _best(
             continue
         alpha = _forecast_budget([part[:, i] for part in e], R, rho, samples)
         ranked.append((float(np.mean(np.sqrt(alpha * variance) / amplitudes)), i, rho))
-    tried: list[tuple[float, _Found]] = []
-    for _, i, rho in sorted(ranked)[:SOLVED]:
-        found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
-        if found is not None:
-            alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
-            tried.append((float(np.mean(np.sqrt(alpha / found.tau) / amplitudes)), found))
-    if not tried:
-        raise Infeasible(
-            "no storage function bounds the output by the innovations: the increments are too "
-            "different over the model's range; give a smaller range of inputs or a smaller box"
-        )
-    return min(tried, key=lambda entry: entry[0])[1]
+    ranked.sort()
+    refused = ""
+    for first in range(0, min(len(ranked), MOST), SOLVED):
+        tried: list[tuple[float, _Found]] = []
+        for _, i, rho in ranked[first : first + SOLVED]:
+            found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
+            if found is not None:
+                alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
+                width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
+                tried.append((width, replace(found, at=i)))
+        for _, found in sorted(tried, key=lambda entry: entry[0]):
+            refused = decided(found)
+            if not refused:
+                return found
+    if refused:
+        raise Infeasible(f"no proved tube: {refused}")
+    raise Infeasible(
+        "no storage function bounds the output by the innovations: the increments are too "
+        "different over the model's range; give a smaller range of inputs or a smaller box"
+    )
 
 
 def _mean_gramian(

@@ -6,13 +6,12 @@ are cubics as they are written stay what they are; every other one has a bounded
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
-from math import floor, inf, log2, nextafter
+from math import inf, nextafter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
@@ -294,7 +293,7 @@ class Cubic:
             for j in used:  # times z_j - centre_j
                 product: dict[tuple[int, ...], Fraction] = {}
                 for exponent, c in parts.items():
-                    higher = exponent[:j] + (exponent[j] + 1,) + exponent[j + 1 :]
+                    higher = (*exponent[:j], exponent[j] + 1, *exponent[j + 1 :])
                     product[higher] = product.get(higher, Fraction(0)) + c
                     if centre[j]:
                         product[exponent] = product.get(exponent, Fraction(0)) - c * centre[j]

@@ -8,6 +8,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.funnels.level import CommandLevel
 
 FORMAT = "nlsid/funnel"
 KIND = "tube"
@@ -22,6 +23,8 @@ class Tube:
     number of samples for which an energy (rho = 1) is assumed; None with rho < 1, for ever. level =
     safety_factor² · measured, the largest E on the trials `measured_on`; `designed_on` are those
     that L, rho, P, R were chosen on; each (name, digest). inlet: V = x̄'Px̄ that the start may have.
+    With `follows`, level is multiplied at every sample by g, its one row; half_widths are those
+    where g = 1, which it is on average over the trials of the design.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -39,6 +42,7 @@ class Tube:
     measured_on: tuple[tuple[str, str], ...]
     samples: int | None = None
     inlet: float = 0.0
+    follows: CommandLevel | None = None
 
     def __post_init__(self) -> None:
         for key in ("L", "P", "R", "tau", "half_widths"):
@@ -64,14 +68,16 @@ class Tube:
         energy = "e'Re" if len(self.R) > 1 else "e²"
         if self.samples is not None:
             return f"Σ {energy} ≤ {self.level:.4g} over {self.samples} samples"
-        return f"E ≤ {self.level:.4g}, E⁺ = {self.rho:.4g} E + {energy}"
+        room = " g, g of the commands" if self.follows is not None else ""
+        return f"E ≤ {self.level:.4g}{room}, E⁺ = {self.rho:.4g} E + {energy}"
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         kind: Json = {"kind": "fading"}
         if self.samples is not None:
             kind = {"kind": "energy", "samples": self.samples}
-        return {
+        follows: Json = {} if self.follows is None else {"follows": self.follows.document()}
+        return follows | {
             "rho": self.rho,
             "level": self.level,
             "inlet": self.inlet,
@@ -91,12 +97,81 @@ class Tube:
 
 
 @dataclass(frozen=True, eq=False)
+class Response:
+    """What is assumed of the output error itself: |y_j - y°_j| <= half_widths_j √g_j, for ever.
+
+    half_widths: (p,), in the outputs' units. g_j: row j of `follows`, or 1. measured: the largest
+    error as a part of this on the trials `measured_on`, times safety_factor at most 1;
+    `designed_on` are those that g was chosen on.
+    """
+
+    half_widths: FloatArray
+    measured: float
+    safety_factor: float
+    designed_on: tuple[tuple[str, str], ...]
+    measured_on: tuple[tuple[str, str], ...]
+    follows: CommandLevel | None = None
+
+    def __post_init__(self) -> None:
+        widths = np.array(self.half_widths, dtype=np.float64)
+        if widths.ndim != 1 or not ((widths > 0.0) & np.isfinite(widths)).all():
+            raise DataError(f"response: half-widths {widths.tolist()} should be positive")
+        widths.setflags(write=False)
+        object.__setattr__(self, "half_widths", widths)
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        follows: Json = {} if self.follows is None else {"follows": self.follows.document()}
+        return follows | {
+            "half_widths": self.half_widths.tolist(),
+            "assumption": {
+                "measured": self.measured,
+                "safety_factor": self.safety_factor,
+                "designed_on": _named(self.designed_on),
+                "measured_on": _named(self.measured_on),
+            },
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Cusum:
+    """An alarm that nothing rests on: one-sided sums of the innovation, S⁺ = max(0, S ± z - drift).
+
+    z = e / deviation (p,), of the first tube's observer; it alarms where S is above `threshold`.
+    Source: E. S. Page, Continuous Inspection Schemes, Biometrika 41 (1954).
+    """
+
+    deviation: FloatArray
+    drift: float
+    threshold: float
+
+    def __post_init__(self) -> None:
+        deviation = np.array(self.deviation, dtype=np.float64)
+        if deviation.ndim != 1 or not (deviation > 0.0).all() or not self.threshold > 0.0:
+            raise DataError(
+                f"cusum: deviation {deviation.tolist()} and threshold {self.threshold} should be "
+                "positive"
+            )
+        deviation.setflags(write=False)
+        object.__setattr__(self, "deviation", deviation)
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "deviation": self.deviation.tolist(),
+            "drift": self.drift,
+            "threshold": self.threshold,
+        }
+
+
+@dataclass(frozen=True, eq=False)
 class TubeFunnel:
     """The output is within every one of `tubes` of the model's simulation, whatever the inputs.
 
     The simulation starts at the observer's state after `settling` samples. y_box (p, 2), u_box
     (n_u, 2): where outputs, states and inputs have to stay, for implicit models whose increments
-    are known on a box only; else None. model: its digest.
+    are known on a box only; else None. model: its digest. response: what else is assumed, beside
+    what the tubes assume. cusum: a second alarm, which is no assumption.
     """
 
     tubes: tuple[Tube, ...]
@@ -104,6 +179,8 @@ class TubeFunnel:
     model: str
     y_box: FloatArray | None = None
     u_box: FloatArray | None = None
+    response: Response | None = None
+    cusum: Cusum | None = None
 
     def __post_init__(self) -> None:
         if not self.tubes:
@@ -133,6 +210,8 @@ class TubeFunnel:
             "model": self.model,
             "settling": self.settling,
             **box,
+            **({} if self.response is None else {"response": self.response.document()}),
+            **({} if self.cusum is None else {"cusum": self.cusum.document()}),
             "tubes": [tube.document() for tube in self.tubes],
         }
 
@@ -141,12 +220,18 @@ class TubeFunnel:
         """Raises DocumentError if the document is not a funnel of this kind."""
         files.header(document, FORMAT, source=source, kind=KIND)
         entries = files.member(document, "tubes", list, source=source)
-        box: dict[str, FloatArray] = {}
+        box: dict[str, Any] = {}
         if "box" in document:
             given = files.member(document, "box", dict, source=source)
             box = {f"{k}_box": files.array(given, k, (None, 2), source=source) for k in ("y", "u")}
+        beside: dict[str, Any] = {}
+        if "response" in document:
+            beside["response"] = _response(document["response"], f"{source} response")
+        if "cusum" in document:
+            beside["cusum"] = _cusum(document["cusum"], f"{source} cusum")
         return cls(
             tubes=tuple(_tube(entry, f"{source} tubes[{i}]") for i, entry in enumerate(entries)),
+            **beside,
             settling=files.member(document, "settling", int, source=source),
             model=files.member(document, "model", str, source=source),
             **box,
@@ -176,7 +261,36 @@ def _tube(document: Any, source: str) -> Tube:
         measured_on=_trials(given, "measured_on", source),
         samples=samples,
         inlet=files.number(document, "inlet", source=source),
+        follows=_follows(document, source),
     )
+
+
+def _follows(document: Json, source: str) -> CommandLevel | None:
+    if "follows" not in document:
+        return None
+    return CommandLevel.from_document(document["follows"], source=f"{source} follows")
+
+
+def _response(document: Any, source: str) -> Response:
+    if not isinstance(document, dict):
+        raise DocumentError(f"{source} should be an object")
+    given = files.member(document, "assumption", dict, source=source)
+    return Response(
+        half_widths=files.array(document, "half_widths", (None,), source=source),
+        measured=files.number(given, "measured", source=source),
+        safety_factor=files.number(given, "safety_factor", source=source),
+        designed_on=_trials(given, "designed_on", source),
+        measured_on=_trials(given, "measured_on", source),
+        follows=_follows(document, source),
+    )
+
+
+def _cusum(document: Any, source: str) -> Cusum:
+    if not isinstance(document, dict):
+        raise DocumentError(f"{source} should be an object")
+    deviation = files.array(document, "deviation", (None,), source=source)
+    numbers = (files.number(document, key, source=source) for key in ("drift", "threshold"))
+    return Cusum(deviation, *numbers)
 
 
 def _named(trials: tuple[tuple[str, str], ...]) -> list[Json]:

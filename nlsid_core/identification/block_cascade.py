@@ -14,7 +14,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
-from nlsid_core.identification.cascade_fit import Parameters, Trial, minimise
+from nlsid_core.identification.cascade_fit import MAX_RADIUS, Parameters, Trial, minimise
 from nlsid_core.identification.cascade_starts import (
     best_start,
     mean_square,
@@ -121,11 +121,13 @@ def identify_block_cascade(
     model_class: BlockCascadeClass,
     *,
     transient: int = 0,
+    slowest: float = MAX_RADIUS,
     progress: Progress | None = None,
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
 
-    transient: samples at the start of each trajectory that are simulated and not scored.
+    transient: samples at the start of each trajectory that are simulated and not scored. slowest:
+    radius of the filters' poles, at most.
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
     Infeasible if the minimum found has no proof.
     """
@@ -144,6 +146,7 @@ def identify_block_cascade(
         smoothing=smoothing[0],
         starts=starts,
         rng=np.random.default_rng(model_class.seed),
+        radius=slowest,
     )
     total = len(phases) * len(intervals) * len(smoothing) + 2
     report(f"best of {starts} starts", 1 / total)
@@ -153,6 +156,7 @@ def identify_block_cascade(
         smoothing=smoothing[0],
         steps=STEPS,
         tolerance=TOLERANCE,
+        radius=slowest,
     ).parameters
     tried: list[tuple[CascadeChoice, Parameters]] = []
     for M in phases:
@@ -161,7 +165,7 @@ def identify_block_cascade(
         for K in intervals:
             base = with_intervals(base, fitted, K)
             for weight in smoothing:
-                tried.append(_choice(base, fitted, judged, scales[1], weight))
+                tried.append(_choice(base, fitted, judged, scales[1], weight, radius=slowest))
                 report(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
             finer = min(tried[-len(smoothing) :], key=_validation_error)
             if _validation_error(finer) > coarser:
@@ -170,7 +174,7 @@ def identify_block_cascade(
     chosen, parameters = min(tried, key=_validation_error)
     polished = _choice(
         parameters, fitted, judged, scales[1], chosen.smoothing,
-        steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE,
+        steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
     )  # fmt: skip
     tried.append(polished)
     chosen, parameters = min(tried, key=_validation_error)
@@ -195,11 +199,14 @@ def _choice(
     unit: float,
     smoothing: float,
     *,
+    radius: float,
     steps: int = STEPS,
     tolerance: float = TOLERANCE,
 ) -> tuple[CascadeChoice, Parameters]:
     started = time.perf_counter()
-    found = minimise(fitted, start, smoothing=smoothing, steps=steps, tolerance=tolerance)
+    found = minimise(
+        fitted, start, smoothing=smoothing, steps=steps, tolerance=tolerance, radius=radius
+    )
     choice = CascadeChoice(
         phases=len(start.b1),
         intervals=start.f.intervals,

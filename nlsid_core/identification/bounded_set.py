@@ -55,7 +55,8 @@ class BoundedSet:
         n, box = len(problem.left) - 1, problem.window_range()
         weights = START_SLACK / (len(box) * 0.25 * (box[:, 1] - box[:, 0]) ** 2)
         extra = np.concatenate([START_BOUNDS, weights, weights])
-        return cls(problem, np.diag(0.5 ** np.arange(n)), np.array([1.0, 1.0]), extra)
+        fall = 0.5 * _rate(problem) ** 2
+        return cls(problem, np.diag(fall ** np.arange(n)), np.array([1.0, 1.0]), extra)
 
     @classmethod
     def of_proof(
@@ -67,7 +68,7 @@ class BoundedSet:
             raise ShapeError("the last step needs a positive leading coefficient")
         bounds, multipliers = found
         lagged = np.array([g.coefficients.sum() for g in model.G[1:]])
-        P = _common_storage([companion(lagged, q) for q in bounds])
+        P = _common_storage([companion(lagged, q) for q in bounds], _rate(problem))
         return cls(
             problem,
             proof.P if P is None else P,
@@ -81,15 +82,15 @@ class BoundedSet:
         n, box = len(problem.left) - 1, problem.window_range()
         n_q, n_w = len(problem.left[0]), len(box)
         n_g = n_q + n
-        size = 1 + n_g + 2 + 2 * n_w
+        size, rate = 1 + n_g + 2 + 2 * n_w, _rate(problem)
         S = np.diag(np.ones(n - 1), -1)
         result = []
         for end in (0, 1):
             F = np.zeros((size, 2 * n, 2 * n))
-            F[0, :n, :n] = -((SLOWEST_RATE * linearised_at[end]) ** 2) * P
+            F[0, :n, :n] = -((rate * linearised_at[end]) ** 2) * P
             F[0, n:, n:] = P
             level = F[1 + n_g + end]
-            level[:n, :n] = 2.0 * SLOWEST_RATE**2 * linearised_at[end] * P
+            level[:n, :n] = 2.0 * rate**2 * linearised_at[end] * P
             level[n:, :n], level[:n, n:] = P @ S, (P @ S).T
             for k in range(n):
                 entry = F[1 + n_q + k]
@@ -111,7 +112,8 @@ class BoundedSet:
         """The set around θ: the tightest bounds there, and P centred between them."""
         n = len(self.P)
         tight = _tightened(self.inequalities()[2:], theta, extra)
-        P = _centred(self.P, [companion(theta[-n:], q) for q in tight[:2]])
+        A = [companion(theta[-n:], q) for q in tight[:2]]
+        P = _centred(self.P, A, _rate(self.problem))
         return BoundedSet(self.problem, P, tight[:2], tight)
 
 
@@ -136,26 +138,28 @@ def _tightened(
     return tight
 
 
-def _centred(P: FloatArray, matrices: list[FloatArray]) -> FloatArray:
+def _rate(problem: StateAffineRows) -> float:
+    return min(SLOWEST_RATE, problem.slowest)
+
+
+def _centred(P: FloatArray, matrices: list[FloatArray], rate: float) -> FloatArray:
     """The analytic centre of {P : r²P - A'PA ≻ 0 for every A, tr P = n}, from P in it."""
     n = len(P)
     basis = traceless(n)
     start = P * n / np.trace(P)
-    images = [
-        np.stack([SLOWEST_RATE**2 * X - A.T @ X @ A for X in (start, *basis)]) for A in matrices
-    ]
+    images = [np.stack([rate**2 * X - A.T @ X @ A for X in (start, *basis)]) for A in matrices]
     inequalities = [MatrixInequality(F) for F in images]
     z = centre(inequalities, np.zeros(len(basis)))
     return np.asarray(start + np.tensordot(z, basis, axes=1))
 
 
-def _common_storage(matrices: list[FloatArray]) -> FloatArray | None:
+def _common_storage(matrices: list[FloatArray], rate: float) -> FloatArray | None:
     """P, tr P = n, that maximises the least eigenvalue of r²P - A'PA over the matrices."""
     n = len(matrices[0])
     basis = traceless(n)
     inequalities = []
     for A in matrices:
-        images = [SLOWEST_RATE**2 * X - A.T @ X @ A for X in (np.eye(n), *basis)]
+        images = [rate**2 * X - A.T @ X @ A for X in (np.eye(n), *basis)]
         inequalities.append(MatrixInequality(np.array([*images, -np.eye(n)])))
     objective = np.zeros(len(basis) + 1)
     objective[-1] = -1.0

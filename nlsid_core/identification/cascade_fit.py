@@ -84,8 +84,12 @@ def minimise(
     smoothing: float,
     steps: int,
     tolerance: float,
+    radius: float = MAX_RADIUS,
 ) -> Minimum:
-    """Damped Gauss-Newton from `start` until steps gain less than `tolerance` of the cost."""
+    """Damped Gauss-Newton from `start` until steps gain less than `tolerance` of the cost.
+
+    radius: of the poles, at most; those of `start` are within it.
+    """
     D = _second_differences(start)
     weight = smoothing / float(np.ptp(start.f.coefficients) ** 2 + np.finfo(float).tiny)
     here, residual = start, _residual(trials, start)
@@ -98,7 +102,7 @@ def minimise(
         taken += 1
         gain = 0.0
         while damping < GIVE_UP_DAMPING:
-            candidate = _step(here, H, gradient, damping)
+            candidate = _step(here, H, gradient, damping, radius)
             if candidate is not None:
                 trial_residual = _residual(trials, candidate)
                 reached = _cost(trial_residual, candidate, D, weight)
@@ -175,9 +179,9 @@ def _cost(residual: FloatArray, parameters: Parameters, D: FloatArray, weight: f
 
 
 def _step(
-    here: Parameters, H: FloatArray, gradient: FloatArray, damping: float
+    here: Parameters, H: FloatArray, gradient: FloatArray, damping: float, radius: float
 ) -> Parameters | None:
-    """The damped step, None if it leaves the stable filters."""
+    """The damped step, None if it leaves the filters of this radius."""
     diagonal = np.diag(H)
     try:
         damped = H + np.diag(damping * diagonal + RIDGE * np.max(diagonal))
@@ -185,7 +189,7 @@ def _step(
     except (LinAlgError, ValueError):
         return None
     candidate = here.moved(step)
-    return candidate if candidate.radius < MAX_RADIUS else None
+    return candidate if candidate.radius < radius else None
 
 
 def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:

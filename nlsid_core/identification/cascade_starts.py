@@ -37,14 +37,21 @@ def best_start(
     smoothing: float,
     starts: int,
     rng: np.random.Generator,
+    radius: float,
 ) -> Parameters:
     """The best of `starts` minima from random all-pole filters with f by linear least squares."""
 
     def minimised(start: Parameters, steps: int) -> Minimum:
-        return minimise(trials, start, smoothing=smoothing, steps=steps, tolerance=START_TOLERANCE)
+        return minimise(
+            trials, start, smoothing=smoothing, steps=steps, tolerance=START_TOLERANCE,
+            radius=radius,
+        )  # fmt: skip
 
     screened = [
-        minimised(_random_start(trials, orders, smoothing=smoothing, rng=rng), SCREENING_STEPS)
+        minimised(
+            _random_start(trials, orders, smoothing=smoothing, rng=rng, radius=radius),
+            SCREENING_STEPS,
+        )
         for _ in range(starts)
     ]
     screened.sort(key=lambda minimum: minimum.cost)
@@ -106,9 +113,10 @@ def _random_start(
     *,
     smoothing: float,
     rng: np.random.Generator,
+    radius: float,
 ) -> Parameters:
     """All-pole filters, the first scaled to a unit output, f by regularised least squares."""
-    a1, a2 = (_random_denominator(order, rng) for order in orders)
+    a1, a2 = (_random_denominator(order, rng, radius) for order in orders)
     b1, b2 = np.eye(1, orders[0] + 1), np.eye(1, orders[1] + 1)
     flat = Parameters(a1, b1, Spline(0.0, 1.0, np.zeros(START_INTERVALS + 3)), a2, b2)
     gain = 1.0 / float(np.std(np.concatenate([second_inputs(flat, t)[0] for t in trials])))
@@ -126,14 +134,15 @@ def _random_start(
     return replace(flat, f=replace(flat.f, coefficients=np.linalg.solve(H, R @ y)))
 
 
-def _random_denominator(order: int, rng: np.random.Generator) -> FloatArray:
+def _random_denominator(order: int, rng: np.random.Generator, radius: float) -> FloatArray:
     """Coefficients a of zⁿ - a[0] zⁿ⁻¹ - … with random poles: pairs, and a real one if n is odd."""
     roots: list[complex] = []
+    radii = np.minimum(POLE_RADII, 0.9 * radius)
     while len(roots) + 2 <= order:
-        pole = rng.uniform(*POLE_RADII) * np.exp(1j * rng.uniform(*POLE_ANGLES))
+        pole = rng.uniform(*radii) * np.exp(1j * rng.uniform(*POLE_ANGLES))
         roots += [pole, pole.conjugate()]
     if len(roots) < order:
-        roots.append(rng.uniform(*POLE_RADII))
+        roots.append(rng.uniform(*radii))
     return np.asarray(-np.real(np.poly(roots))[1:]) if roots else np.zeros(0)
 
 

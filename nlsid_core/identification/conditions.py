@@ -54,24 +54,27 @@ class Inequality:
         return tuple(name for name in names if name in used) or tuple(names[:1])
 
 
-def linear(E: Polynomials, F: Polynomials, delta: Number = 1) -> Inequality:
-    """[E - δI, F'; F, E] ⪰ 0: E x⁺ = F x + …, stable; with E = E' it contains every stable A.
+def linear(E: Polynomials, F: Polynomials, delta: Number = 1, *, rate: Number = 1) -> Inequality:
+    """[ρ²E - δI, F'; F, E] ⪰ 0: E x⁺ = F x + …, stable; with E = E' it contains every stable A.
 
-    Source: (2.19).
+    rate: ρ, by which V shrinks beside δ. Source: (2.19).
     """
-    corner = E - delta * _identity(len(E))
+    corner = rate**2 * E - delta * _identity(len(E))
     return Inequality(filled(np.block([[corner, F.T], [F, E]])))
 
 
 def increments(
     e: Polynomials, f: Polynomials, P: Polynomials, states: Sequence[str], *,
-    delta: Number = 1, domain: Domain = (),
+    delta: Number = 1, rate: Number = 1, domain: Domain = (),
 ) -> Inequality:  # fmt: skip
-    """[2Δ'(e - ê) - |Δ|²_P - δ|Δ|², (f - f̂)'; f - f̂, P] ⪰ 0, Δ = x - x̂. Source: Lemma 2.12."""
+    """[ρ²(2Δ'(e - ê) - |Δ|²_P) - δ|Δ|², (f - f̂)'; f - f̂, P] ⪰ 0, Δ = x - x̂, ρ = rate.
+
+    V = |e - ê|²_{P⁻¹} ≥ 2Δ'(e - ê) - |Δ|²_P shrinks by ρ² or more. Source: Lemma 2.12.
+    """
     hat, gap = _second(states)
     moved, image = e - _substituted(e, hat), f - _substituted(f, hat)
     matrix = np.empty((len(e) + 1,) * 2, dtype=object)
-    matrix[0, 0] = 2 * (gap @ moved) - gap @ P @ gap - delta * (gap @ gap)
+    matrix[0, 0] = rate**2 * (2 * (gap @ moved) - gap @ P @ gap) - delta * (gap @ gap)
     matrix[0, 1:] = matrix[1:, 0] = image
     matrix[1:, 1:] = P
     return Inequality(filled(matrix), _both(domain, hat), _gaps(states))
@@ -79,22 +82,22 @@ def increments(
 
 def derivatives(
     e: Polynomials, f: Polynomials, P: Polynomials, states: Sequence[str], *,
-    delta: Number = 1, domain: Domain = (),
+    delta: Number = 1, rate: Number = 1, domain: Domain = (),
 ) -> Inequality:  # fmt: skip
-    """[He(E(x)) - P - δI, F(x, w)'; F(x, w), P] ⪰ 0 with E = ∂e/∂x, F = ∂f/∂x.
+    """[ρ²(He(E(x)) - P) - δI, F(x, w)'; F(x, w), P] ⪰ 0 with E = ∂e/∂x, F = ∂f/∂x, ρ = rate.
 
     Global only if deg E ≥ 2 deg F; otherwise give a domain. Source: Lemma 2.13.
     """
     E, F = _slopes(e, states), _slopes(f, states)
-    corner = E + E.T - P - delta * _identity(len(e))
+    corner = rate**2 * (E + E.T - P) - delta * _identity(len(e))
     return Inequality(filled(np.block([[corner, F.T], [F, P]])), domain)
 
 
 def implicit_increments(
     h: Polynomials, shift: Polynomials, V: Polynomial, v: Sequence[str], x: Sequence[str], *,
-    delta: Number = 1, domain: Domain = (),
+    delta: Number = 1, rate: Number = 1, domain: Domain = (),
 ) -> Inequality:  # fmt: skip
-    """2(v - v̂)'(h - ĥ) + V(x, x̂) - V(x⁺, x̂⁺) - δ|x - x̂|² ≥ 0, x⁺ = [v; ã(x, w)].
+    """2(v - v̂)'(h - ĥ) + ρ²V(x, x̂) - V(x⁺, x̂⁺) - δ|x - x̂|² ≥ 0, x⁺ = [v; ã(x, w)], ρ = rate.
 
     V: in x and its gap, zero without gap; `storage` asks V ≥ 0. Source: Lemma 2.10.
     """
@@ -108,7 +111,7 @@ def implicit_increments(
     wide = V.over(tuple(dict.fromkeys([*names, *V.names])))
     next_V = wide.substitute(dict(zip(names, [*after, *gap_after], strict=True)))
     moved = h - _substituted(h, hat)
-    p = 2 * (gap_v @ moved) + V - next_V - delta * (gap_x @ gap_x)
+    p = 2 * (gap_v @ moved) + rate**2 * V - next_V - delta * (gap_x @ gap_x)
     return Inequality(filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps([*v, *x]))
 
 
@@ -119,12 +122,12 @@ def storage(V: Polynomial, x: Sequence[str], *, domain: Domain = ()) -> Inequali
 
 def implicit_derivatives(
     h: Polynomials, shift: Polynomials, M: Polynomials, v: Sequence[str], x: Sequence[str], *,
-    delta: Number = 1, domain: Domain = (),
+    delta: Number = 1, rate: Number = 1, domain: Domain = (),
 ) -> Inequality:  # fmt: skip
-    """2ν'(H₁ν + H₂Δ) + |Δ|²_{M(x)-δI} - |[ν; ÃΔ]|²_{M(x⁺)} ≥ 0 for every ν, Δ, as a matrix.
+    """2ν'(H₁ν + H₂Δ) + |Δ|²_{ρ²M(x)-δI} - |[ν; ÃΔ]|²_{M(x⁺)} ≥ 0 for every ν, Δ, as a matrix.
 
-    H₁ = ∂h/∂v, H₂ = ∂h/∂x, Ã = ∂ã/∂x; M: (n_x, n_x) in x, M ⪰ 0 to be asked for beside it.
-    Source: Lemma 2.11.
+    ρ = rate, H₁ = ∂h/∂v, H₂ = ∂h/∂x, Ã = ∂ã/∂x; M: (n_x, n_x) in x, M ⪰ 0 to be asked for beside
+    it. Source: Lemma 2.11.
     """
     n_v, n_x = len(v), len(x)
     H1, H2 = _slopes(h, v), _slopes(h, x)
@@ -132,7 +135,7 @@ def implicit_derivatives(
     next_M = _substituted(M, dict(zip(x, [*variables(list(v)), *shift], strict=True)))
     top = H1 + H1.T - next_M[:n_v, :n_v]
     side = H2 - next_M[:n_v, n_v:] @ A
-    corner = M - delta * _identity(n_x) - A.T @ next_M[n_v:, n_v:] @ A
+    corner = rate**2 * M - delta * _identity(n_x) - A.T @ next_M[n_v:, n_v:] @ A
     return Inequality(filled(np.block([[top, side], [side.T, corner]])), domain)
 
 

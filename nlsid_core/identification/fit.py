@@ -30,20 +30,24 @@ class Proof(Protocol):
 
 def stated_rate(proof: Proof, period: float) -> str:
     """The rate a sample, rounded up, and its time constant at `period` (s): `0.9500 (0.49 s)`."""
-    if proof.rate >= 1.0:
-        return "proved, no rate"
-    digits = 4 if proof.rate <= 0.999 else 7
-    rate = max(math.ceil(proof.rate * 10**digits), 1) / 10**digits
-    if rate >= 1.0:
-        return f"{proof.rate!r} ({-period / math.log(proof.rate):.2g} s)"
-    return f"{rate:.{digits}f} ({-period / math.log(rate):.2g} s)"
+    return "proved, no rate" if proof.rate >= 1.0 else rate_text(proof.rate, period)
+
+
+def rate_text(rate: float, period: float) -> str:
+    """A rate below 1 as `stated_rate` writes it."""
+    digits = 4 if rate <= 0.999 else 7
+    rounded = max(math.ceil(rate * 10**digits), 1) / 10**digits
+    if rounded >= 1.0:
+        return f"{rate!r} ({-period / math.log(rate):.2g} s)"
+    return f"{rounded:.{digits}f} ({-period / math.log(rounded):.2g} s)"
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Generic[M]):
     """One method's model, its stability proof if there is one, and the seconds it took.
 
-    transient: samples at the start of each trial that its scores leave out.
+    seconds: of processor time. transient: samples at the start of each trial that its scores leave
+    out. remark: why there is no proof, where that is known.
     """
 
     method: Method
@@ -51,10 +55,16 @@ class Candidate(Generic[M]):
     proof: Proof | None
     seconds: float
     transient: int = 0
+    remark: str = ""
 
     def error_percent(self, dataset: Dataset) -> float:
         """100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation over `dataset`."""
         return simulation_percent(self.model, dataset, transient=self.transient)
+
+    @property
+    def unproved(self) -> str:
+        """What is said in the place of a proof."""
+        return f"not proved: {self.remark}" if self.remark else "not proved"
 
     def validate(self, dataset: Dataset, *, transient: int | None = None) -> Validation:
         """Simulation and prediction errors and the tests of the residuals over `dataset`."""
@@ -91,13 +101,15 @@ class Fit(Generic[M]):
     """Every candidate in order, the chosen one, and what was measured on the way.
 
     errors: simulation error in % by dataset name ("train", "validation", "test", those given) and
-    name of the method. fit[name] is the candidate of the method called so.
+    name of the method. max_rate: the slowest rate a sample that was searched, and proofs of which
+    count. fit[name] is the candidate of the method called so.
     """
 
     candidates: tuple[Candidate[M], ...]
     method: Method
     history: History
     errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    max_rate: float = 1.0
 
     def __getitem__(self, method: str) -> Candidate[M]:
         return next(c for c in self.candidates if c.method.name == method)
@@ -124,6 +136,11 @@ class Fit(Generic[M]):
             raise Infeasible(f"the model of {self.method.title} has no proof of stability")
         return self.chosen.proof
 
+    @property
+    def slowest(self) -> str:
+        """The slowest rate that was allowed, in words."""
+        return f"slowest rate allowed: {rate_text(self.max_rate, self.model.period)} a sample"
+
     def __str__(self) -> str:
         columns = list(self.errors)
         header = f"  {'simulation error [%]':52s}" + "".join(f"{name:>12s}" for name in columns)
@@ -131,7 +148,7 @@ class Fit(Generic[M]):
         rows: list[str] = []
         for c in self.candidates:
             scores = "".join(f"{self.errors[name][c.method.name]:12.2f}" for name in columns)
-            state = stated_rate(c.proof, c.model.period) if c.proof else "not proved"
+            state = stated_rate(c.proof, c.model.period) if c.proof else c.unproved
             mark = "*" if c.method == self.method else " "
             rows.append(f"{mark} {c.method.title:52s}{scores}{c.seconds:9.3f} s  {state}")
-        return "\n".join([str(self.model), str(self.history), header, *rows])
+        return "\n".join([str(self.model), str(self.history), self.slowest, header, *rows])

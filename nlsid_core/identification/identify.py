@@ -3,19 +3,23 @@
 `select` does so for several classes and keeps the one with the least error on validation data.
 """
 
+import logging
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic
 
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.errors import DataError, Infeasible, OptionError, SolverError
 from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, alike, describe
+from nlsid_core.identification.rates import default_max_rate
 from nlsid_core.identification.searches import OFFERS, methods_of
 from nlsid_core.identification.trail import Progress, Task, silent
+
+log = logging.getLogger(__name__)
 
 
 def identify(
@@ -27,6 +31,7 @@ def identify(
     validation: Dataset | None = None,
     test: Dataset | None = None,
     transient: int = 0,
+    max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -37,8 +42,10 @@ def identify(
     of them. comparators: what else runs beside it; None: what is quick, with the options that it
     shares with the method. `test` is only scored; so is `validation`, but by it a block cascade
     chooses its phases and knots. transient: samples at the start of every trial that are simulated
-    and not scored. executor: shares work that splits, such as moments of many bags. progress:
-    called with (what was done, fraction done).
+    and not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a sample: two
+    solutions approach each other by it or faster, and a slower proof does not count (None: the
+    time constant is the length of the longest training trial). executor: shares work that splits,
+    such as moments of many bags. progress: called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
     """
@@ -50,28 +57,33 @@ def identify(
     datasets = {"train": train, "validation": validation, "test": test}
     scored = {name: dataset for name, dataset in datasets.items() if dataset is not None}
     _refuse_other_signals(scored)
+    if max_rate is not None and not 0.0 < max_rate < 1.0:
+        raise OptionError("max_rate", max_rate, "a number between 0 and 1")
+    slowest = default_max_rate(train) if max_rate is None else max_rate
     offer = OFFERS[type(model_class)]
     quick = tuple(alike(kind, chosen) for kind in offer.comparators if kind in known)
     task = Task(
         method=chosen,
         comparators=quick if comparators is None else tuple(comparators),
+        max_rate=slowest,
         validation=validation,
         transient=transient,
         executor=executor,
         progress=silent if progress is None else progress,
     )
     trail = offer.search(train, model_class, task)
-    fit = Fit(tuple(trail.candidates), chosen, trail.history)
+    fit = Fit(tuple(trail.candidates), chosen, trail.history, max_rate=slowest)
     if fit.chosen.proof is None and not allow_unproved:
+        remark = fit.chosen.remark and f" ({fit.chosen.remark})"
         raise Infeasible(
-            f"no proof of stability for the model of {chosen.title}; try fewer lags, more or "
-            "richer data, or a method that keeps a proof (rse_certified, moment_rie)"
+            f"no proof of stability for the model of {chosen.title}{remark}; try fewer lags, more "
+            "or richer data, or a method that keeps a proof (rse_certified, moment_rie)"
         )
     errors = {
         name: {c.method.name: c.error_percent(dataset) for c in fit.candidates}
         for name, dataset in scored.items()
     }
-    return Fit(fit.candidates, chosen, fit.history, errors)
+    return replace(fit, errors=errors)
 
 
 def select(
@@ -82,43 +94,61 @@ def select(
     method: Method | None = None,
     test: Dataset | None = None,
     transient: int = 0,
+    max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> "Selection[M]":
-    """Identify every class on `train` and keep the one with the least error on `validation`.
+    """Identify every class on `train`, choose by the error on `validation`, fit to both again.
 
     A class that does not fit the data or (unless `allow_unproved`) has no proof counts as
-    infinitely bad. Options are those of `identify`. Raises Infeasible if no class has a model.
+    infinitely bad. The chosen class is identified once more on both datasets together, unless it
+    needs `validation` for choices of its own. Options are those of `identify`. Raises Infeasible if
+    no class has a model.
     """
     report = silent if progress is None else progress
     tried: list[Tried[M]] = []
+
+    def fitted(data: Dataset, model_class: ModelClass[M], judged: Dataset | None) -> Fit[M]:
+        return identify(
+            data,
+            model_class,
+            method=method,
+            comparators=(),
+            validation=judged,
+            test=test,
+            transient=transient,
+            max_rate=max_rate,
+            allow_unproved=allow_unproved,
+            executor=executor,
+        )
+
     for number, model_class in enumerate(classes):
-        report(describe(model_class), number / len(classes))
+        report(describe(model_class), number / (len(classes) + 1))
         try:
-            fit = identify(
-                train,
-                model_class,
-                method=method,
-                comparators=(),
-                validation=validation,
-                test=test,
-                transient=transient,
-                allow_unproved=allow_unproved,
-                executor=executor,
-            )
+            fit = fitted(train, model_class, validation)
         except (DataError, SolverError) as refusal:
             tried.append(Tried(model_class, None, str(refusal)))
         else:
             tried.append(Tried(model_class, fit))
-    report("done", 1.0)
     if not tried:
         raise DataError("no model class to select from")
     best = min(tried, key=lambda entry: entry.error("validation"))
     if best.fit is None:
         reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
         raise Infeasible(f"no class has a proved model: {reasons}")
-    return Selection(tuple(tried), best.model_class, best.fit)
+    report("fitting to training and validation trials", len(classes) / (len(classes) + 1))
+    refit = None
+    if not OFFERS[type(best.model_class)].needs_validation:
+        try:
+            both = Dataset((*train.trajectories, *validation.trajectories))
+            refit = fitted(both, best.model_class, None)
+        except (DataError, SolverError) as refusal:
+            log.warning("not fitted to training and validation trials together: %s", refusal)
+    report("done", 1.0)
+    return Selection(
+        tuple(tried), best.model_class, best.fit if refit is None else refit, refit is not None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +166,15 @@ class Tried(Generic[M]):
 
 @dataclass(frozen=True, eq=False)
 class Selection(Generic[M]):
-    """Everything that was tried, in order, and the class with the least validation error."""
+    """Everything that was tried, in order, and the class with the least validation error.
+
+    fit: of that class, to training and validation trials together if `refitted`.
+    """
 
     tried: tuple[Tried[M], ...]
     best: ModelClass[M]
     fit: Fit[M]
+    refitted: bool
 
     @property
     def errors(self) -> tuple[float, ...]:
@@ -153,7 +187,10 @@ class Selection(Generic[M]):
             + (entry.refusal or f"{entry.error('validation'):9.2f} %")
             for entry in self.tried
         ]
-        return "\n".join(["model class, validation error", *rows, str(self.fit)])
+        on = "training and validation trials" if self.refitted else "training trials"
+        return "\n".join(
+            ["model class, validation error", *rows, f"fitted to {on}:", str(self.fit)]
+        )
 
 
 def _unknown(asked: object, model_class: object, known: Sequence[type[Method]]) -> str:

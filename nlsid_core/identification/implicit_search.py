@@ -57,8 +57,10 @@ class ImplicitFit:
     bound: float
 
 
-def minimise_implicit_rie(rows: ImplicitRows) -> ImplicitFit:
+def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> ImplicitFit:
     """The stable model with the least bound on its simulation error, and its proof.
+
+    slowest: the storage shrinks by its square or more, a sample.
 
     Raises Infeasible if there is none in the set or it has no exact proof, SolverError as the
     solver does.
@@ -66,7 +68,7 @@ def minimise_implicit_rie(rows: ImplicitRows) -> ImplicitFit:
     n_v, names = len(rows.y_scale[0]), rows.names
     e, f = _unknowns(rows)
     S = symmetric_template("S", n_v)
-    parts = _conditions(rows, e, f, S)
+    parts = _conditions(rows, e, f, S, slowest)
     found, bound = _interior([*parts, *_weighted(rows, S)], names)
     lowest = float(np.linalg.eigvalsh(_values(found, S))[0])
     model = rows.model(*_coefficients(found, rows), HALF * lowest / 2.0)
@@ -124,7 +126,9 @@ def _unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
     return e, f
 
 
-def _conditions(rows: ImplicitRows, e: Objects, f: Objects, S: Objects) -> list[Constraint]:
+def _conditions(
+    rows: ImplicitRows, e: Objects, f: Objects, S: Objects, rate: float
+) -> list[Constraint]:
     """The set's inequalities with Q and S kept, and e monotone wherever v is."""
     names, made, Q = rows.names, rows.model_class, rows.weight
     domain = _domain(rows, (*names.x, *names.w))
@@ -138,7 +142,7 @@ def _conditions(rows: ImplicitRows, e: Objects, f: Objects, S: Objects) -> list[
             assert isinstance(storage, Polynomial)
             kept = _form(S, names.gaps(names.v)) + _form(Q, names.gaps(names.x))
             part = conditions.implicit_increments(
-                h, shift, storage, names.v, names.x, delta=0, domain=inside
+                h, shift, storage, names.v, names.x, delta=0, rate=rate, domain=inside
             )
             of_set = [
                 _minus(part, [[kept]]),
@@ -147,7 +151,7 @@ def _conditions(rows: ImplicitRows, e: Objects, f: Objects, S: Objects) -> list[
         else:
             assert isinstance(storage, np.ndarray)
             part = conditions.implicit_derivatives(
-                h, shift, storage, names.v, names.x, delta=0, domain=inside
+                h, shift, storage, names.v, names.x, delta=0, rate=rate, domain=inside
             )
             of_set = [_minus(part, _diagonal(S, Q)), Inequality(storage)]
     else:
@@ -157,12 +161,12 @@ def _conditions(rows: ImplicitRows, e: Objects, f: Objects, S: Objects) -> list[
                 np.array([[p.derivative(x) for x in names.x] for p in part], dtype=object)
                 for part in (e_of_x, f)
             )
-            part = conditions.linear(E, F, 0)
+            part = conditions.linear(E, F, 0, rate=rate)
         else:
             P = storage_template(made.set, names, 0)
             assert isinstance(P, np.ndarray)
             of = conditions.increments if made.set == "2.12" else conditions.derivatives
-            part = of(e_of_x, f, P, names.x, delta=0, domain=domain)
+            part = of(e_of_x, f, P, names.x, delta=0, rate=rate, domain=domain)
         corner = Q
         if made.set == "2.12":
             corner = np.array([[_form(Q, names.gaps(names.x))]], dtype=object)

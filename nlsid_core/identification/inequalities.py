@@ -15,28 +15,38 @@ MU_FALL = 0.1
 
 @dataclass(frozen=True, eq=False)
 class MatrixInequality:
-    """F₀ + Σ z_i F_i ⪰ 0 on z = [θ; extra unknowns]; F: (1 + n_z, m, m), F₀ first."""
+    """F₀ + Σ z_i F_i ⪰ 0 on z = [θ; extra unknowns]; F: (1 + n_z, …, m, m), F₀ first.
+
+    Several matrices of one order stand in one inequality.
+    """
 
     F: FloatArray
 
+    @property
+    def order(self) -> int:
+        """The parameter of the barrier: m times how many matrices there are."""
+        return int(np.prod(self.F.shape[1:-1]))
+
     def at(self, z: FloatArray) -> FloatArray:
-        """The matrix at z."""
+        """The matrices (…, m, m) at z."""
         moved = z @ self.F[1:].reshape(len(z), -1)
         return np.asarray(self.F[0] + moved.reshape(self.F.shape[1:]))
 
     def barrier(self, z: FloatArray) -> float:
         """-log det; infinite outside."""
         try:
-            return float(-2.0 * np.log(np.diag(np.linalg.cholesky(self.at(z)))).sum())
+            L = np.linalg.cholesky(self.at(z))
+            return float(-2.0 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum())
         except np.linalg.LinAlgError:
             return np.inf
 
     def derivatives(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the barrier."""
         inverse = np.linalg.inv(np.linalg.cholesky(self.at(z)))
-        scaled = inverse @ self.F[1:] @ inverse.T
-        flat = scaled.reshape(len(scaled), scaled.shape[1] ** 2)
-        return -np.trace(scaled, axis1=1, axis2=2), flat @ flat.T
+        scaled = inverse @ self.F[1:] @ np.swapaxes(inverse, -2, -1)
+        flat = scaled.reshape(len(scaled), -1)
+        traces = np.trace(scaled, axis1=-2, axis2=-1).reshape(len(scaled), -1)
+        return -traces.sum(axis=1), flat @ flat.T
 
 
 def centre(
@@ -73,7 +83,7 @@ def minimise_linear(
     objective: FloatArray, inequalities: Sequence[MatrixInequality], z: FloatArray, *, gap: float
 ) -> FloatArray:
     """Minimise objective'z to within `gap`, staying strictly inside, from z inside."""
-    size = sum(inequality.F.shape[1] for inequality in inequalities)
+    size = sum(inequality.order for inequality in inequalities)
     mu = max(abs(float(objective @ z)), gap) / size
     while True:
         z = centre(inequalities, z, objective=objective, mu=mu)

@@ -4,7 +4,7 @@ A last step on the simulation error may be kept among the stable models.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.options import require_whole
 
 SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
+POLE_ROUNDING = 1e-9  # of a pole that was put on the radius
 MIN_ROWS_PER_PARAMETER = 5  # fewer and the fit is an interpolation, not an estimate
 RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeats the others
 
@@ -132,7 +133,8 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
         rank = int((singular > RANK_TOLERANCE * singular[0]).sum()) - 1
         raise DataError(
             f"the excitation does not excite {lags} lags: its window of {lags + 1} samples has "
-            f"rank {rank}; use richer inputs or fewer lags"
+            f"rank {rank}; use richer inputs, fewer lags, or the class state_affine with fewer "
+            "delays of the input, such as `delays: [1]`"
         )
     return Regression(
         Y=np.concatenate(outputs),
@@ -157,14 +159,19 @@ def least_squares(regression: Regression) -> DifferenceEquation:
 
 
 def minimise_simulation_error(
-    regression: Regression, start: DifferenceEquation, *, stable: bool = False
+    regression: Regression,
+    start: DifferenceEquation,
+    *,
+    stable: bool = False,
+    radius: float = SLOWEST_POLE,
 ) -> DifferenceEquation:
     """A local minimum of Σ (y - ŷ)² from `start`'s lagged coefficients, never above it.
 
-    stable: search among stable models only, for a `start` that has a proof; the result has one
-    too, or is `start` itself. Otherwise nothing keeps the model stable.
+    stable: search among stable models only, their poles within `radius`, for a `start` that has a
+    proof and is one of them; the result has one too, or is `start` itself. Otherwise nothing keeps
+    the model stable.
     """
-    inside = _is_stable if stable else None
+    inside = partial(_is_stable, radius=min(radius, SLOWEST_POLE)) if stable else None
     theta = np.concatenate([[1.0], -start.a])
     objective = SimulationError(regression.rows, inside=inside)
     point = Descent(objective, (), len(theta)).to_minimum(theta).point
@@ -172,9 +179,9 @@ def minimise_simulation_error(
     return start if stable and prove_stability(found) is None else found
 
 
-def _is_stable(theta: FloatArray) -> bool:
-    """Every pole of g_0 y(t) + … + g_n y(t-n) is inside the unit circle, with room for a proof."""
-    return bool(theta[0] and (abs(np.roots(theta)) < SLOWEST_POLE).all())
+def _is_stable(theta: FloatArray, radius: float) -> bool:
+    """Every pole of g_0 y(t) + … + g_n y(t-n) is within the radius, up to rounding."""
+    return bool(theta[0] and (abs(np.roots(theta)) <= radius + POLE_ROUNDING).all())
 
 
 def _scalars(scale: tuple[FloatArray, FloatArray]) -> tuple[float, float]:

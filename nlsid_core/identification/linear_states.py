@@ -48,9 +48,10 @@ class LinearStateFit:
         return self.model.jacobian(zero[:, :n], zero[:, :n], zero[:, n:])[0, :, :n]
 
 
-def identify_linear_states(dataset: Dataset) -> LinearStateFit:
+def identify_linear_states(dataset: Dataset, *, slowest: float = 1.0) -> LinearStateFit:
     """The stable linear model of the measured outputs as states, x⁺ one sample ahead.
 
+    slowest: two solutions approach each other by it or faster, a sample.
     Raises DataError for data too few or not rich enough, Infeasible if the minimiser has no exact
     proof, SolverError as the solver does.
     """
@@ -68,7 +69,7 @@ def identify_linear_states(dataset: Dataset) -> LinearStateFit:
     refuse_poor(data[:, after.shape[1] :])
     n = after.shape[1]
     R = np.linalg.qr(data, mode="r") / np.sqrt(len(data))
-    E, found = _solved(R, n)
+    E, found = _solved(R, n, slowest)
     F = _values(found, "F", n, n)
     G = _values(found, "G", n, R.shape[1] - 2 * n)
     first = dataset.trajectories[0]
@@ -94,7 +95,7 @@ def identify_linear_states(dataset: Dataset) -> LinearStateFit:
     return LinearStateFit(model, proof)
 
 
-def _solved(R: FloatArray, n: int) -> tuple[FloatArray, Solution]:
+def _solved(R: FloatArray, n: int, slowest: float) -> tuple[FloatArray, Solution]:
     """E, and the solution that holds F and G, for the triangular factor R of [x⁺, x, w, 1]."""
     E = symmetric_template("E", n)
     F, G = _unknown("F", n, n), _unknown("G", n, R.shape[1] - 2 * n)
@@ -102,7 +103,7 @@ def _solved(R: FloatArray, n: int) -> tuple[FloatArray, Solution]:
     residual = R[:, :n] @ E - R[:, n : 2 * n] @ F.T - R[:, 2 * n :] @ G.T
     program = Program(
         forms_of(2 * n),
-        (linear_models(E, F), NormBound(tuple(residual.ravel()), bound)),
+        (linear_models(E, F, rate=slowest), NormBound(tuple(residual.ravel()), bound)),
         minimise=bound,
     )
     found = solve(program)

@@ -24,7 +24,7 @@ from nlsid_core.polynomial.values import monomial_values
 SLOWEST_RATE = 1.0 - 1e-6  # V shrinks by its square at least, so that the proof is strict
 SLOWEST_IN_BOX = 1.0 - 1e-3  # the same where w matters: the search for a proof needs more room
 GROWTH = 4.0  # of G_0 from one iterate to the next, at most, as its multiplier weighs it
-MOST_CORNERS = 256  # of the input box, an inequality for each
+MOST_CORNERS = 4096  # of the input box, a matrix for each
 LARGEST_MULTIPLIER = 100.0  # of the mean eigenvalue of P: where nothing else bounds M
 
 
@@ -58,7 +58,8 @@ class MatrixSet:
     def start(cls, problem: StateAffineRows) -> "MatrixSet":
         """The set around G = I."""
         n, n_y = len(problem.left) - 1, len(problem.y_scale[0])
-        P = np.kron(np.diag(0.5 ** np.arange(n)), np.eye(n_y))
+        fall = 0.5 * slowest_rate(problem) ** 2
+        P = np.kron(np.diag(fall ** np.arange(n)), np.eye(n_y))
         return cls(problem, P, np.eye(n_y, (n + 1) * n_y), problem.rows.identity)
 
     @classmethod
@@ -89,9 +90,9 @@ class MatrixSet:
         positive[1 + n_theta :] = basis
         result = [MatrixInequality(positive)]
         decrease = _decrease(self.problem, basis)
-        for G in corners:
-            slopes = _twice_symmetric(self.M.T @ G)
-            result.append(MatrixInequality(np.concatenate([0.0 * decrease[:1], slopes, decrease])))
+        slopes = _twice_symmetric(self.M.T @ corners).transpose(1, 0, 2, 3)
+        of_P = np.broadcast_to(decrease[:, None], (n_P, *slopes.shape[1:]))
+        result.append(MatrixInequality(np.concatenate([0.0 * slopes[:1], slopes, of_P])))
         lead = len(self.M)
         scale = np.einsum("ab,viab->i", self.M[:, :lead], corners[..., :lead])  # Σ tr T G_0
         limit = np.zeros((1 + n_theta + n_P, 1, 1))
@@ -118,12 +119,13 @@ class MatrixSet:
         bounded[1 + n_P :, n_y:, :n_y] = multipliers.transpose(0, 2, 1)
         inequalities = [MatrixInequality(positive), MatrixInequality(bounded)]
         storage = _decrease(problem, np.concatenate([P[None], moves]))
-        for corner in _coefficients(problem):
-            G = np.tensordot(theta, corner, axes=1)
-            terms = _twice_symmetric(np.concatenate([M[None], multipliers]).transpose(0, 2, 1) @ G)
-            F = np.concatenate([storage, terms[1:]])
-            F[0] += terms[0]
-            inequalities.append(MatrixInequality(F))
+        G = np.einsum("i,viab->vab", theta, _coefficients(problem))
+        each = np.concatenate([M[None], multipliers]).transpose(0, 2, 1)
+        terms = _twice_symmetric(each[:, None] @ G)
+        of_P = np.broadcast_to(storage[:, None], (len(storage), *terms.shape[1:]))
+        F = np.concatenate([of_P, terms[1:]])
+        F[0] += terms[0]
+        inequalities.append(MatrixInequality(F))
         z = centre(inequalities, np.zeros(n_P + n_M))
         return MatrixSet(
             problem,
@@ -155,7 +157,7 @@ def _coefficients(problem: StateAffineRows) -> FloatArray:
 
 def slowest_rate(problem: StateAffineRows) -> float:
     """r: V shrinks by r² a sample, or faster, in the whole set."""
-    return SLOWEST_IN_BOX if _used(problem).any() else SLOWEST_RATE
+    return min(SLOWEST_IN_BOX if _used(problem).any() else SLOWEST_RATE, problem.slowest)
 
 
 def _decrease(problem: StateAffineRows, P: FloatArray) -> FloatArray:
@@ -174,4 +176,4 @@ def _symmetric(entries: FloatArray, size: int) -> FloatArray:
 
 
 def _twice_symmetric(X: FloatArray) -> FloatArray:
-    return np.asarray(X + X.transpose(0, 2, 1))
+    return np.asarray(X + np.swapaxes(X, -2, -1))

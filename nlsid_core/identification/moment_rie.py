@@ -66,14 +66,16 @@ def minimise_moment_rie(
     offsets: Offsets,
     *,
     kappa: float | None = None,
+    slowest: float = 1.0,
 ) -> MomentFit:
     """The stable model with the least bound on these moments, and its exact proof.
 
     template: names, units and sample time. kappa: bound on |R|_F in the model's units (None: none).
+    slowest: V shrinks by its square or more, a sample.
     Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
     exact proof, SolverError if the solver gives up.
     """
-    problem = _Problem.of(moments, model_class.lags)
+    problem = _Problem.of(moments, model_class.lags, slowest)
     solution = problem.solve(kappa=kappa)
     x = problem.columns * solution.x
     layout = problem.layout
@@ -196,11 +198,11 @@ class Layout:
         """Columns of c that multiply y(t-1) … y(t-n)."""
         return self.c[self.degree + 1 : self.degree + 1 + self.lags]
 
-    def stability(self, delta: float) -> AffineMatrix:
-        """G₈."""
+    def stability(self, delta: float, rate: float = 1.0) -> AffineMatrix:
+        """G₈, with rate² P in the place of the P of Δ."""
         n, d, sd = self.lags, self.lags, self.lags + 1
         G = _Entries(n + 1 if self.degree == 1 else n + 2)
-        self._storage(G, 0, d)
+        self._storage(G, 0, d, rate)
         for k in range(n):
             G.add(k, k, None, -delta)
             G.add(k, d, self.past[k], 1.0)
@@ -248,12 +250,12 @@ class Layout:
                 G.add(*minus, tau + k, -weight)
         return G.matrix(self.unknowns)
 
-    def _storage(self, G: "_Entries", start: int, d: int) -> None:
-        """|Δ|²_P - |[d; Δ_1 … Δ_{n-1}]|²_P, Δ from index `start` on."""
+    def _storage(self, G: "_Entries", start: int, d: int, rate: float = 1.0) -> None:
+        """rate²|Δ|²_P - |[d; Δ_1 … Δ_{n-1}]|²_P, Δ from index `start` on."""
         place = [d, *range(start, start + self.lags - 1)]
         for k in range(self.lags):
             for j in range(k, self.lags):
-                G.add(start + k, start + j, self.P[k, j], 1.0)
+                G.add(start + k, start + j, self.P[k, j], rate**2)
                 G.add(place[k], place[j], self.P[k, j], -1.0)
 
 
@@ -270,7 +272,7 @@ class _Problem:
     negative: float
 
     @classmethod
-    def of(cls, moments: Moments, n: int) -> "_Problem":
+    def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "_Problem":
         """The scaled problem for n lags."""
         raw = moments.matrix()
         layout = Layout(n, len(raw) - moments.degree - 1 - n, moments.degree)
@@ -293,7 +295,7 @@ class _Problem:
             M=M,
             unit=unit,
             columns=columns,
-            stability=layout.stability(DELTA).scaled(rows8, columns),
+            stability=layout.stability(DELTA, slowest).scaled(rows8, columns),
             error_bound=layout.error_bound().scaled(rows9, columns),
             negative=float(min(values[0], 0.0)),
         )

@@ -23,6 +23,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification.methods import MOST_LAGS
+from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import MonotoneEquation
 from nlsid_core.options import require_delays, require_one_of, require_whole
 
@@ -195,7 +196,7 @@ def refuse_unexcited(
     if rank < len(block):
         raise DataError(
             f"the excitation does not excite the window of {len(window)} inputs: with a constant "
-            f"it has rank {rank}, not {len(block)}; use richer inputs or fewer delays"
+            f"it has rank {rank}, not {len(block)}; {FEWER}"
         )
 
 

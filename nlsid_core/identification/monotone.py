@@ -45,13 +45,15 @@ def identify_from_repeats(
     kappa: float | None = None,
     transient: int = 0,
     accept_untested_repeats: bool = False,
+    slowest: float = 1.0,
     executor: Executor | None = None,
 ) -> MomentFit:
     """Identify a `MonotoneEquation` from the dataset's groups of repeats, proved stable.
 
     Trajectories without a repeat are not used. transient: samples at the start of each that the
     test of the repeats leaves out. accept_untested_repeats: skip that test; the bias of noise is
-    then removed only if the trials repeat one excitation all the same. executor: for the moments.
+    then removed only if the trials repeat one excitation all the same. slowest: as of
+    `minimise_moment_rie`. executor: for the moments.
     Raises DataError if there are no repeats or they are not repeats, ShapeError for several
     outputs, Infeasible or SolverError as `minimise_moment_rie`.
     """
@@ -65,7 +67,9 @@ def identify_from_repeats(
         refuse_false_repeats(data, transient=transient)
     offsets = offsets_of([trial for group in groups for trial in group])
     moments = repeated_moments(groups, model_class, offsets, executor=executor)
-    return minimise_moment_rie(moments, model_class, groups[0][0], offsets, kappa=kappa)
+    return minimise_moment_rie(
+        moments, model_class, groups[0][0], offsets, kappa=kappa, slowest=slowest
+    )
 
 
 def least_squares_equation(

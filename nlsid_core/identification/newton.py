@@ -153,8 +153,8 @@ def minimise(
 ) -> Minimum:
     """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
 
-    extra: start of further unknowns that only occur in the inequalities.
-    Raises SolverError if no minimiser is found.
+    extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
+    of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
     """
     descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
@@ -167,7 +167,7 @@ def minimise(
 
 def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
     """Minimise where eigenvalues of K vanish; `start` is well inside, Newton ended at `found`."""
-    U, best = np.zeros((len(found.point.x), 0)), found if found.converged else None
+    U, best, lowest = np.zeros((len(found.point.x), 0)), found if found.converged else None, found
     for _ in range(MAX_BASES):
         U = np.linalg.qr(np.column_stack([U, _vanishing(found.point)]))[0]
         # K is affine: half way back to the start no eigenvalue is small.
@@ -177,9 +177,8 @@ def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Mi
             if best is not None and best.point.J <= found.point.J:
                 found = best
             return replace(found, steps=descent.steps, on_boundary=True)
-    if best is None:
-        raise SolverError(f"no minimiser of J after {descent.steps} Newton steps")
-    return best
+        lowest = min(lowest, found, key=lambda minimum: minimum.point.J)
+    return replace(lowest if best is None else best, steps=descent.steps)
 
 
 def _vanishing(point: Point) -> FloatArray:
@@ -244,7 +243,7 @@ class Descent:
 
     def path(self, z: FloatArray, *, barrier: SchurBarrier | None = None) -> Minimum:
         """Follow the minimisers for μ → 0."""
-        size = sum(inequality.F.shape[1] for inequality in self.inequalities)
+        size = sum(inequality.order for inequality in self.inequalities)
         size += 0 if barrier is None else barrier.U.shape[1]
         gap = INEQUALITY_GAP if barrier is None else GAP
         mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size

@@ -2,7 +2,7 @@
 over single predictions: all starts advance together.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.signal import lfilter
@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
+from nlsid_core.identification.rollout import simulate_together
 from nlsid_core.models import (
     BlockCascade,
     DifferenceEquation,
@@ -45,9 +46,16 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
     if isinstance(model, BlockCascade):
         return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
     if isinstance(model, ImplicitModel):
-        return model.simulate_outputs(trial.u, trial.y[:n])
+        return simulate_together(model, [trial])[0]
     u = trial.u if isinstance(model, MonotoneEquation) else trial.u[:, 0]
     return model.simulate(u, trial.y[:n, 0])[:, None]
+
+
+def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArray]:
+    """`simulate_trial` of each; implicit models solve all trials together."""
+    if isinstance(model, ImplicitModel):
+        return simulate_together(model, trials)
+    return [simulate_trial(model, trial) for trial in trials]
 
 
 def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:

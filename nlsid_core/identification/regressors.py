@@ -6,6 +6,10 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
 
 CONSTANT = 1e-10  # relative spread below which a signal is constant
+FEWER = (
+    "use richer inputs, fewer lags, a lower degree, or fewer delays of the inputs, such as "
+    "`delays: [1]`"
+)
 RANK_TOLERANCE = 1e-10  # relative singular value at which regressors repeat each other
 
 
@@ -37,5 +41,5 @@ def refuse_poor(regressors: FloatArray) -> None:
     if rank < regressors.shape[1]:
         raise DataError(
             f"states and inputs are not independent: {regressors.shape[1]} regressors of rank "
-            f"{rank}; excite them more, or use lower degrees and fewer lags"
+            f"{rank}; {FEWER}"
         )

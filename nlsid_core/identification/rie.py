@@ -3,9 +3,10 @@
 With V = |x - x̃|²_P, ν = v - ỹ, Δ = x - x̃ and x⁺ = [v; S x], the worst case over (x, v) at one
 row is
     sup -[Δ; ν]' M [Δ; ν] - 2ν'ε = ε' (M⁻¹)_νν ε,
-    M = [P - Q - S'P₂₂S, r; r', G_0 + G_0' - P₁₁],   r = [G_1 … G_n]' - S'P₂₁,
-M affine in θ and P at the row's window. Its sum over the rows is a robust simulation error
-with a block diagonal K. The scale of y is in Q = e₁e₁': the newest output.
+    M = [ρ²P - Q - S'P₂₂S, r; r', G_0 + G_0' - P₁₁],   r = [G_1 … G_n]' - S'P₂₁,
+M affine in θ and P at the row's window; ρ ≤ 1 keeps the model as fast as is asked for. Its sum
+over the rows is a robust simulation error with a block diagonal K. The scale of y is in Q = e₁e₁':
+the newest output.
 Source: thesis (2.28), Lemma 2.16 and Proposition 4.4.
 """
 
@@ -80,20 +81,21 @@ class IdentificationErrorBound:
             P = np.zeros((self.size, self.size))
             P[i, j] = P[j, i] = 1.0
             M = -next_state.T @ P @ next_state
-            M[: self.size, : self.size] += P
+            M[: self.size, : self.size] += self.problem.slowest**2 * P
             shapes.append(M)
         return shapes
 
     def start(self) -> FloatArray:
-        """G = I and a diagonal P with every M ≻ 0."""
+        """A multiple of G = I and a diagonal P with every M ≻ 0."""
         n = self.size // self.outputs
-        levels = ROOM * np.arange(n, 0, -1) / n
-        levels[0] += 1.0
+        levels, last = np.zeros(n), 0.0
+        for k in reversed(range(n)):
+            levels[k] = last = (last + ROOM / n + (k == 0)) / self.problem.slowest**2
         P = np.diag(np.repeat(levels, self.outputs))
-        return np.concatenate([self.rows.identity, P[np.triu_indices(self.size)]])
+        return np.concatenate([levels[0] * self.rows.identity, P[np.triu_indices(self.size)]])
 
     def storage(self) -> MatrixInequality:
-        """P - Q - S'P₂₂S ⪰ 0, which every M shares."""
+        """ρ²P - Q - S'P₂₂S ⪰ 0, which every M shares."""
         n = slice(0, self.size)
         return MatrixInequality(np.concatenate([self.constant[None, n, n], self.shapes[:, n, n]]))
 

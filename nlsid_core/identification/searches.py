@@ -1,5 +1,6 @@
 """How the models of each class are found: which methods there are, and the search itself."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +11,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
+from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import ImplicitClass, build_implicit_rows
@@ -68,6 +70,7 @@ from nlsid_core.models import (
     StateAffineModel,
 )
 
+log = logging.getLogger(__name__)
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
 CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: corners decide
@@ -78,20 +81,33 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     regression = build_regression(train, model_class.lags)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
-    starts = tuple(stable_starts(regression))
-    trail.follow(regression.rows, lambda i: regression.model(i.theta, i.p), starts)
+    radius = task.searched_rate
+    starts = tuple(stable_starts(regression, radius))
+    trail.follow(
+        regression.rows,
+        lambda i: regression.model(i.theta, i.p),
+        starts,
+        lambda theta: reflected(theta, radius),
+    )
 
     def minimised(iterations: int, *, stable: bool) -> DifferenceEquation:
         """The best of the local minima from the robust simulation error and the other starts."""
-        *_, last = robust_simulation_error(regression.rows, iterations=iterations)
-        thetas = [reflected(last.theta), *(theta for _, theta in starts)]
-        if not stable:
-            thetas.append(last.theta)
+        thetas = [theta for _, theta in starts]
+        try:
+            *_, last = robust_simulation_error(regression.rows, iterations=iterations)
+        except SolverError:
+            log.info("the robust simulation error gives no start")
+        else:
+            thetas.insert(0, reflected(last.theta, radius))
+            if not stable:
+                thetas.append(last.theta)
         models = []
         for theta in thetas:
             start = regression.model(theta, SimulationError(regression.rows).at(theta).p)
             if not stable or prove_stability(start) is not None:
-                models.append(minimise_simulation_error(regression, start, stable=stable))
+                models.append(
+                    minimise_simulation_error(regression, start, stable=stable, radius=radius)
+                )
         if not models:
             raise Infeasible("no start of the search has a proof of stability")
         return min(models, key=lambda model: simulation_percent(model, train))
@@ -105,7 +121,7 @@ def state_affine(
     train: Dataset, model_class: StateAffineClass, task: Task
 ) -> Trail[StateAffineModel]:
     """State-affine models, of several inputs and outputs."""
-    problem = build_state_affine_rows(train, model_class)
+    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
     trail: Trail[StateAffineModel] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: state_affine_equation_error(problem))
     trail.add(Rie, lambda _: robust_identification_error(problem)[0])
@@ -142,7 +158,12 @@ def block_cascade(
 
     def search(_: Sem) -> tuple[BlockCascade, Proof]:
         found = identify_block_cascade(
-            train, validation, model_class, transient=task.transient, progress=task.progress
+            train,
+            validation,
+            model_class,
+            transient=task.transient,
+            slowest=min(MAX_RADIUS, task.searched_rate),
+            progress=task.progress,
         )
         *choices, last = found.choices
         steps = [Step(str(choice), choice.validation_rms) for choice in choices]
@@ -162,7 +183,7 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     refuse_unexcited(plain, model_class, template, offsets)
     trail: Trail[MonotoneEquation] = Trail(
         task,
-        lambda _: None,
+        prove_stability,
         f"mean squared simulation error by the moments, at most [{_unit(train)}²]",
     )
 
@@ -173,11 +194,13 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     def without_bias(method: MomentRie) -> MomentFit:
         return identify_from_repeats(
             train, model_class, transient=task.transient, executor=task.executor,
-            accept_untested_repeats=method.accept_untested_repeats,
+            accept_untested_repeats=method.accept_untested_repeats, slowest=task.searched_rate,
         )  # fmt: skip
 
     def biased() -> MomentFit:
-        return minimise_moment_rie(plain, model_class, template, offsets)
+        return minimise_moment_rie(
+            plain, model_class, template, offsets, slowest=task.searched_rate
+        )
 
     def equation_error() -> MonotoneEquation:
         return least_squares_equation(plain, model_class, template, offsets)
@@ -216,7 +239,7 @@ def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[Im
     )
 
     def search(method: Rie) -> tuple[ImplicitModel, Proof]:
-        found = minimise_implicit_rie(rows)
+        found = minimise_implicit_rie(rows, slowest=task.searched_rate)
         trail.solved(method, found.bound)
         return found.model, found.proof
 
@@ -230,7 +253,7 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
     trail: Trail[ImplicitModel] = Trail(task, lambda _: None, "equation error")
 
     def search(_: LeastSquares) -> tuple[ImplicitModel, Proof]:
-        found = identify_linear_states(train)
+        found = identify_linear_states(train, slowest=task.searched_rate)
         return found.model, found.proof
 
     trail.add_proved(LeastSquares, search)
@@ -239,11 +262,15 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
 
 @dataclass(frozen=True)
 class Offer:
-    """The methods of a class, the default first, and those that run beside what is asked for."""
+    """The methods of a class, the default first, and those that run beside what is asked for.
+
+    needs_validation: the search chooses by validation trials.
+    """
 
     search: Callable[[Dataset, Any, Task], Trail[Any]]
     methods: tuple[type[Method], ...]
     comparators: tuple[type[Method], ...]
+    needs_validation: bool = False
 
 
 OFFERS: dict[type, Offer] = {
@@ -255,7 +282,7 @@ OFFERS: dict[type, Offer] = {
         (Rse, LeastSquares, Rie, FirstRse, CertifiedRse, CertifiedSem),
         (LeastSquares, Rie, FirstRse, Rse),
     ),
-    BlockCascadeClass: Offer(block_cascade, (Sem,), ()),
+    BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     MonotoneClass: Offer(
         monotone, (MomentRie, Rie, LeastSquares, Sem), (LeastSquares, Rie, MomentRie)
     ),

@@ -16,9 +16,12 @@ from nlsid_core.polynomial import Polynomial
 from nlsid_core.sos import SumOfSquares, matrix_sum_of_squares
 
 
-def linear_models(E: Polynomials, F: Polynomials) -> SumOfSquares:
-    """E x⁺ = F x + …, stable; with E = E' it contains every stable A. Source: (2.19)."""
-    return constraint(conditions.linear(E, F), name="linear models (2.19)")
+def linear_models(E: Polynomials, F: Polynomials, *, rate: float = 1.0) -> SumOfSquares:
+    """E x⁺ = F x + …, stable; with E = E' it contains every A of spectral radius below `rate`.
+
+    Source: (2.19).
+    """
+    return constraint(conditions.linear(E, F, rate=rate), name="linear models (2.19)")
 
 
 def increments(

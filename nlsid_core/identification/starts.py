@@ -27,25 +27,33 @@ LONGER = 4  # times the lags, of the model that is reduced
 LONGEST_RESPONSE = 400  # samples of its impulse response
 
 
-def stable_starts(regression: Regression) -> Iterator[tuple[str, FloatArray]]:
-    """Left parameters (n+1,) of stable models with their names, each when it is asked for."""
-    yield "from least squares", reflected(np.concatenate([[1.0], -least_squares(regression).a]))
+def stable_starts(
+    regression: Regression, radius: float = SLOWEST_POLE
+) -> Iterator[tuple[str, FloatArray]]:
+    """Left parameters (n+1,) of models whose poles are within the radius, with their names."""
+    direct = np.concatenate([[1.0], -least_squares(regression).a])
+    yield "from least squares", reflected(direct, radius)
     try:
         longer = build_regression(regression.dataset, LONGER * regression.lags)
     except DataError:  # too few rows, or too little excitation for as many lags
         return
     poles = reduced_poles(least_squares(longer), regression.lags)
     if np.isfinite(poles).all():
-        yield "from a longer model", reflected(np.poly(poles).real)
+        yield "from a longer model", reflected(np.poly(poles).real, radius)
 
 
-def reflected(theta: FloatArray) -> FloatArray:
-    """θ (n+1,) with every pole outside the circle at the place that is as far inside, 1/z̄."""
-    poles = np.roots(theta)
+def reflected(theta: FloatArray, radius: float = SLOWEST_POLE) -> FloatArray:
+    """θ (n+1,) with every pole outside the circle at the place that is as far inside, 1/z̄, and
+    what is slower than the radius on it; θ itself if every pole is within the radius.
+    """
+    poles, radius = np.roots(theta), min(radius, SLOWEST_POLE)
     outside = np.abs(poles) > 1.0
+    slow = np.abs(poles) > radius
+    if not slow.any():
+        return theta
     poles[outside] = 1.0 / poles[outside].conj()
-    slow = np.abs(poles) >= SLOWEST_POLE
-    poles[slow] *= SLOWEST_POLE**2 / np.abs(poles[slow])
+    slow = np.abs(poles) > radius
+    poles[slow] *= radius / np.abs(poles[slow])
     lags = len(theta) - 1  # np.roots leaves out poles at 0
     return np.concatenate([np.poly(poles).real, np.zeros(lags - len(poles))])
 

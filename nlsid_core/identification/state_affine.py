@@ -14,7 +14,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.regressors import lagged, signal_scale
+from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
 from nlsid_core.models import Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.state_affine import OutOfRange
@@ -61,7 +61,10 @@ class StateAffineClass:
 
 @dataclass(frozen=True, eq=False)
 class StateAffineRows:
-    """The rows of a dataset, their windows w (N, n_w), and the way back to a model."""
+    """The rows of a dataset, their windows w (N, n_w), and the way back to a model.
+
+    slowest: rate a sample that searches for models that are stable for every input keep.
+    """
 
     rows: Rows
     w: FloatArray
@@ -74,6 +77,7 @@ class StateAffineRows:
     u_scale: tuple[FloatArray, FloatArray]
     u_range: FloatArray
     on_out_of_range: OutOfRange = "clip"
+    slowest: float = 1.0
 
     @property
     def is_bounded_by_leading(self) -> bool:
@@ -113,9 +117,12 @@ class StateAffineRows:
         )
 
 
-def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> StateAffineRows:
+def build_state_affine_rows(
+    dataset: Dataset, model_class: StateAffineClass, *, slowest: float = 1.0
+) -> StateAffineRows:
     """Stack the rows t = n … of every trajectory, signals scaled to zero mean and unit spread.
 
+    slowest: as of `StateAffineRows`.
     Raises DataError if there are too few rows, or the inputs do not excite the right basis.
     """
     n = model_class.lags
@@ -163,7 +170,7 @@ def build_state_affine_rows(dataset: Dataset, model_class: StateAffineClass) -> 
     )
     return StateAffineRows(
         rows, w, dataset, left, right, R, window, y_scale, u_scale, declared,
-        model_class.on_out_of_range,
+        model_class.on_out_of_range, slowest,
     )  # fmt: skip
 
 
@@ -218,7 +225,7 @@ def _refuse_rank(R: FloatArray, lags: int) -> None:
     if rank < len(R):
         raise DataError(
             f"the excitation does not excite {lags} lags: its polynomial basis of {len(R)} has "
-            f"rank {rank}; use richer inputs, fewer lags or a lower degree"
+            f"rank {rank}; {FEWER}"
         )
 
 

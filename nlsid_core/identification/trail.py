@@ -4,18 +4,27 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
+import numpy as np
 from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError, SolverError
 from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.fit import Candidate, History, Proof, Step
+from nlsid_core.identification.fit import (
+    Candidate,
+    History,
+    Proof,
+    Step,
+    rate_text,
+    stated_rate,
+)
 from nlsid_core.identification.methods import FirstRse, Method, Rse
 from nlsid_core.identification.prediction import Model
+from nlsid_core.identification.rates import is_too_slow, searched_rate
 from nlsid_core.identification.rse import Iterate, robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 
@@ -31,14 +40,22 @@ def silent(_what: str, _fraction: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """method: the one asked for; comparators: what runs beside it. See `identify`."""
+    """method: the one asked for; comparators: what runs beside it; max_rate: the slowest that is
+    allowed, and proofs of which count. See `identify`.
+    """
 
     method: Method
     comparators: tuple[Method, ...]
+    max_rate: float
     validation: Dataset | None = None
     transient: int = 0
     executor: Executor | None = None
     progress: Progress = silent
+
+    @property
+    def searched_rate(self) -> float:
+        """The slowest rate that a search keeps, so that its proof is fast enough."""
+        return searched_rate(self.max_rate)
 
     def wanted(self, kind: type[W]) -> W | None:
         """The method of this kind that was asked for, with its options; None if none was."""
@@ -71,7 +88,7 @@ class Trail(Generic[T]):
         if method is None:
             return
         self.task.progress(method.title, 0.1 * len(self.candidates))
-        started = time.perf_counter()
+        started = time.process_time()
         try:
             model, proof = make(method)
         except NlsidError as reason:
@@ -79,46 +96,52 @@ class Trail(Generic[T]):
                 raise
             log.warning("no comparison with %s: %s", method.name, reason)
             return
-        self._keep(method, model, proof, time.perf_counter() - started)
+        self._keep(method, model, proof, time.process_time() - started)
 
     def follow(
         self,
         rows: Rows,
         model: Callable[[Iterate], T],
         starts: Iterable[tuple[str, FloatArray]] = (),
+        within: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         """The iterates of the robust simulation error; the first and the best are candidates.
 
         starts: left parameters with their names, at which a first bound is made exact; from each
-        it is iterated too, and the iterate of the least simulation error is kept.
+        it is iterated too, and the iterate of the least simulation error is kept. within: the
+        nearest left parameters that are allowed, at which an iterate that is not is taken.
         """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
         if first is None and final is None:
             return
         iterations = 1 if final is None else final.iterations
         error = SimulationError(rows)
-        started, best = time.perf_counter(), None
+        started, best, failure = time.process_time(), None, SolverError("no iterate")
         for start, theta in (("", None), *(() if final is None else starts)):
             steps: list[Step] = []
             try:
                 for last in robust_simulation_error(rows, start=theta, iterations=iterations):
                     steps.append(Step(f"iterate {len(steps) + 1} {start}".rstrip(), last.J))
                     if theta is None and len(steps) == 1 and first is not None:
-                        seconds, found = time.perf_counter() - started, model(last)
+                        seconds, found = time.process_time() - started, model(last)
                         self._keep(first, found, self.prove(found), seconds)
                     done = 0.2 + 0.4 * len(steps) / iterations
                     self.task.progress(f"robust simulation error, iterate {len(steps)}", done)
-                reached = error.at(last.theta).J
-            except (SolverError, LinAlgError):
-                if theta is None:
-                    raise
+                allowed = last.theta if within is None else within(last.theta)
+                reached = error.at(allowed)
+                if not np.array_equal(allowed, last.theta):
+                    last = replace(last, theta=allowed, p=reached.p, J=reached.J)
+                    steps.append(Step("at the slowest rate allowed", reached.J))
+            except (SolverError, LinAlgError) as reason:
+                failure = SolverError(str(reason))
                 continue
-            if best is None or reached < best[0]:
-                best = reached, last, tuple(steps)
-        assert best is not None, "there is at least one iterate"
+            if best is None or best[0] > reached.J:
+                best = reached.J, last, tuple(steps)
+        if best is None:
+            raise failure
         self.history = History(self.history.value, best[2])
         if final is not None:
-            seconds, found = time.perf_counter() - started, model(best[1])
+            seconds, found = time.process_time() - started, model(best[1])
             self._keep(final, found, self.prove(found), seconds)
 
     def solved(self, method: Method, bound: float) -> None:
@@ -127,4 +150,14 @@ class Trail(Generic[T]):
             self.history = History(self.history.value, (Step(method.title, bound),))
 
     def _keep(self, method: Method, model: T, proof: Proof | None, seconds: float) -> None:
-        self.candidates.append(Candidate(method, model, proof, seconds, self.task.transient))
+        remark = ""
+        if proof is not None and is_too_slow(proof, self.task.max_rate):
+            period = model.period
+            remark = (
+                f"proved only at {stated_rate(proof, period)} a sample, slower than the max_rate "
+                f"of {rate_text(self.task.max_rate, period)}"
+            )
+            proof = None
+        self.candidates.append(
+            Candidate(method, model, proof, seconds, self.task.transient, remark)
+        )

@@ -23,6 +23,7 @@ from nlsid_core.identification.prediction import (
     one_step_residual,
     predict,
     simulate_trial,
+    simulate_trials,
 )
 from nlsid_core.models import StateAffineModel
 
@@ -262,7 +263,8 @@ def _cut(trial: Trajectory, begin: int, end: int, number: int) -> Trajectory:
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:
     """(measured, simulated) of every trial from sample `first` on."""
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable model scores infinity
-        return [(trial.y[first:], simulate_trial(model, trial)[first:]) for trial in dataset]
+        outputs = simulate_trials(model, dataset.trajectories)
+        return [(t.y[first:], y[first:]) for t, y in zip(dataset, outputs, strict=True)]
 
 
 def _rms(errors: list[FloatArray]) -> float:

@@ -9,6 +9,10 @@ f is affine in each entry of w, so a vertex of its box each is enough; or, where
 ẋ = ... + Gw, h |2x̄'Pg| r <= h r (κ(x̄'Pg)² + 1/κ) is added for each w instead, r half its range.
 Where u = clip(ũ), ũ = u₀ - Kx̄, each clipped input is free, low or high; τ_l >= 0 multiplies
 q_l >= 0 of that mode: (high - ũ)(ũ - low), low - ũ, or ũ - high.
+Where the input is held, it is clip(ũ) + δ with |δ_i| <= W_i: every corner of that box is a case as
+every vertex of w is, and every piece of rates has to show, for both signs,
+    h R_i ∓ dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l > 0, so |dũ_i/dt| < R_i in the funnel; W is at least
+the hold times R, and the largest |K_i e| over measurement errors e.
 """
 
 import json
@@ -26,8 +30,7 @@ from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 
-MAX_STATES, MAX_INPUTS, MAX_LIMITED = 16, 16, 3
-MAX_UNCERTAIN, MAX_CORNERED = 32, 10  # entries of w: in all, and where their vertices decide
+MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
 PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
@@ -58,6 +61,33 @@ class Policy:
 
 
 @dataclass(frozen=True)
+class Hold:
+    """By interval and input: the bounds R of |dũ/dt| in 1/s, and W of what u is off.
+
+    period: how old the applied input is at most, in s. error: bounds by state. Both may be 0.
+    """
+
+    period: Fraction
+    error: list[Fraction]
+    rates: list[list[Fraction]]
+    widths: list[list[Fraction]]
+
+    @property
+    def moved(self) -> int:
+        """How many inputs are off."""
+        return len(self.widths[0]) if self.period or any(self.error) else 0
+
+    @property
+    def corners(self) -> list[tuple[int, ...]]:
+        """The corners of the box of δ / W."""
+        return list(product((-1, 1), repeat=self.moved))
+
+    def push(self, k: int, corner: tuple[int, ...]) -> list[Fraction]:
+        """δ at a corner, in interval k."""
+        return [side * width for side, width in zip(corner, self.widths[k], strict=False)]
+
+
+@dataclass(frozen=True)
 class Funnel:
     """Knots, control points of x₀, and P and ρ at the knots."""
 
@@ -76,13 +106,14 @@ def decide_funnel(
     claim: Node, proof: Node, read: Read, work: Work | None = None
 ) -> tuple[Decision, Funnel]:
     """The decision, and the funnel that it is about; `work` is shared by several."""
-    parts = claim.members("kind about", "goal")
+    parts = claim.members("kind about", "goal hold error")
     documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
     field = read_field(documents["vector_field"])
     funnel = read_funnel(documents["funnel"], field.n, digests)
     policy = read_policy(documents["policy"], field, funnel, digests)
     required = "margin basis multiplier pieces" + " goal_multiplier" * ("goal" in parts)
-    required += " sides" * bool(policy.limits)
+    required += " sides" * bool(policy.limits or "hold" in parts)
+    required += " rates rate_pieces" * ("hold" in parts)
     stated = proof.members(required, "kappa" if field.box else "")
     margin = stated["margin"].number()
     if margin <= 0:
@@ -91,17 +122,20 @@ def decide_funnel(
     for t in field.breaks:
         if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
             raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
+    hold = _read_hold(parts, stated, field, policy, funnel)
     spans = [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
     bounds, work = [field.bounds[span] for span in spans], work or Work()
-    _decide_valid(field, policy, funnel, bounds, work)
-    count = _decide_pieces(field, policy, funnel, spans, stated, margin, work)
+    _decide_valid(field, policy, funnel, bounds, hold, work)
+    count = _decide_pieces(field, policy, funnel, spans, stated, margin, hold, work)
+    if hold.period:
+        count += _decide_rates(field, policy, funnel, spans, stated, hold, work)
     end = text.exact(funnel.t[-1])
     decision = Decision(
         f"funnel: every solution that is in it at a time from {text.exact(funnel.t[0])} to {end} s "
         f"stays in it until {end} s{goal}{_kept(field, bounds)}; {count} pieces of time decided, "
         "on its boundary V falls by at least the margin, in 1/s",
         margin,
-        _assumptions(field, policy, bounds),
+        _assumptions(field, policy, bounds, hold),
         digests,
     )
     return decision, funnel
@@ -171,6 +205,57 @@ def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str
     return Policy(u, K, limits)
 
 
+def _read_hold(
+    parts: dict[str, Node], stated: dict[str, Node], field: Field, policy: Policy, funnel: Funnel
+) -> Hold:
+    """The hold and the measurement error that the claim is about, and what u is off by then.
+
+    At a time in interval k the input is of a time in it or in one that ends less than a period
+    before it starts: W is period times the largest rate there, and what e does to the largest Ke.
+    """
+    period, error = Fraction(0), [Fraction(0)] * field.n
+    rates = [[Fraction(0)] * field.m for _ in funnel.x]
+    if "hold" in parts:
+        period = parts["hold"].number()
+        rates = stated["rates"].array(len(funnel.x), field.m)
+        if period <= 0 or any(rate <= 0 for row in rates for rate in row):
+            raise Rejected("hold and rates should be positive")
+        jumps = [p[-1] != q[0] for p, q in pairwise(policy.u)]
+        if any(jumps) or any(p[-1] != q[0] for p, q in pairwise(policy.K)):
+            raise Rejected("the policy jumps at a knot: no rate bounds what holding it changes")
+    if "error" in parts:
+        error = parts["error"].array(field.n)
+        if any(e < 0 for e in error):
+            raise Rejected("error should be 0 or more for every state")
+    exponents = [e for span in field.equations for equation in span for e, _ in equation]
+    if len(parts.keys() & {"hold", "error"}) and any(
+        e > 1 for row in exponents for e in row[1 + field.n : 1 + field.n + field.m]
+    ):
+        raise Rejected("the dynamics are not affine in each input: corners do not bound its hold")
+    shaken = [
+        [max(_weighed(gain[i], error) for gain in points) for i in range(field.m)]
+        for points in policy.K
+    ]
+    widths: list[list[Fraction]] = []
+    first = 0
+    for k in range(len(funnel.x)):
+        while funnel.t[first + 1] <= funnel.t[k] - period:
+            first += 1
+        seen = range(first, k + 1)
+        widths.append(
+            [
+                period * max(rates[j][i] for j in seen) + max(shaken[j][i] for j in seen)
+                for i in range(field.m)
+            ]
+        )
+    return Hold(period, error, rates, widths)
+
+
+def _weighed(row: Sequence[Fraction], weights: Sequence[Fraction]) -> Fraction:
+    """Σ |row_i| weights_i."""
+    return sum((abs(a) * b for a, b in zip(row, weights, strict=True)), Fraction(0))
+
+
 def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
     times: list[Fraction] = node.array(None)
     if not least <= len(times) <= most or any(b <= a for a, b in pairwise(times)):
@@ -219,12 +304,12 @@ def _unit(i: int, n: int) -> list[Fraction]:
 
 
 def _decide_valid(
-    field: Field, policy: Policy, funnel: Funnel, bounds: list[Bounds], work: Work
+    field: Field, policy: Policy, funnel: Funnel, bounds: list[Bounds], hold: Hold, work: Work
 ) -> None:
-    """x and clip(ũ) stay where the equations are valid.
+    """x and the input stay where the equations are valid.
 
     |g'x̄| <= d wherever W <= ρ if ρ g'P⁻¹g <= d², so if d²P - ρgg' ⪰ 0, which holds between knots if
-    it does at them.
+    it does at them. A held input is within W of clip(ũ), and within the limits.
     Centres and gains between knots are convex combinations of their control points. A limit within
     the bounds keeps its side by itself; no limit may lie beyond the other side.
     """
@@ -234,7 +319,8 @@ def _decide_valid(
             i = j - field.n
             middle = [point[j] for point in funnel.x[k]] if i < 0 else [u[i] for u in policy.u[k]]
             rows = [_unit(j, field.n)] if i < 0 else [gain[i] for gain in policy.K[k]]
-            room = [min(middle) - low, high - max(middle)]
+            off = 0 if i < 0 else hold.widths[k][i]
+            room = [min(middle) - low - off, high - max(middle) - off]
             if i in policy.limits:
                 least, most = policy.limits[i]
                 if not (low <= most and least <= high):
@@ -268,8 +354,19 @@ def _kept(field: Field, bounds: list[Bounds]) -> str:
     return f", and keeps {', '.join(shown)}" if shown else ""
 
 
-def _assumptions(field: Field, policy: Policy, bounds: list[Bounds]) -> tuple[str, ...]:
-    obeyed = "the state obeys the stored equations and the stored policy is applied at every time"
+def _assumptions(field: Field, policy: Policy, bounds: list[Bounds], hold: Hold) -> tuple[str, ...]:
+    obeyed = "the state obeys the stored equations and the stored policy is applied "
+    if hold.period:
+        longest = text.exact(hold.period)
+        obeyed += (
+            f"every {longest} s or more often: at every time, the input is the policy's for a state"
+            f" of at most {longest} s before, and not before the start"
+        )
+    else:
+        obeyed += "continuously, with no hold and no delay"
+    if any(hold.error):
+        errors = ", ".join(f"x{i} by {text.exact(e)}" for i, e in enumerate(hold.error) if e)
+        obeyed += f", measured wrong by at most: {errors}"
     for i in range(field.m):
         if i in policy.limits:
             obeyed += f", u{i} clipped to {_range(policy.limits[i])}"
@@ -290,9 +387,12 @@ def _range(ends: tuple[Fraction, Fraction]) -> str:
     return f"[{text.exact(ends[0])}, {text.exact(ends[1])}]"
 
 
+Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
+
+
 def _decide_pieces(
     field: Field, policy: Policy, funnel: Funnel, spans: list[int], stated: dict[str, Node],
-    margin: Fraction, work: Work,
+    margin: Fraction, hold: Hold, work: Work,
 ) -> int:  # fmt: skip
     """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
     kappa = None
@@ -300,26 +400,124 @@ def _decide_pieces(
         kappa = stated["kappa"].array(len(spans), len(field.box))
         if any(k <= 0 for row in kappa for k in row):
             raise Rejected("kappa should be positive")
-        terms = [row for span in field.equations for equation in span for row, _ in equation]
-        if any(any(row[1 + field.n + field.m :]) and sum(row) > 1 for row in terms):
+        if len(_pushing(field)) < len(field.box):
             raise Rejected("w does more than add constants: kappa does not bound what it does")
-    elif len(field.box) > MAX_CORNERED:
-        raise Rejected(f"at most {MAX_CORNERED} entries of w are decided without kappa")
-    limited = len(policy.limits)
-    middle = [tuple((a + b) / 2 for a, b in field.box)]
-    vertices = middle if kappa else list(product(*field.box))
-    needed = product(range(len(spans)), range(len(vertices)), product((0, -1, 1), repeat=limited))
-    combinations = len(spans) * len(vertices) * 3**limited
+    corners = hold.moved + (0 if kappa else len(field.box))
+    _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits))
+    values = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
+    vertices, modes = list(product(hold.corners, values)), _modes(policy)
+    names = "mu" + " mode tau" * bool(policy.limits)
+    needed = list(product(range(len(spans)), range(len(vertices)), modes))
+    order, pieces = _in_order(stated["pieces"], names, needed, len(modes[0]), work)
+    multiplier = stated["multiplier"].monomials(field.n)
+    loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
+
+    def decide_piece(ring: Ring, number: int) -> None:
+        (k, v, mode), level, index, i = order[number]
+        corner, w = vertices[v]
+        key = ring.width, k, level, index, mode, corner
+        if key not in loops:
+            loops.clear()
+            push = hold.push(k, corner)
+            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, push)
+            loops[key].grow(field, kappa[k] if kappa else [], margin)
+        loop, piece = loops[key], pieces[i]
+        c = loop.condition(multiplier, piece, stated, w)
+        squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
+        positive(c, squares, loop.ring, f"piece {i} (interval {k}, vertex {v}, mode {mode})")
+
+    for number in range(len(order)):
+        at_width(field.n, work, partial(decide_piece, number=number))
+    return len(order)
+
+
+def _decide_rates(
+    field: Field, policy: Policy, funnel: Funnel, spans: list[int], stated: dict[str, Node],
+    hold: Hold, work: Work,
+) -> int:  # fmt: skip
+    """Prove |dũ_i/dt| < R_i in the funnel, for every input where it is not at a limit.
+
+    What entries of w do that only push is taken off R; the others are at vertices.
+    """
+    pushing = _pushing(field)
+    corners = len(field.box) - len(pushing) + hold.moved
+    _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits), 2 * field.m)
+    values = product(
+        *(((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(field.box))
+    )
+    vertices, limited = list(product(hold.corners, values)), list(policy.limits)
+    cases = [
+        (i, sign, *mode)
+        for i, sign, mode in product(range(field.m), (-1, 1), _modes(policy))
+        if i not in limited or not mode[limited.index(i)]
+    ]
+    needed = list(product(range(len(spans)), range(len(vertices)), cases))
+    names = "input sign tau" + " mode" * bool(limited)
+    order, pieces = _in_order(stated["rate_pieces"], names, needed, len(limited), work)
+    halves = {j: (field.box[j][1] - field.box[j][0]) / 2 for j in pushing}
+
+    def decide_piece(ring: Ring, number: int) -> None:
+        (k, v, (i, sign, *mode)), level, index, place = order[number]
+        (corner, w), what = vertices[v], f"rate piece {place} (interval {k}, vertex {v}, input {i})"
+        push = hold.push(k, corner)
+        loop = _Loop(ring, field, policy, funnel, spans[k], (k, level, index), tuple(mode), push)
+        room = hold.rates[k][i]
+        for j, half in halves.items():
+            column = [_pushed(equation, j, field) for equation in field.equations[spans[k]]]
+            room -= half * max(abs(_product(gain[i], column)) for gain in policy.K[k])
+        c = loop.rate_condition(room, i, sign, pieces[place], stated, w)
+        positive(c, read_squares(pieces[place] | {"basis": stated["basis"]}, ring), ring, what)
+
+    for number in range(len(order)):
+        at_width(field.n, work, partial(decide_piece, number=number))
+    return len(order)
+
+
+def _refuse_many(*counts: int) -> None:
+    combinations = prod(counts)
     if combinations > MAX_PIECES:
         raise Rejected(f"{combinations} intervals, vertices and modes; at most {MAX_PIECES}")
+
+
+def _modes(policy: Policy) -> list[tuple[int, ...]]:
+    return list(product((0, -1, 1), repeat=len(policy.limits)))
+
+
+def _pushing(field: Field) -> list[int]:
+    """The entries of w that do nothing but add constants to ẋ, in all time spans."""
+    first = 1 + field.n + field.m
+    rows = [e for span in field.equations for equation in span for e, _ in equation]
+    return [
+        j for j in range(len(field.box)) if all(sum(row) == 1 for row in rows if row[first + j])
+    ]
+
+
+def _pushed(equation: Terms, j: int, field: Field) -> Fraction:
+    """What w_j adds to one rate, for an entry that only pushes."""
+    return sum((c for e, c in equation if e[1 + field.n + field.m + j]), Fraction(0))
+
+
+def _product(a: Sequence[Fraction], b: Sequence[Fraction]) -> Fraction:
+    return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
+
+
+def _in_order(
+    node: Node, names: str, needed: Sequence[Key], limited: int, work: Work
+) -> tuple[list[tuple[Key, int, int, int]], list[dict[str, Node]]]:
+    """(key, level, index, place) of every piece, and their members, in the order of the file.
+
+    Raises Rejected unless their parts of time cover [0, 1] for everything that is needed.
+    """
     covered = {key: Fraction(0) for key in needed}
-    names = "interval vertex level index mu columns squares" + " mode tau" * bool(limited)
-    pieces = [node.members(names) for node in stated["pieces"].items(1, MAX_PIECES)]
+    names = "interval vertex level index columns squares " + names
+    pieces = [piece.members(names) for piece in node.items(1, MAX_PIECES)]
     order = []
     for i, piece in enumerate(pieces):
         level = piece["level"].whole(0, MAX_LEVEL)
         index = piece["index"].whole(0, 2**level - 1)
         mode = tuple(piece["mode"].wholes(limited)) if limited else ()
+        if "input" in piece:
+            mode = piece["input"].whole(0), piece["sign"].whole(-1, 1), *mode
         key = piece["interval"].whole(0), piece["vertex"].whole(0), mode
         if key not in covered:
             k, v, mode = key
@@ -331,55 +529,33 @@ def _decide_pieces(
     for (k, v, mode), until in covered.items():
         if until < 1:
             raise Rejected(f"a piece of interval {k} is missing (vertex {v}, mode {mode})")
-    multiplier = stated["multiplier"].monomials(field.n)
     work.spend(PIECE * len(pieces))
-    loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
-
-    def decide_piece(ring: Ring, number: int) -> None:
-        (k, v, mode), _, level, index, _ = order[number]
-        key = ring.width, k, level, index, mode
-        if key not in loops:
-            loops.clear()
-            bound = kappa[k] if kappa else []
-            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, bound, margin)
-        loop, piece = loops[key], pieces[number]
-        c = loop.condition(multiplier, piece, stated, vertices[v])
-        squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
-        positive(c, squares, loop.ring, f"piece {number} (interval {k}, vertex {v}, mode {mode})")
-
-    for number in range(len(pieces)):
-        at_width(field.n, work, partial(decide_piece, number=number))
-    return len(pieces)
+    return [(key, level, index, i) for key, _, level, index, i in order], pieces
 
 
 class _Loop:
-    """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it."""
+    """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it.
+
+    held: what is nonnegative in the mode. gap: ρ - W. forms: t, x and u for the field's equations.
+    """
 
     def __init__(
         self, ring: Ring, field: Field, policy: Policy, funnel: Funnel, span: int,
-        place: tuple[int, int, int], mode: tuple[int, ...], kappa: list[Fraction],
-        margin: Fraction,
+        place: tuple[int, int, int], mode: tuple[int, ...], push: Sequence[Fraction],
     ) -> None:  # fmt: skip
-        (k, level, index), x = place, ring.variables
-        h, start, end = funnel.t[k + 1] - funnel.t[k], funnel.P[k], funnel.P[k + 1]
-        in_time = partial(ring.bernstein, level=level, index=index)
-        rho = in_time(funnel.rho[k : k + 2])
-        Px = [
-            ring.dot([in_time(ends) for ends in zip(*rows, strict=True)], x)
-            for rows in zip(start, end, strict=True)
+        (self.k, level, index), self.ring, x = place, ring, ring.variables
+        self.funnel, self.policy, self.equations = funnel, policy, field.equations[span]
+        k, self.h = self.k, funnel.t[self.k + 1] - funnel.t[self.k]
+        self.in_time = in_time = partial(ring.bernstein, level=level, index=index)
+        self.rho = in_time(funnel.rho[k : k + 2])
+        ends = zip(funnel.P[k], funnel.P[k + 1], strict=True)
+        self.Px = [
+            ring.dot([in_time(pair) for pair in zip(*rows, strict=True)], x) for rows in ends
         ]
-        centres = list(zip(*funnel.x[k], strict=True))
-        steps = [[(len(p) - 1) * (b - a) for a, b in pairwise(p)] or [Fraction(0)] for p in centres]
-        bend = [
-            [b - a for a, b in zip(*rows, strict=True)] for rows in zip(start, end, strict=True)
-        ]
-        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
-        rest = funnel.rho[k + 1] - funnel.rho[k] - margin * h * rho - ring.form(bend, x)
-        rest += 2 * ring.dot([in_time(points) for points in steps], Px)
+        self.gap = self.rho - ring.dot(x, self.Px)
         inputs, self.held = [], []
         for i, points in enumerate(zip(*policy.u[k], strict=True)):  # ũ = u₀ - Kx̄
-            gains = [in_time(rows) for rows in zip(*(K[i] for K in policy.K[k]), strict=True)]
-            inputs.append(in_time(points) - ring.dot(gains, x))
+            inputs.append(in_time(points) - ring.dot(self._gains(i), x))
         for side, (i, (low, high)) in zip(mode, policy.limits.items(), strict=True):
             wanted = inputs[i]
             if side:
@@ -387,15 +563,38 @@ class _Loop:
                 inputs[i] = ring.made(low if side < 0 else high)
             else:
                 self.held.append((high - wanted) * (wanted - low))
+        inputs = [u + delta for u, delta in zip(inputs, push, strict=True)] if push else inputs
+        centres = zip(*funnel.x[k], strict=True)
         states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
-        forms = [in_time(funnel.t[k : k + 2]), *states, *inputs]
-        self.growth = _growth(ring, field.equations[span], Px, forms, 2 * h)
+        self.forms = [in_time(funnel.t[k : k + 2]), *states, *inputs]
+
+    def _gains(self, i: int) -> list[Polynomial]:
+        """Row i of K."""
+        rows = zip(*(K[i] for K in self.policy.K[self.k]), strict=True)
+        return [self.in_time(points) for points in rows]
+
+    def _motion(self) -> list[Polynomial]:
+        """dx₀/ds."""
+        return [self.in_time(_slope(p)) for p in zip(*self.funnel.x[self.k], strict=True)]
+
+    def grow(self, field: Field, kappa: Sequence[Fraction], margin: Fraction) -> None:
+        """`rest` and, by monomials in w, `growth`: all of c(s, x̄) but its multipliers."""
+        ring, k, h, x = self.ring, self.k, self.h, self.ring.variables
+        bend = [
+            [b - a for a, b in zip(*rows, strict=True)]
+            for rows in zip(self.funnel.P[k], self.funnel.P[k + 1], strict=True)
+        ]
+        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
+        rise = self.funnel.rho[k + 1] - self.funnel.rho[k]
+        rest = rise - margin * h * self.rho - ring.form(bend, x)
+        rest += 2 * ring.dot(self._motion(), self.Px)
+        self.growth = _along(ring, self.equations, self.Px, self.forms, 2 * h)
         for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=False)):
             unit = tuple(int(i == j) for i in range(len(field.box)))
             along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
             half = (high - low) / 2
             rest -= half * bound / (4 * h) * (along * along) + half * h / bound
-        self.ring, self.rest, self.gap = ring, rest, rho - ring.dot(x, Px)
+        self.rest = rest
 
     def condition(
         self, multiplier: list[tuple[int, ...]], piece: dict[str, Node], stated: dict[str, Node],
@@ -412,24 +611,68 @@ class _Loop:
         ]
         mu = ring.dot([Fraction(2) ** shift for shift in shifts], lines)
         parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest), (1, mu * self.gap)]
-        for used, growth in self.growth.items():
-            parts.append((-prod(value for value, e in zip(w, used, strict=True) if e), growth))
-        taus = piece["tau"].items(len(self.held), len(self.held)) if self.held else []
-        for node, held in zip(taus, self.held, strict=True):
-            tau = node.members("columns squares") | {"basis": stated["sides"]}
-            parts.append((-1, expanded(read_squares(tau, ring), ring) * held))
+        parts += [(-weight, growth) for weight, growth in _at(w, self.growth)]
+        if self.held:
+            parts += self._taken(piece["tau"], self.held, stated)
         return ring.weighted(parts)
 
+    def rate_condition(
+        self, room: Fraction, i: int, sign: int, piece: dict[str, Node], stated: dict[str, Node],
+        w: Sequence[Fraction],
+    ) -> Polynomial:  # fmt: skip
+        """h room - sign dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l, of ũ = u₀ - Kx̄, at a vertex w."""
+        ring, k, x = self.ring, self.k, self.ring.variables
+        gains = self._gains(i)
+        turning = [self.in_time(_slope(p)) for p in zip(*(K[i] for K in self.policy.K[k]),
+                                                        strict=True)]  # fmt: skip
+        parts: list[tuple[Fraction | int, Polynomial]] = [
+            (1, ring.made(self.h * room)),
+            (-sign, self.in_time(_slope([u[i] for u in self.policy.u[k]]))),
+            (sign, ring.dot(turning, x)),
+            (-sign, ring.dot(gains, self._motion())),
+        ]
+        moved = _along(ring, self.equations, gains, self.forms, self.h)
+        parts += [(sign * weight, rate) for weight, rate in _at(w, moved)]
+        parts += self._taken(piece["tau"], [self.gap, *self.held], stated)
+        return ring.weighted(parts)
 
-def _growth(
-    ring: Ring, equations: list[Terms], Px: list[Polynomial], forms: list[Polynomial],
+    def _taken(
+        self, taus: Node, held: list[Polynomial], stated: dict[str, Node]
+    ) -> list[tuple[Fraction | int, Polynomial]]:
+        """-τ q for everything that is nonnegative here."""
+        parts: list[tuple[Fraction | int, Polynomial]] = []
+        for node, q in zip(taus.items(len(held), len(held)), held, strict=True):
+            tau = node.members("columns squares") | {"basis": stated["sides"]}
+            parts.append((-1, expanded(read_squares(tau, self.ring), self.ring) * q))
+        return parts
+
+
+def _slope(points: Sequence[Fraction]) -> list[Fraction]:
+    """Control points of the derivative in s."""
+    return [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
+
+
+def _at(
+    w: Sequence[Fraction], parts: dict[tuple[int, ...], Polynomial]
+) -> list[tuple[Fraction, Polynomial]]:
+    """What multiplies each polynomial at a vertex w."""
+    return [
+        (prod((value for value, e in zip(w, used, strict=True) if e), start=Fraction(1)), part)
+        for used, part in parts.items()
+    ]
+
+
+def _along(
+    ring: Ring, equations: list[Terms], direction: list[Polynomial], forms: list[Polynomial],
     scale: Fraction,
 ) -> dict[tuple[int, ...], Polynomial]:  # fmt: skip
-    """scale x̄'Pf by its monomials in w, for the variables t, x, u as forms in x̄ and s."""
+    """scale direction'f by its monomials in w, for t, x, u as forms in x̄ and s."""
     rates: dict[tuple[int, ...], list[Terms]] = {}
     n, known = len(equations), len(forms)
     for i, equation in enumerate(equations):
         for e, c in equation:
             rates.setdefault(e[known:], [[] for _ in range(n)])[i].append((e[:known], c))
     found = ring.substituted([p for parts in rates.values() for p in parts], forms)
-    return {used: scale * ring.dot(found[n * i : n * i + n], Px) for i, used in enumerate(rates)}
+    return {
+        used: scale * ring.dot(found[n * i : n * i + n], direction) for i, used in enumerate(rates)
+    }

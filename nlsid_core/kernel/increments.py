@@ -284,7 +284,7 @@ def _block_cascade(node: Node) -> Model:
 
 
 def _monotone_equation(node: Node) -> Model:
-    """e(ȳ(t)) = affine in the past, ν = ȳ(t), E = [e', -a]: e' at least its least value, a ray."""
+    """e(ȳ(t)) = affine in the past, ν = ȳ(t), E = [e', -a]: e' constant, or its least and a ray."""
     parts = _members(node, "y u e a b c window y_offset u_offset")
     first, second, third = parts["e"].array(3)
     a = parts["a"].array(None)
@@ -304,7 +304,7 @@ def _monotone_equation(node: Node) -> Model:
     F = [_unit(i, n + 1) for i in range(n)]
     return Model(
         _period(parts), (_signal(parts["y"]),), u, F, [_unit(0, n + 1)],
-        "for every input", [], lambda _, __: [E], ray=True,
+        "for every input", [], lambda _, __: [E], ray=third > 0,
     )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
 from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
+from .levels import CommandLevel, formula, read_level
 from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**9
@@ -44,6 +45,7 @@ class Tube:
     measured: Fraction
     safety_factor: Fraction
     measured_on: list[Recorded]
+    follows: CommandLevel | None
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -54,7 +56,9 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     documents, digests = bound_files(about, read, "model funnel")
     made_for, names = {"model": digests["model"]}, "settling tubes"
     stated = documents["funnel"]
-    funnel = stated.document("funnel", names, "tube", optional="box", made_for=made_for)
+    funnel = stated.document(
+        "funnel", names, "tube", optional="box response cusum", made_for=made_for
+    )
     model = read_model(documents["model"], funnel.get("box"))
     tubes = [_read(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
     given = proof.members("", "multipliers").get("multipliers")
@@ -80,6 +84,10 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
         assumptions.append(label + _assumption(model, tube, fitted))
+    if "response" in funnel:
+        assumptions += _response(model, funnel["response"], fitted)
+    if "cusum" in funnel:
+        _read_cusum(model, funnel["cusum"])
     return Decision(_statement(model, tubes), margin, tuple(assumptions), digests)
 
 
@@ -99,7 +107,7 @@ def _forms(model: Model, tube: Tube) -> list[tuple[str, Matrix]]:
 
 def _read(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    parts = node.members("rho L P R tau half_widths level inlet assumption")
+    parts = node.members("rho L P R tau half_widths level inlet assumption", "follows")
     names = "kind measured safety_factor designed_on measured_on"
     given = parts["assumption"].members(names, "samples")
     kind = given["kind"].text()
@@ -115,6 +123,7 @@ def _read(node: Node, model: Model) -> Tube:
         samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
         measured=given["measured"].number(), safety_factor=given["safety_factor"].number(),
         measured_on=read_trials(given["measured_on"]),
+        follows=read_level(parts["follows"], len(model.u), 1) if "follows" in parts else None,
     )  # fmt: skip
     if not 0 < tube.rho <= 1 or (kind == "energy") != (tube.rho == 1):
         raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
@@ -122,6 +131,8 @@ def _read(node: Node, model: Model) -> Tube:
         raise Rejected("tau and half-widths should be positive")
     if min(tube.inlet, tube.measured) < 0 or tube.safety_factor < 1:
         raise Rejected("inlet and measured should be 0 or more, the safety factor 1 or more")
+    if tube.follows is not None and (kind == "energy" or tube.inlet):
+        raise Rejected("a level that follows the commands is for fading, without an inlet")
     if not tube.measured_on:
         raise Rejected("the assumption was measured on no trial")
     if shared(tube.measured_on, read_trials(given["designed_on"])):
@@ -131,11 +142,49 @@ def _read(node: Node, model: Model) -> Tube:
     return tube
 
 
+def _response(model: Model, node: Node, fitted_to: list[Recorded] | None) -> list[str]:
+    """What is assumed of the output error itself, one line for each output."""
+    p = len(model.y)
+    parts = node.members("half_widths assumption", "follows")
+    widths = parts["half_widths"].array(p)
+    given = parts["assumption"].members("measured safety_factor designed_on measured_on")
+    follows = read_level(parts["follows"], len(model.u), p) if "follows" in parts else None
+    measured, factor = given["measured"].number(), given["safety_factor"].number()
+    measured_on = read_trials(given["measured_on"])
+    if min(widths) <= 0 or measured < 0 or factor < 1:
+        raise Rejected("a response's half-widths should be positive, its safety factor 1 or more")
+    if not measured_on:
+        raise Rejected("the response was measured on no trial")
+    if shared(measured_on, read_trials(given["designed_on"])):
+        raise Rejected("a trial that the response's level was chosen on cannot measure it")
+    at_most(factor * measured, 1, "the response is below safety_factor x measured")
+    worth = calibration(measured, factor, measured_on, fitted_to)
+    said = []
+    for j, (signal, width) in enumerate(zip(model.y, widths, strict=True)):
+        bound = signal.quantity(text.below(width))
+        g = ""
+        if follows is not None:
+            bound, g = f"({bound} sqrt(g))", f", g = {formula(follows, j, model.u)}"
+        said.append(
+            f"output error: |{signal.name} - simulated| / {bound} <= 1 at every sample{g} ({worth})"
+        )
+    return said
+
+
+def _read_cusum(model: Model, node: Node) -> None:
+    """An alarm that no claim rests on: it only has to make sense."""
+    parts = node.members("deviation drift threshold")
+    least = min(*parts["deviation"].array(len(model.y)), parts["threshold"].number())
+    if least <= 0 or parts["drift"].number() < 0:
+        raise Rejected("cusum: deviation and threshold should be positive, drift 0 or more")
+
+
 def _statement(model: Model, tubes: list[Tube]) -> str:
     said = []
     for i, tube in enumerate(tubes, 1):
         widths = " and ".join(
             f"{signal.name} within {signal.quantity(text.above(width))}"
+            + (" sqrt(g)" if tube.follows else "")
             for signal, width in zip(model.y, tube.half_widths, strict=True)
         )
         how_long = "for ever"
@@ -176,7 +225,11 @@ def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> s
         energy = "e^2" if tube.R == [[1]] else f"{text.exact(tube.R[0][0])} e^2"
     squared = Signal("", unit)
     level = squared.quantity(text.below(tube.level))
-    bound = f"E <= {level} after every sample, E+ = {text.exact(tube.rho)} E + {energy} from 0"
+    growth = f"E+ = {text.exact(tube.rho)} E + {energy} from 0"
+    bound = f"E <= {level} after every sample, {growth}"
+    if tube.follows is not None:
+        g = formula(tube.follows, 0, model.u)
+        bound = f"E <= {level} g after every sample, {growth}, g = {g}"
     if tube.samples is not None:
         bound = f"sum of {energy} <= {level} over {tube.samples} samples"
     worth = calibration(tube.measured, tube.safety_factor, tube.measured_on, fitted_to)

@@ -12,13 +12,14 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError, SolverError
+from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.polynomial.values import monomial_values
 
 KIND = "implicit"
-DIVERGED = 1e30  # a state whose powers would overflow
+
 CENTRED = 0.5  # h is so monotone in e₀(v): Proposition 2.7
 
 
@@ -152,14 +153,21 @@ class ImplicitModel:
         Newton's method with step halving; where it fails, the ellipsoid method, guaranteed for a
         true monotonicity. Raises SolverError where that is not true.
         """
-        slope, n_v = self._slope, self.unknowns
-        size = 1.0 + np.linalg.norm(self.h(_with(np.zeros_like(start), known)), axis=1)
+        of_known, powers, table = self._in_v
+        weights = (monomial_values(of_known, known) @ table).reshape(len(known), len(powers), -1)
+        at_zero = weights[:, ~powers.any(axis=1)].sum(axis=1)
+        size = 1.0 + np.linalg.norm(at_zero, axis=1)
+        lowered = [np.maximum(powers - unit, 0) for unit in np.eye(powers.shape[1], dtype=np.int64)]
 
         def c(v: FloatArray, rows: IntArray) -> FloatArray:
-            return self.h(_with(v, known[rows]))
+            return np.asarray((monomial_values(powers, v)[:, :, None] * weights[rows]).sum(axis=1))
 
         def slope_of(v: FloatArray, rows: IntArray) -> FloatArray:
-            return slope(_with(v, known[rows]))[..., :n_v]
+            columns = [
+                (power * monomial_values(lower, v))[:, :, None] * weights[rows]
+                for power, lower in zip(powers.T, lowered, strict=True)
+            ]
+            return np.stack([column.sum(axis=1) for column in columns], axis=2)
 
         v, failed = newton(c, slope_of, start=start, size=size)
         for row in failed:
@@ -218,24 +226,6 @@ class ImplicitModel:
         columns = [u[h - d : N - d, i] for i, d in self.window]
         return np.column_stack(columns) if columns else np.zeros((N - h, 0))
 
-    def simulate_outputs(self, u: FloatArray, y_start: FloatArray) -> FloatArray:
-        """Outputs (N, n_y) for recorded inputs u (N, n_u), the first `history` being y_start.
-
-        Infinite from where a model without proof diverges.
-        """
-        outputs = np.full((len(u), self.unknowns), np.inf)
-        outputs[: self.history] = y_start
-        x = y_start[: -self.lags - 1 : -1].reshape(1, -1)
-        for t, w in enumerate(self.windows(u), self.history):
-            try:
-                x = self.step(x, w[None])
-            except SolverError:
-                break
-            if not np.abs(x).max() < DIVERGED:
-                break
-            outputs[t] = x[0, : self.unknowns]
-        return outputs
-
     def jacobian(self, after: ArrayLike, x: ArrayLike, w: ArrayLike) -> FloatArray:
         """(B, n, n + m): ∂x⁺/∂[x; w] = [-H₁⁻¹[H₂, H₃]; ∂ã] along a step that has been made."""
         known = np.concatenate([np.asarray(x, float), np.asarray(w, float)], axis=1)
@@ -244,6 +234,18 @@ class ImplicitModel:
         top = -np.linalg.solve(slope[..., : self.unknowns], slope[..., self.unknowns :])
         rest = self.shift.jacobian(known.shape[1])(known)
         return np.concatenate([top, rest], axis=1)
+
+    @cached_property
+    def _in_v(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """h as polynomials in v: exponents (k, n + m) of [x; w] and (p, n_v) of v, and the table
+        (k, p n_v) by which monomials of [x; w] give the coefficients of the monomials of v.
+        """
+        n_v, exponents = self.unknowns, self.h.exponents
+        known, place = np.unique(exponents[:, n_v:], axis=0, return_inverse=True)
+        powers, of = np.unique(exponents[:, :n_v], axis=0, return_inverse=True)
+        table = np.zeros((len(known), len(powers), n_v))
+        np.add.at(table, (place.ravel(), of.ravel()), self.h.coefficients)
+        return known, powers, table.reshape(len(known), -1)
 
     @cached_property
     def _slope(self) -> Polynomials:

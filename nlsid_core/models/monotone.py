@@ -34,7 +34,7 @@ def newton(
         if not len(active):
             break
         try:
-            steps = np.linalg.solve(slope(v[active], active), -residual[active][..., None])[..., 0]
+            steps = _solved(slope(v[active], active), -residual[active])
         except np.linalg.LinAlgError:  # a singular slope: c is not monotone, or overflows
             break
         length, waiting = np.ones(len(active)), np.arange(len(active))
@@ -50,6 +50,15 @@ def newton(
             length[waiting] /= 2.0
             waiting = waiting[length[waiting] >= SHORTEST_STEP]
     return v, np.flatnonzero(~(error <= RESIDUAL * size))
+
+
+def _solved(slopes: FloatArray, right: FloatArray) -> FloatArray:
+    """(k, n): what slopes (k, n, n) take to right (k, n)."""
+    if right.shape[1] > 1:
+        return np.asarray(np.linalg.solve(slopes, right[..., None])[..., 0])
+    if not slopes.all():
+        raise np.linalg.LinAlgError("a slope is zero")
+    return np.asarray(right / slopes[:, 0])
 
 
 def ellipsoid(

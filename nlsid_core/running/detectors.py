@@ -27,17 +27,28 @@ class Residuals:
     error: FloatArray
 
 
-def cusum(z: FloatArray) -> FloatArray:
-    """The larger of both one-sided sums S⁺ = max(0, S ± z - DRIFT) of z (N, p), largest output.
+class CusumMeter:
+    """Both one-sided sums S⁺ = max(0, S ± z - drift) of several outputs, sample by sample.
 
     Source: E. S. Page, Continuous Inspection Schemes, Biometrika 41 (1954).
     """
-    up, down = np.zeros(z.shape[1]), np.zeros(z.shape[1])
-    found = np.empty(len(z))
-    for k, now in enumerate(z):
-        up, down = np.maximum(0.0, up + now - DRIFT), np.maximum(0.0, down - now - DRIFT)
-        found[k] = max(float(up.max()), float(down.max()))
-    return found
+
+    def __init__(self, outputs: int, drift: float = DRIFT) -> None:
+        self._drift, self._sums = drift, [0.0] * (2 * outputs)
+
+    def update(self, z: Sequence[float]) -> float:
+        """The largest sum after z (p,), in standard deviations."""
+        drift, sums = self._drift, self._sums
+        for j, now in enumerate(z):
+            sums[2 * j] = max(0.0, sums[2 * j] + now - drift)
+            sums[2 * j + 1] = max(0.0, sums[2 * j + 1] - now - drift)
+        return max(sums)
+
+
+def cusum(z: FloatArray) -> FloatArray:
+    """The largest sum of a `CusumMeter` at every sample of z (N, p)."""
+    meter = CusumMeter(z.shape[1])
+    return np.array([meter.update(now) for now in z.tolist()])
 
 
 def largest(z: FloatArray) -> FloatArray:

@@ -35,6 +35,9 @@ class Reading(NamedTuple):
     two samples ahead, or `innovation`. nominal, measured: each measured signal, in its unit;
     nominal is empty if unknown. level: see `Level`. reason: why it is not inside, empty if it is.
     assuming: the assumption in words. deviation: from the nominal, on each axis in its unit.
+    alarm: a second alarm in words, which is no assumption and changes no status; empty if there is
+    none. half_widths: of the tube at this sample, of each measured signal in its unit, where they
+    follow the commands; else empty.
     """
 
     t: float
@@ -49,6 +52,8 @@ class Reading(NamedTuple):
     reason: str = ""
     assuming: str = ""
     deviation: Sequence[float] = ()
+    alarm: str = ""
+    half_widths: Sequence[float] = ()
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -22,6 +22,7 @@ from nlsid_core.models import (
     StableModel,
     StateAffineModel,
 )
+from nlsid_core.models.implicit_step import SingleStep
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.signal import Signal
 
@@ -197,7 +198,8 @@ class _Implicit:
     """0 = h(v, x, w), x⁺ = [v; ã(x, w)], y = v."""
 
     def __init__(self, model: ImplicitModel) -> None:
-        self._model = model
+        self._step = SingleStep(model)
+        self._unknowns, self._window = model.unknowns, model.window
         self.order, self.lags = len(model), model.lags
         self.delays = max((d for _, d in model.window), default=0)
 
@@ -205,9 +207,9 @@ class _Implicit:
         return np.asarray(y[len(y) - self.lags :][::-1].ravel())
 
     def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        w = np.array([past[-1 - d][i] for i, d in self._model.window])
-        after = self._model.step(x, np.tile(w, (len(x), 1)))
-        return after[:, : self._model.unknowns], after
+        w = np.array([past[-1 - d][i] for i, d in self._window])
+        after = self._step(x, w)
+        return after[:, : self._unknowns], after
 
 
 _KINDS: dict[type, Callable[..., Any]] = {

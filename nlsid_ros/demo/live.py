@@ -26,7 +26,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from bags.chain.faults import FAULTS, write_faulty_copy
-from bags.designs.documents import load_proved_funnel
+from bags.designs.documents import load_proved
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import header_stamp_ns
@@ -82,7 +82,7 @@ class LiveResult:
                 + ("equal to what was sent" if self.recording_equal else "NOT what was sent"),
                 f"monitor: {self.margins} of {self.margins_expected} margins, at most "
                 f"{self.margin_difference:.1e} from the offline replay's",
-                f"speed {FAULT}: ERROR {self.alarm_ms:.1f} ms after the first bad sample "
+                f"sensor {FAULT}: ERROR {self.alarm_ms:.1f} ms after the first bad sample "
                 f"({self.alarm})",
             ]
         )
@@ -123,12 +123,12 @@ class Observer(Node):
 
 def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     """Play `bag` to the live nodes, clean and with a broken sensor, and compare with offline."""
-    proved = load_proved_funnel(funnel)
-    paths = [proved.design.response, proved.design.command]
+    proved = load_proved(funnel)
+    signals = proved.design.sampler()
     with Bag(bag) as source:
-        topics = {path.topic: source.types_on(path.topic)[0] for path in paths}
+        topics = {topic: source.types_on(topic)[0] for topic in signals.topics}
     faulty = out / f"{bag.name}, {FAULT}"
-    write_faulty_copy(bag, faulty, str(paths[0]), FAULTS[FAULT])
+    write_faulty_copy(bag, faulty, str(signals.responses[0].path), FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
     with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
         with _node("funnel_monitor", {"allow_old_stamps": True}):
@@ -161,7 +161,7 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
         for stamp, reading in zip(bad.stamps_ns, bad.readings, strict=True)
         if reading is bad.first_bad
     )
-    heard = observer.arrivals.get((paths[0].topic, bad_stamp), float("nan"))
+    heard = observer.arrivals.get((signals.responses[0].path.topic, bad_stamp), float("nan"))
     sent, recorded = _contents(bag, list(topics)), _contents(recording, list(topics))
     return LiveResult(
         sent=len(sent),

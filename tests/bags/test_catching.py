@@ -199,7 +199,7 @@ def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
 def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     found: Catching,
 ) -> None:
-    worse = Row("made up", Caught(outside=1, violated=2, unjudged=3, after=0.25),
+    worse = Row("made up", Caught(outside=1, violated=2, unjudged=3, after=0.25, alarmed=4),
                 {"CUSUM": Caught(violated=9, after=0.5), "3σ": Caught(),
                  "box": Caught()})  # fmt: skip
     refused = Row("refused", Caught(), {}, "no such input")
@@ -208,12 +208,12 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     with console.capture() as said:
         console.print(table)
     line = next(line for line in said.get().splitlines() if "made up" in line)
-    assert line.split() == ["made", "up", "1", "2", "3", "0.25", "s", "9", "0.50", "s", "0", "-",
+    assert line.split() == ["made", "up", "1", "2", "4", "3", "0.25", "9", "0.50", "0", "-",
                             "0", "-"]  # fmt: skip
     assert table.rows[-2].style == "dark_orange3"
     assert table.rows[0].style == ""
     assert (
-        next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 7
+        next(line for line in said.get().splitlines() if "refused" in line).split()[1:] == ["-"] * 8
     )
     with console.capture() as said:
         show.say_catching(console, replace(found, rows=(*found.rows, refused)), None)
@@ -224,5 +224,5 @@ def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> 
     figure = draw(found)
     (errors,), (caught,) = (part.axes for part in figure.subfigs)
     assert len(errors.lines) == found.trials + 2
-    assert len(caught.patches) == len(found.rows) * (3 + 3)
+    assert len(caught.patches) == len(found.rows) * (4 + 3)
     assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in found.rows]

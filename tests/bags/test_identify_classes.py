@@ -117,7 +117,7 @@ def test_moments_stand_beside_the_biased_rie_and_least_squares(
 ) -> None:
     assert monotone.methods == ("least_squares", "rie", "moment_rie")
     assert repeated.percent(monotone.model) < 0.4 * repeated.percent(monotone["rie"].model)
-    assert monotone["least_squares"].proof is None
+    assert monotone["least_squares"].proof is not None, "every candidate is offered to the prover"
     assert len(monotone.history.steps) == 1
     assert "mean squared simulation error by the moments" in str(monotone)
 
@@ -305,6 +305,7 @@ def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None
     orders = [replace(CASCADE, orders=orders) for orders in ((1, 0), (2, 1))]
     chosen = select(train, validation, orders, transient=60)
     assert chosen.best == orders[1]
+    assert not chosen.refitted, "validation trials choose its knots"
     with pytest.raises(Infeasible, match="share a `group`"):
         select(train, validation, [MonotoneClass(1), MonotoneClass(2)])
     with pytest.raises(DataError, match="no model class to select from"):

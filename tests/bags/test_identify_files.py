@@ -210,9 +210,10 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
         few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=quiet
     )
     assert len(both.selection.tried) == 4
-    assert both.selection.fit.errors["validation"][both.selection.fit.method.name] == min(
-        both.selection.errors
-    )
+    least = both.selection.tried[int(np.argmin(both.selection.errors))]
+    assert both.selection.best is least.model_class
+    assert both.selection.fit.model.bags == tuple((t.name, t.digest) for t in both.identified.train)
+    assert len(both.identified.train) == 2, "the training and the validation trial"
 
 
 @pytest.mark.parametrize(
@@ -354,7 +355,7 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
 def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
     coupled: Path, tmp_path: Path
 ) -> None:
-    unproved = {"model": "monotone", "lags": 2, "method": "least_squares"}
+    unproved = {"lags": 2, "method": "least_squares", "max_rate": 0.01}
     config = write_config(tmp_path / "c.yaml", {"lags": 2})
     assert nlsid("identify", coupled, "--config", config, "--out", tmp_path).exit_code == 0
     assert (tmp_path / documents.MODEL_PROOF).exists()

@@ -183,7 +183,89 @@ def test_messages_give_the_same_bits_as_identification_reads(
         resample=resample,
         hold=0.2,
     )
-    sampler = Sampler(trial.y_paths, trial.u_paths, period=trial.period)
+    given = replayed(bag, Sampler(trial.y_paths, trial.u_paths, period=trial.period))
+    assert trial.y.tolist() == [list(sample.y) for sample in given]
+    assert trial.u.tolist() == [list(sample.u) for sample in given]
+    assert len(given) > 80
+    if turn:
+        assert np.abs(trial.y[:, 0] - 4.0).max() < 0.5  # rad/s, by stamps with 3 ms of jitter
+
+
+def driven(values: Series, at: int, *, delay_ns: int, lag_ns: float, limit_ns: int) -> float:
+    """A delayed, held, lagged command at `at`, step by step from the first value on."""
+    came = [(stamp + delay_ns, value) for stamp, value in values if stamp + delay_ns <= at]
+    if not came or at - came[-1][0] > limit_ns:
+        return math.nan
+    if not lag_ns:
+        return came[-1][1]
+    x = came[0][1]
+    ends = [*(stamp for stamp, _ in came[1:]), at]
+    for (stamp, value), end in zip(came, ends, strict=True):
+        x = value + (x - value) * math.exp(-(end - stamp) / lag_ns)
+    return x
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_products_of_delayed_and_lagged_signals_are_what_the_words_say(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    columns = [series(rng, 0.01, 60) for _ in range(3)]
+    drives = [f"{U}|delay(0.025 s)|lag(0.1 s)|hold(0.03 s)", f"{Z}|hold(0.02 s)"]
+    sampler = Sampler([Y], [f"{drives[0]} * {drives[1]}", drives[1]], period=0.01)
+    assert sampler.topics == ("/y", "/u", "/z")
+    events = interleaved(rng, columns)
+    again = [(k, stamp, value) for k, stamp, value in events if k == 2]
+    given = fed(sampler, sorted([*events, *((3, *e[1:]) for e in again)], key=lambda e: e[1]))
+    options = ({"delay_ns": 25 * MS, "lag_ns": 100.0 * MS, "limit_ns": 30 * MS},
+               {"delay_ns": 0, "lag_ns": 0.0, "limit_ns": 20 * MS})  # fmt: skip
+    truth: list[list[float]] = []
+    for at, y in columns[0]:
+        u, z = (driven(c, at, **o) for c, o in zip(columns[1:], options, strict=True))  # type: ignore[arg-type]
+        if truth or math.isfinite(u * z):
+            truth.append([y, u * z, z])
+    found = [[*sample.y, *sample.u] for sample in given]
+    np.testing.assert_allclose(found, truth, rtol=1e-12)
+    assert np.isfinite(found).any()
+
+
+def test_what_answers_is_no_product_and_has_no_lag() -> None:
+    for text in (f"{Y} * {Z}", f"{Y}|lag(1 s)", f"{Y}|delay(1 s)"):
+        with pytest.raises(BagError, match="for what drives, not for a response"):
+            Sampler([text], [U], period=0.1)
+    with pytest.raises(BagError, match="leave out linear"):
+        Expression.parse(f"{U}|lag(1 s)|linear(1 s)")
+    with pytest.raises(BagError, match="at most 4"):
+        Sampler([Y], [" * ".join([U] * 5)], period=0.1)
+
+
+@pytest.mark.parametrize("resample", ["none", "linear"])
+def test_signals_of_several_topics_and_products_give_the_same_bits(
+    tmp_path: Path, resample: str
+) -> None:
+    """Responses on two topics, drives made of two, as identification reads and as replay does."""
+    bag = drive(tmp_path / "drive")
+    steering = f"{CMD}:twist.linear.x|delay(0.03 s)|lag(0.1 s)"
+    yaw = f"{ODOM}:pose.pose.orientation.yaw|unwrap"
+    [trial] = read_dataset(
+        [bag],
+        responses=[SPEED] if resample == "none" else [SPEED, f"{CMD}:twist.linear.x"],
+        excitations=[f"{steering} * {SPEED}", f"{yaw}|derivative(0.1 s)"],
+        period=0.025 if resample == "none" else 0.05,
+        max_gap=0.1,
+        resample=resample,
+        hold=0.2,
+    )
+    assert trial.u_paths[0] == (
+        f"{steering}|hold(0.2 s) * {SPEED}|hold(0.2 s)"
+    )  # the model knows the whole rule
+    given = replayed(bag, Sampler(trial.y_paths, trial.u_paths, period=trial.period))
+    assert trial.y.tolist() == [list(sample.y) for sample in given]
+    assert trial.u.tolist() == [list(sample.u) for sample in given]
+    assert len(given) > 80
+
+
+def replayed(bag: Path, sampler: Sampler) -> list[Sample]:
+    """Complete samples of a bag's messages in the order of logging."""
     given: list[Sample] = []
     with Bag(bag) as source:
         for topic in sampler.topics:
@@ -192,13 +274,7 @@ def test_messages_give_the_same_bits_as_identification_reads(
             decoded = decode(message.data, *source.types_on(message.topic))
             stamp = sampler.stamp(message.data, message.log_time_ns)
             given += sampler.message(message.topic, stamp, decoded)
-    given += sampler.flush()
-    given = [sample for sample in given if not sample.missing]
-    assert trial.y.tolist() == [list(sample.y) for sample in given]
-    assert trial.u.tolist() == [list(sample.u) for sample in given]
-    assert len(given) > 80
-    if turn:
-        assert np.abs(trial.y[:, 0] - 4.0).max() < 0.5  # rad/s, by stamps with 3 ms of jitter
+    return [sample for sample in [*given, *sampler.flush()] if not sample.missing]
 
 
 def test_commands_without_a_header_are_paired_by_log_time_when_that_is_said(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def left(model: StateAffineModel) -> np.ndarray:
 
 def smallest(inside: MatrixSet, theta: np.ndarray, extra: np.ndarray) -> float:
     z = np.concatenate([theta, extra])
-    return min(float(np.linalg.eigvalsh(part.at(z))[0]) for part in inside.inequalities())
+    return min(float(np.linalg.eigvalsh(part.at(z)).min()) for part in inside.inequalities())
 
 
 def checked(model: StateAffineModel, folder: Path) -> str:

@@ -126,10 +126,27 @@ def test_selection_takes_the_class_with_the_least_validation_error(train: Datase
     assert chosen.best == LinearClass(2)
     assert chosen.errors[0] > chosen.errors[1]
     assert chosen.errors[2] == np.inf, "too few rows for sixty lags"
-    assert seen == [*map(describe, classes), "done"]
+    assert seen == [
+        *map(describe, classes), "fitting to training and validation trials", "done"
+    ]  # fmt: skip
     assert "linear, lags 2" in str(chosen)
     with pytest.raises(Infeasible, match="no class has a proved model"):
         select(train, validation, [LinearClass(60)])
+
+
+def test_the_class_that_is_selected_is_fitted_to_training_and_validation_trials(
+    train: Dataset,
+) -> None:
+    validation = synthetic_dataset(0.01, trials=3)
+    chosen = select(train, validation, [LinearClass(1), LinearClass(2)])
+    assert chosen.refitted
+    both = Dataset((*train.trajectories, *validation.trajectories))
+    direct = identify(both, LinearClass(2), comparators=())
+    np.testing.assert_array_equal(chosen.fit.model.a, direct.model.a)
+    assert len(chosen.fit.model.bags) == len(train) + 3
+    tried = chosen.tried[1].fit
+    assert tried is not None
+    assert len(tried.model.bags) == len(train), "what was judged on validation had not seen it"
 
 
 def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
@@ -153,11 +170,16 @@ def test_the_command_line_compares_methods_on_the_same_bags(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A console that was made by an earlier test keeps the width it found.
-    monkeypatch.setattr("bags.commands.cli.out._width", 200)
+    monkeypatch.setattr("bags.commands.cli.out._width", 80)
     made = CliRunner().invoke(
         app, ["compare", *BAGS, "--config", str(config), "--lags", "1", "--lags", "2"]
     )
     assert made.exit_code == 0, made.output
     for method in (LeastSquares, Rie, Rse, CertifiedRse):
-        assert len(re.findall(rf"│ {method.name} ", made.output)) == 2
-    assert "20 ahead" in made.output
+        rows = re.findall(rf"^ {method.name} .*", made.output, re.MULTILINE)
+        assert len(rows) == 2
+        for row in rows:
+            assert len(row) <= 80
+            assert re.search(r"\d (ms|s) *$", row), "to the last column, the time"
+    assert "+20" in made.output
+    assert "…" not in made.output

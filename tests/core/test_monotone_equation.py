@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nlsid_core.data.trajectory import Dataset
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
+from nlsid_core.identification import LeastSquares, Rie, Sem, identify, prove_stability
 from nlsid_core.identification.moment_rie import MomentFit
+from nlsid_core.identification.moments import MonotoneClass
 from nlsid_core.identification.monotone import (
     identify_from_repeats,
     simulate_banded,
@@ -78,3 +80,35 @@ def test_the_proof_holds_on_pairs_of_solutions(fit: MomentFit) -> None:
         gap = first - second
         V = np.array([[gap[t], gap[t - 1]] @ P @ [gap[t], gap[t - 1]] for t in range(1, 40)])
         assert (V[1:] <= fit.proof.rate**2 * V[:-1] * (1 + 1e-9) + 1e-20).all()
+
+
+def test_a_lightly_damped_linear_equation_is_proved_as_the_linear_model_it_equals() -> None:
+    model = replace(truth(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]))
+    proof = prove_stability(model)
+    assert proof is not None
+    assert np.sqrt(0.95) < proof.rate < 0.98, "poles of radius √0.95"
+    with_ray = replace(model, e=np.array([2.0, 0.0, 1e-3]))
+    assert prove_stability(with_ray) is None, "with a slope without bound it is not positive real"
+
+
+def test_every_method_of_the_class_is_offered_to_the_prover() -> None:
+    fit = identify(
+        Dataset((run(np.random.default_rng(1).uniform(-2.0, 2.0, 2000), 0.0, 1),)), CLASS,
+        method=Sem(), comparators=(LeastSquares(), Rie()),
+    )  # fmt: skip
+    assert fit.methods == ("least_squares", "rie", "sem")
+    for name in fit.methods:
+        proof = fit[name].proof
+        assert proof is not None, name
+        assert 0.0 < proof.rate < 1.0
+
+
+def test_a_resonance_is_identified_by_a_linear_equation() -> None:
+    """Least squares finds it, and what it found is proved, although it is no minimiser of (3.8)."""
+    rng = np.random.default_rng(2)
+    resonant = replace(truth(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]), c=0.0)
+    u = rng.uniform(-1.0, 1.0, 1500)
+    data = Dataset((Trajectory(t=0.01 * np.arange(1500), y=resonant.simulate(u), u=u),))
+    fit = identify(data, MonotoneClass(2, (0,), degree=1), method=LeastSquares(), comparators=())
+    assert fit.errors["train"]["least_squares"] < 1e-6
+    assert fit.proof.rate < 0.98

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design_output_tube
 from nlsid_core.design.tube import energy, innovations
@@ -59,16 +60,27 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
     judged = readings[settling:]
     assert all(r.status is not Status.UNKNOWN for r in judged)
     E = energy(innovations(made.model, tube.L[None], trial, settling)[:, 0], tube)
+    g: FloatArray = np.ones(len(E))
+    if tube.follows is not None:
+        g = tube.follows.along(trial.u)[settling:, 0]
+    error = innovations(made.model, 0 * tube.L[None], trial, settling)[:, 0]
+    response = made.funnel.response
+    assert response is not None
+    rows = g[:, None] if response.follows is None else response.follows.along(trial.u)[settling:]
+    parts = ((error / response.half_widths) ** 2 / rows).max(axis=1)
+    expected = np.maximum(E / tube.level / g, parts)
     used = np.array([r.assumption for r in judged])
     if len(made.funnel.tubes) == 1:
-        assert used == pytest.approx(E / tube.level, rel=1e-6)
-        assert (used >= E / tube.level).all(), "rounded up"
+        assert used == pytest.approx(expected, rel=1e-6)
+        assert (used >= expected * (1 - 1e-12)).all(), "rounded up"
     else:
-        assert (used >= E / tube.level * (1 - 1e-9)).all(), "the most of several"
-    widths = made.funnel.half_widths
+        assert (used >= expected * (1 - 1e-9)).all(), "the most of several"
     for k, r in enumerate(judged):
         deviation = np.abs(np.array(r.nominal) - trial.y[settling + k])
-        assert 1.0 - r.margin >= (deviation / tube.half_widths).max() * (1 - 1e-12)
+        widths = made.funnel.half_widths * np.sqrt(g[k])
+        assert 1.0 - r.margin >= (deviation / tube.half_widths).max() / np.sqrt(g[k]) * (1 - 1e-9)
+        if tube.follows is not None:
+            assert r.half_widths == pytest.approx(widths, rel=1e-8)
         assert (r.status is Status.OUTSIDE) == (r.margin < 0.0)
         assert (deviation <= widths).all() or r.status is not Status.INSIDE
 

@@ -13,7 +13,7 @@ SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 FILES = {FUNNEL: "funnel_tube", PROOF: "proof_output_tube"}
 
 
-@pytest.mark.parametrize("name", ["linear", "split", "implicit_box"])
+@pytest.mark.parametrize("name", ["linear", "split", "implicit_box", "two_following"])
 @pytest.mark.parametrize(("file", "schema"), FILES.items())
 def test_every_written_document_validates_and_a_damaged_one_does_not(
     name: str, file: str, schema: str

@@ -105,7 +105,8 @@ def test_time_and_disturbances_are_expanded_too() -> None:
     cubics, bounds = expanded(blown, centre, radius, states=2, uncertain=w)
     box = np.array([[0.0, 0.1], *np.stack([centre - radius, centre + radius], axis=1), *w])
     assert (left_over(blown, cubics, box, 2, 1) <= bounds + 1e-13).all()
-    assert bounds[0] == 0 and 0 < bounds[1] < 0.01
+    assert bounds[0] == 0
+    assert 0 < bounds[1] < 0.01
     t = np.linspace(0, 1, 5)
     field = taylor_field(
         blown, t, np.zeros((5, 2)), np.zeros((5, 1)), radius=[1, 1, 1], uncertain=w
@@ -120,21 +121,22 @@ def test_many_inexact_rates_are_pushes_and_exact_ones_have_none() -> None:
         lambda x: [*np.sin(x[: n - 2]), x[0] / 3 + 0.1 * x[1] + 0.2 * x[1], x[3] ** 3],
         t, x, np.zeros((3, 0)), radius=np.full(n, 0.1),
     )  # fmt: skip
-    assert len(field.uncertain) == n - 2 and field.is_pushed
+    assert len(field.uncertain) == n - 2
+    assert field.is_pushed
 
 
 @pytest.mark.parametrize(
     ("function", "said"),
     [
-        (lambda x, u: [np.arcsin(x[0])], "arcsin.*known are .*np.arctan2.*dynamics.solve"),
+        (lambda x: [np.arcsin(x[0])], "arcsin.*known are .*np.arctan2.*dynamics.solve"),
         (lambda x, u: [x[0] if x[0] > 0 else u[0]], "comparison: which branch"),
         (lambda x, u: [np.linalg.solve([[x[0]]], [u[0]])[0]], "known are"),
-        (lambda x, u: [np.sin(x[0]) ** 0.3], "power 0.3: whole numbers"),
+        (lambda x: [np.sin(x[0]) ** 0.3], "power 0.3: whole numbers"),
         (lambda x, u: [np.arctan2(x[0] - 1, u[0])], "zero in the box"),
-        (lambda x, u: [np.log(x[0] - 1)], "logarithm of a value that may not be positive"),
-        (lambda x, u: [np.tan(x[0] + 0.57)], "may be at a pole"),
-        (lambda x, v: [x[0]], "function of some of t, x, u, w"),
-        (lambda x, u, w: [x[0]], "give its bounds as `uncertain`"),
+        (lambda x: [np.log(x[0] - 1)], "logarithm of a value that may not be positive"),
+        (lambda x: [np.tan(x[0] + 0.57)], "may be at a pole"),
+        (lambda x, v: [x[0] + v], "function of some of t, x, u, w"),
+        (lambda x, w: [x[0] + w[0]], "give its bounds as `uncertain`"),
     ],
 )
 def test_what_is_not_supported_says_what_is(function: Any, said: str) -> None:
@@ -144,7 +146,7 @@ def test_what_is_not_supported_says_what_is(function: Any, said: str) -> None:
 
 def test_a_radius_that_makes_no_sense_is_refused() -> None:
     t, x, u = np.linspace(0, 1, 3), np.zeros((3, 2)), np.zeros((3, 1))
-    with pytest.raises(DataError, match="how far .* may be, 0 or more"):
+    with pytest.raises(DataError, match=r"how far .* may be, 0 or more"):
         taylor_field(swinging, t, x, u, radius=[-0.1, 1, 1])
     with pytest.raises(ShapeError, match="radius should have 3 entries"):
         taylor_field(swinging, t, x, u, radius=[0.1, 1])

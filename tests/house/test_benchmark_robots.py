@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bags.samples import convert_dart
 from bags.signals.reader import read_signals
-from benchmarks.robots import DART_ROLES, ROBOTS, Robot, measure, write_drive
+from benchmarks.robots import DART_KINDS, ROBOTS, Robot, dart_split, measure
 from nlsid_core.arrays import FloatArray
 from tests.conftest import SHARED
 
@@ -30,19 +31,16 @@ def test_a_robot_whose_recordings_are_not_there_is_listed_with_the_reason(tmp_pa
 
 def test_a_drive_turns_as_its_poses_say(tmp_path: Path) -> None:
     """Yaw rate and speed, delayed by half their window, against differences of the raw poses."""
-    folder = SHARED / "dart" / DART_ROLES["rubbery"][0]
-    if not folder.is_dir():
+    if not (SHARED / "dart").is_dir():
         pytest.skip("needs dart in ../shared/data")
-    file = sorted(folder.glob("*.csv"))[0]
-    write_drive(file, tmp_path / "drive")
-    paths = ["/odom:twist.angular.z", "/odom:twist.linear.x", "/command:twist.angular.z"]
+    drive = next(convert_dart.drives(SHARED / "dart"))
+    convert_dart.convert(drive, tmp_path / "drive")
+    paths = ["/motion:twist.angular.z", "/motion:twist.linear.x", "/command:twist.angular.z"]
     read = read_signals(tmp_path / "drive", paths)
-    table = np.genfromtxt(file, delimiter=",", names=True)
-    t = table["vicon_time"] - table["vicon_time"][0]
-    kept = np.concatenate([[True], np.diff(t) > 0])
-    t, yaw = t[kept], np.unwrap(table["vicon_yaw"][kept])
-    x, y = table["vicon_x"][kept], table["vicon_y"][kept]
-    at = (read[paths[0]].stamp_ns - 1_700_000_000 * 10**9) / 1e9
+    table = drive.columns
+    t, yaw = table["t"], np.unwrap(table["vicon yaw"])
+    x, y = table["vicon x"], table["vicon y"]
+    at = read[paths[0]].stamp_ns / 1e9
 
     def slope(values: FloatArray) -> FloatArray:
         ahead, behind = np.interp(at, t, values), np.interp(at - 0.2, t, values)
@@ -52,4 +50,17 @@ def test_a_drive_turns_as_its_poses_say(tmp_path: Path) -> None:
     assert np.abs(read[paths[0]].values - slope(yaw)).mean() < 0.1
     assert np.abs(read[paths[1]].values - np.hypot(slope(x), slope(y))).mean() < 0.1
     assert np.ptp(read[paths[0]].values) > 1.0
-    assert set(np.unique(read[paths[2]].values)) <= set(np.unique(table["steering"]))
+    commanded = np.unique(table["steering"])
+    nearest = commanded[np.searchsorted(commanded[:-1], read[paths[2]].values - convert_dart.STEP)]
+    assert np.abs(nearest - read[paths[2]].values).max() <= convert_dart.STEP
+
+
+def test_every_kind_of_drive_is_dealt_to_training_calibration_and_test() -> None:
+    bags = [Path(f"rubbery_{day}_{k:06d}") for day in DART_KINDS for k in range(4)]
+    split = dart_split(bags, 3)
+    assert split == dart_split(bags, 3)
+    assert split != dart_split(bags, 4)
+    assert not set(split["test"]) & set(split["calibration"])
+    for days in (("20240909",), ("20240904", "20240927"), ("20240916",)):
+        for use in split.values():
+            assert any(name.split("_")[1] in days for name in use)

@@ -17,8 +17,8 @@ DOWNWARD = {
 }
 # The rooms of bags, each standing on those before it.
 ROOMS = (
-    "recordings", "signals", "tools", "designs", "monitoring", "pictures", "chain", "setup",
-    "commands",
+    "recordings", "signals", "tools", "designs", "monitoring", "viewing", "pictures", "chain",
+    "setup", "commands",
 )  # fmt: skip
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {

@@ -37,8 +37,8 @@ class Pieces:
     2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
     kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
     mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
-    y = (1, z) the multiplier of what holds in that mode. stated: (B,) how a proof writes mu and
-    tau, see `witnesses.rounded`.
+    y = (1, z) the multiplier of what holds in that mode. push: (B, m) that the input is off.
+    stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
     """
 
     basis: IntArray
@@ -51,6 +51,7 @@ class Pieces:
     gram: FloatArray
     mode: IntArray
     tau: FloatArray
+    push: FloatArray
     stated: NDArray[np.object_]
     kappa: FloatArray | None = None
 
@@ -247,7 +248,8 @@ class _Loop:
         u = self.restricted(self.policy.u.control[k])
         KT = _product(self.restricted(self.policy.K.control[k]), T)
         time = self.restricted(_linear(self.funnel.t)[k])
-        w = self.field.vertices()[self.pieces.vertex]
+        vertices = self.field.vertices()
+        w = vertices[self.pieces.vertex % len(vertices)]
         if self.pieces.kappa is not None:
             w = np.tile(self.field.uncertain.mean(axis=1), (len(self.pieces), 1))
         forms: list[Graded] = [{0: time[:, :, None]}]
@@ -255,7 +257,8 @@ class _Loop:
         self.demands: list[Graded] = [
             {0: u[:, :, i][:, :, None], 1: -KT[:, :, i]} for i in range(self.field.m)
         ]
-        forms += self._clipped()
+        for i, applied in enumerate(self._clipped()):
+            forms.append(add(applied, {0: self.pieces.push[:, i][:, None, None]}))
         forms += [{0: w[:, None, i][:, :, None]} for i in range(w.shape[1])]
         return forms
 

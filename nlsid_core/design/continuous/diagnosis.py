@@ -60,11 +60,11 @@ class Diagnosis:
         taking = "; ".join(f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
                            for p, n in shares if p >= 0.01 * total)  # fmt: skip
         sizes = ", ".join(f"{width:.3g}" for width in self.widths)
+        cause = "that" if self.dominant == "linear" else NAMES[self.dominant].rstrip(",")
         return (
-            f"no funnel at t = {self.t:.6g} s: around the motion within ({sizes}) the linear closed "
-            f"loop lets V fall by {self.linear:.3g} 1/s, and {taking or 'nothing else is lost'}. "
-            f"Because of {'that' if self.dominant == 'linear' else NAMES[self.dominant].rstrip(',')}"
-            f": {ADVICE[self.dominant]}"
+            f"no funnel at t = {self.t:.6g} s: around the motion within ({sizes}) the linear "
+            f"closed loop lets V fall by {self.linear:.3g} 1/s, and "
+            f"{taking or 'nothing else is lost'}. Because of {cause}: {ADVICE[self.dominant]}"
         )
 
 
@@ -99,7 +99,7 @@ def _terms(
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """-Ẇ/ρ of the linear closed loop at the program's points, and of each term beside it."""
     x_bar = np.sqrt(rho) * steps.program.points @ section.base.T
-    vertex, _ = steps.split(case)
+    vertex, *_ = steps.split(case)
     centre = steps.field.uncertain.mean(axis=1)
 
     def falls(rates: FloatArray) -> FloatArray:

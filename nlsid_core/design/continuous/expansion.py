@@ -190,7 +190,7 @@ class _Interval:
         raise Infeasible(str(self.diagnosis(known)))
 
     def bracketed(self, rho: float, known: Ends, most: float) -> float:
-        """The largest ρ ≤ most, to 1 %, at which the bound leaves the margin; 0 if there is none."""
+        """The largest ρ ≤ most, to 1 %, at which the bound leaves the margin; or 0."""
         step = STEP
         if self.predicted(rho, known) >= 0:
             low = rho

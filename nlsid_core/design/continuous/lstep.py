@@ -5,6 +5,7 @@ depend on ρ̇. Source: thesis (6.4), in the sphere form.
 """
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.design.continuous.modes import multipliers
 from nlsid_core.dynamics import VectorField
-from nlsid_core.dynamics.taylor import Cubic
 from nlsid_core.dynamics.piecewise import bernstein
+from nlsid_core.dynamics.taylor import Cubic
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
@@ -40,8 +41,8 @@ class Section:
     P: FloatArray
     P_rate: FloatArray
     base: FloatArray
-    interval: int
     span: int
+    interval: int
 
 
 def section_at(
@@ -61,8 +62,8 @@ def section_at(
         P=here,
         P_rate=(P[k + 1] - P[k]) / h,
         base=coordinates(here, steps.nonlinear),
-        interval=k,
         span=steps.field.span(float(t[k])),
+        interval=k,
     )
 
 
@@ -99,11 +100,13 @@ def refuse_degree(field: VectorField) -> None:
 class LSteps:
     """L-steps of one vector field; holds the sphere program and counts what is solved.
 
-    A case is a vertex of w in a mode of the policy: every vertex in the first mode comes first.
-    limits and modes: of the policy, if its inputs are clipped. nonlinear: the states that the
-    programs take as such, the field's or more. pushed: whether what w does is bounded, not taken at
-    its corners; only where it adds constants to ẋ (None: the field's `is_pushed`). local: what the dynamics are on an interval, where
-    a search expands them anew; else they are the field. kappa: (intervals, n_w), if w only pushes.
+    A case is a vertex of w at a corner of δ in a mode of the policy: every vertex at the first
+    corner in the first mode comes first. limits and modes: of the policy, if its inputs are
+    clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
+    nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
+    w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
+    field's `is_pushed`). kappa: (intervals, n_w), if it is. local: what the dynamics are on an
+    interval, where a search expands them anew; else they are the field.
     """
 
     def __init__(
@@ -114,6 +117,7 @@ class LSteps:
         nonlinear: tuple[int, ...] | None = None,
         pushed: bool | None = None,
         tolerance: float = 1e-5,
+        widths: FloatArray | None = None,
     ) -> None:
         refuse_degree(field)
         self.field = field
@@ -124,7 +128,11 @@ class LSteps:
         self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
-        self.program = sphere_program(field, self.nonlinear, reduced=len(self.limits) == 0)
+        self.widths = widths
+        corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
+        self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
+        reduced = len(self.limits) == 0 and widths is None
+        self.program = sphere_program(field, self.nonlinear, reduced=reduced)
         self.kappa: FloatArray | None = None
         self.solved = 0
         if self.pushed and policy is not None:
@@ -161,22 +169,25 @@ class LSteps:
 
     @property
     def cases(self) -> int:
-        """Vertices times modes."""
-        return len(self.vertices) * len(self.modes)
+        """Vertices times corners times modes."""
+        return len(self.vertices) * len(self.corners) * len(self.modes)
 
-    def split(self, case: int) -> tuple[int, IntArray]:
-        """The vertex and the mode of a case."""
-        mode, vertex = divmod(case, len(self.vertices))
-        return vertex, self.modes[mode]
+    def split(self, case: int) -> tuple[int, int, IntArray]:
+        """The vertex, the corner and the mode of a case."""
+        rest, vertex = divmod(case, len(self.vertices))
+        mode, corner = divmod(rest, len(self.corners))
+        return vertex, corner, self.modes[mode]
 
     def values(self, section: Section, rho: float, case: int) -> FloatArray:
         """-Ẇ/ρ at the program's points, straight from the vector field in the case's mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
-        vertex, mode = self.split(case)
+        vertex, corner, mode = self.split(case)
         u = section.u - x_bar @ section.K.T
         for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
             if side:
                 u[:, int(i)] = low if side < 0 else high
+        if self.widths is not None:
+            u = u + self.corners[corner] * self.widths[section.interval]
         w = self.vertices[vertex]
         rate = self.rate(section, section.x + x_bar, u, w) - section.x_rate
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
@@ -210,7 +221,7 @@ class LSteps:
         """(L, N) at the program's points: what is nonnegative where inputs are in the mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         demand = section.u - x_bar @ section.K.T
-        _, mode = self.split(case)
+        *_, mode = self.split(case)
         rows = []
         for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
             above, below = demand[:, int(i)] - low, high - demand[:, int(i)]
@@ -253,7 +264,7 @@ class LSteps:
             g = self.values(section, rho, case)
             if len(self.limits):
                 q = self.in_mode(section, rho, case)
-                if not saturated and self.split(case)[1].any():
+                if not saturated and self.split(case)[-1].any():
                     continue
                 g = g - np.einsum("ln,na,lab,nb->n", q, y, d.tau, y)
             bounds.append(float(g @ d.y))

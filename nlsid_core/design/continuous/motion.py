@@ -1,4 +1,4 @@
-"""`plan_motion`: a motion between two states by direct collocation, for a funnel to be built around.
+"""`plan_motion`: a motion between two states by direct collocation.
 
 Hermite and Simpson's collocation, solved by convex programs within a trust region, then by
 least-norm Newton steps until the cubics obey the dynamics.
@@ -102,7 +102,7 @@ def plan_motion(
 
 @dataclass(eq=False)
 class _Mesh:
-    """Collocation on times t (K,): z (K, n + m) holds states and inputs, both ends' states fixed."""
+    """Collocation on times t (K,): z (K, n + m) holds x and u; x is fixed at both ends."""
 
     rates: VectorField | Rates
     t: FloatArray

@@ -7,13 +7,13 @@ for the kernel, which decides.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import groupby
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray, Json
-from nlsid_core.design.continuous.closed_loop import Pieces, batches, closed_loop_polynomial
+from nlsid_core.design.continuous.closed_loop import SHARED, Pieces, batches, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
 from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.design.continuous.lstep import LSteps, section_at
@@ -205,6 +205,11 @@ def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
     whole = np.array([(p.interval, p.level, p.index) for p in parts], dtype=np.int64).reshape(-1, 3)
     repeated = np.repeat(whole, steps.cases, axis=0)
     vertices, limited, n = len(steps.vertices), len(steps.limits), steps.program.n
+    corners = np.tile(np.repeat(steps.corners, vertices, axis=0), (len(steps.modes), 1))
+    push = np.zeros((count, steps.field.m))
+    if steps.widths is not None:
+        push = np.tile(corners, (len(parts), 1)) * steps.widths[repeated[:, 0]]
+    vertices *= len(steps.corners)
     return Pieces(
         basis,
         interval=repeated[:, 0],
@@ -216,6 +221,7 @@ def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
         gram=np.zeros((count, 2, len(basis), len(basis))),
         mode=np.tile(np.repeat(steps.modes, vertices, axis=0), (len(parts), 1)),
         tau=np.zeros((count, 2, limited, n + 1, n + 1)),
+        push=push,
         stated=np.empty(count, dtype=object),
         kappa=steps.kappa,
     )
@@ -317,7 +323,7 @@ def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Piece
 
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
-    keys = ("interval", "vertex", "level", "index", "T", "mu", "gram", "mode", "tau", "stated")
+    keys = [f.name for f in fields(Pieces) if f.name not in SHARED]
     whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
     return replace(parts[0], **whole)
 
@@ -345,10 +351,15 @@ def proof_of(
         "pieces": written,
     }
     if pieces.mode.shape[1]:
-        proof["sides"] = [[0] * n, *np.eye(n, dtype=int).tolist()]
+        proof["sides"] = affine(n).tolist()
     if pieces.kappa is not None:
         proof["kappa"] = pieces.kappa.tolist()
     return proof
+
+
+def affine(n: int) -> IntArray:
+    """(n + 1, n) the monomials 1, x0, x1, ..."""
+    return np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
 
 
 def unsolved(policy: ContinuousPolicy, parts: tuple[Part, ...]) -> str:

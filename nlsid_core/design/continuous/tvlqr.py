@@ -51,7 +51,8 @@ def tvlqr(
 ) -> Tracking:
     """The LQR around `nominal` by -Ṡ = A'S + SA - SBR⁻¹B'S + Q, S(t_f) = S_final, K = R⁻¹B'S.
 
-    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots.
+    Q, S_final: (n, n) ⪰ 0 and ≻ 0; R: (m, m) ≻ 0. gain: how K varies between knots;
+    "linear" is continuous.
 
     Raises DataError on indefinite weights, Infeasible if the linearisation cannot be controlled.
     """
@@ -80,7 +81,8 @@ def tvlqr(
     if gain == "constant":
         K = constant_on(nominal.t, after)
     elif gain == "linear":
-        K = PiecewisePolynomial(nominal.t, np.stack([after, before], axis=1))
+        inner = (before[:-1] + after[1:]) / 2  # the dynamics of two intervals may differ a little
+        K = linear_through(nominal.t, np.concatenate([after[:1], inner, before[-1:]]))
     else:
         K = _cubic_gain(field, nominal, S, R_inverse, rate)
     policy = ContinuousPolicy(nominal.x, nominal.u, K, files.digest(field.document()))
@@ -113,7 +115,8 @@ def integrate_nominal(
 ) -> Nominal:
     """The motion with input u(t) from `start` at t[0], or back from `final` at t[-1], as cubics.
 
-    field: or a function of some of t, x, u, named so. t: (K,) knots in s. Raises DataError unless one end is given and the knots increase.
+    field: or a function of some of t, x, u, named so. t: (K,) knots in s. Raises DataError unless
+    one end is given and the knots increase.
     """
     t = np.asarray(t, dtype=np.float64)
     if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():

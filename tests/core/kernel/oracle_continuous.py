@@ -59,8 +59,12 @@ def squares(basis: list[list[int]], columns: list[int], node: Document, s: Fract
 class Oracle:
     """c(s, x̄) of the pieces of one proof about three documents."""
 
-    def __init__(self, field: Document, policy: Document, funnel: Document, proof: Document):
+    def __init__(
+        self, field: Document, policy: Document, funnel: Document, proof: Document,
+        claim: Document | None = None,
+    ):  # fmt: skip
         self.field, self.policy, self.funnel, self.proof = field, policy, funnel, proof
+        self.claim = claim or {}
         self.n, self.m = field["states"], field["inputs"]
 
     def vertex(self, number: int) -> list[Fraction]:
@@ -68,7 +72,97 @@ class Oracle:
         box = numbers(self.field["uncertain"])
         if "kappa" in self.proof:
             return [(low + high) / 2 for low, high in box]
-        return [Fraction(e) for e in list(product(*box))[number]]
+        corners = list(product(*box))
+        return [Fraction(e) for e in corners[number % len(corners)]]
+
+    def sides(self) -> list[tuple[int, ...]]:
+        """The signs of the corners of what the input is off by."""
+        moved = "hold" in self.claim or any(self.claim.get("error", []))
+        return list(product((-1, 1), repeat=self.m)) if moved else [()]
+
+    def push(self, k: int, number: int, vertices: int) -> list[Fraction]:
+        """What the input is off by at a vertex, `vertices` of them to each corner."""
+        side = self.sides()[number // vertices]
+        return [e * self.width(k, i) for i, e in enumerate(side)] or [Fraction(0)] * self.m
+
+    def width(self, k: int, i: int) -> Fraction:
+        """W_ki: hold times the largest rate, and the largest |Ke|, over what was before."""
+        hold = Fraction(self.claim.get("hold", 0))
+        times = [Fraction(t) for t in self.funnel["t"]]
+        seen = [j for j in range(k + 1) if j == k or times[j + 1] > times[k] - hold]
+        rates = self.proof.get("rates")
+        fastest = max(Fraction(rates[j][i]) for j in seen) if rates else Fraction(0)
+        errors = numbers(self.claim.get("error", [0] * self.n))
+        shaken = max(
+            sum((abs(g) * e for g, e in zip(gain[i], errors, strict=True)), Fraction(0))
+            for j in seen
+            for gain in numbers(self.policy["K"][j])
+        )
+        total: Fraction = hold * fastest + shaken
+        return total
+
+    def pushing(self) -> list[int]:
+        """The entries of w that are alone in every monomial that they are in."""
+        rows = [r for span in self.field["pieces"] for e in span for r in e["exponents"]]
+        first = 1 + self.n + self.m
+        return [j for j in range(len(self.field["uncertain"]))
+                if all(sum(row) == 1 for row in rows if row[first + j])]  # fmt: skip
+
+    def rate_corners(self) -> list[tuple[Fraction, ...]]:
+        """w at the vertices of rates: what pushes only is in the middle."""
+        box, pushing = numbers(self.field["uncertain"]), self.pushing()
+        return list(
+            product(*(((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(box)))
+        )
+
+    def rate_vertices(self) -> int:
+        """How many vertices a rate is proved at."""
+        return len(self.rate_corners()) * len(self.sides())
+
+    def rate_left(self, piece: Document, sigma: Fraction, e: list[Fraction]) -> Fraction:
+        """h R ∓ dũ_i/ds - τ_0 (ρ - W) - Σ τ_l q_l, with what w pushes taken off R."""
+        k, n, i = piece["interval"], self.n, piece["input"]
+        s = (piece["index"] + sigma) / Fraction(2) ** piece["level"]
+        t0, t1 = (Fraction(self.funnel["t"][j]) for j in (k, k + 1))
+        h, corners = t1 - t0, self.rate_corners()
+        x0, u0, K = (numbers(part[k]) for part in (self.funnel["x"], self.policy["u"],
+                                                   self.policy["K"]))  # fmt: skip
+        nominal = [bernstein([p[j] for p in x0], s) for j in range(n)]
+        motion = [slope([p[j] for p in x0], s) for j in range(n)]
+        wanted = [
+            bernstein([p[j] for p in u0], s)
+            - dot([bernstein([gain[j][a] for gain in K], s) for a in range(n)], e)
+            for j in range(self.m)
+        ]
+        applied, taken = list(wanted), []
+        for place, (number, low, high) in enumerate(numbers(self.policy["limits"])):
+            j, mode = int(number), piece["mode"][place]
+            applied[j] = wanted[j] if mode == 0 else low if mode < 0 else high
+            taken.append((high - wanted[j]) * (wanted[j] - low) if mode == 0
+                         else low - wanted[j] if mode < 0 else wanted[j] - high)  # fmt: skip
+        applied = add(applied, self.push(k, piece["vertex"], len(corners)))
+        w = list(corners[piece["vertex"] % len(corners)])
+        f = self.rate(k, (1 - s) * t0 + s * t1, add(nominal, e), applied, w)
+        gains = [bernstein([gain[i][a] for gain in K], s) for a in range(n)]
+        turning = [slope([gain[i][a] for gain in K], s) for a in range(n)]
+        away = [h * a - b for a, b in zip(f, motion, strict=True)]
+        change = slope([p[i] for p in u0], s) - dot(turning, e) - dot(gains, away)
+        room = Fraction(self.proof["rates"][k][i])
+        for j in self.pushing():
+            low, high = numbers(self.field["uncertain"][j])
+            unit = [Fraction(int(a == j)) for a in range(len(w))]
+            still = self.rate(k, t0, nominal, wanted, [Fraction(0)] * len(w))
+            g = [a - b for a, b in zip(self.rate(k, t0, nominal, wanted, unit), still, strict=True)]
+            room -= (high - low) / 2 * max(abs(dot(gain[i], g)) for gain in K)
+        P0, P1 = (numbers(self.funnel["P"][j]) for j in (k, k + 1))
+        Pe = [dot([(1 - s) * a + s * b for a, b in zip(*rows, strict=True)], e)
+              for rows in zip(P0, P1, strict=True)]  # fmt: skip
+        rho0, rho1 = (Fraction(self.funnel["rho"][j]) for j in (k, k + 1))
+        left: Fraction = h * room - piece["sign"] * change
+        for q, tau in zip([(1 - s) * rho0 + s * rho1 - dot(e, Pe), *taken], piece["tau"],
+                          strict=True):  # fmt: skip
+            left -= q * squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
+        return left
 
     def span(self, k: int) -> int:
         """Which equations interval k obeys."""
@@ -116,6 +210,8 @@ class Oracle:
             tau = piece["tau"][place]
             held += q * squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
         w = self.vertex(piece["vertex"])
+        count = 1 if "kappa" in self.proof else 2 ** len(w)
+        u = add(u, self.push(k, piece["vertex"], count))
         f = self.rate(k, (1 - s) * t0 + s * t1, add(nominal, e), u, w)
         Pe = [dot(row, e) for row in P]
         W, W_bend = dot(e, Pe), dot(e, [dot(row, e) for row in bend])

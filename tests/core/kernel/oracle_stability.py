@@ -295,9 +295,8 @@ def is_proved(model: Json, claim: Json, proof: Json) -> bool:
                 for part, half in zip(tree["parts"], halves, strict=True)
             )
         N = [[exact(entry) for entry in row] for row in tree["N"]]
-        if model["kind"] == "monotone_equation" and (
-            N[0][0] < 0 or any(row[0] != 0 for row in N[1:])
-        ):
+        has_ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
+        if has_ray and (N[0][0] < 0 or any(row[0] != 0 for row in N[1:])):
             return False
         found = between(model, box, tree["ends"]) if "ends" in tree else vertices(model, box)
         return found is not None and all(is_definite(gap(F, m, P, rate, N, E)) for E in found)

@@ -146,7 +146,8 @@ def form(model: Json, given: Json | None) -> tuple[Rows, int, Box, bool, Any]:
         def hull(part: Box, ends: Json | None) -> list[Rows] | None:
             return vertices(model, part) if ends is None else between(model, part, ends)
 
-        return F, m, box, model["kind"] == "monotone_equation", hull
+        ray = model["kind"] == "monotone_equation" and exact(model["e"][2]) > 0
+        return F, m, box, ray, hull
     implicit = Implicit(model)
     found = implicit.everywhere()
     if found is not None:
@@ -225,10 +226,63 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any) -
     return proved(tree, box)
 
 
+def follows(level: Json, model: Json, rows: int) -> bool:
+    """Whether a level by commands is one: its terms make sense and no weight is negative."""
+    inputs = 1 if isinstance(model["u"], dict) else len(model["u"])
+    if set(level) != {"terms", "weights"} or not 1 <= len(level["terms"]) <= 200:
+        return False
+    for term in level["terms"]:
+        if set(term) != {"inputs", "of", "centre", "scale", "fading"}:
+            return False
+        factors = term["inputs"]
+        if len(factors) > 4 or any(type(i) is not int or not 0 <= i < inputs for i in factors):
+            return False
+        if term["of"] not in ("value", "change") or exact(term["scale"]) <= 0:
+            return False
+        exact(term["centre"])
+        if not 0 <= exact(term["fading"]) < 1:
+            return False
+    weights = matrix(level["weights"], rows, len(level["terms"]))
+    return all(min(row) >= 0 and sum(row) > 0 for row in weights)
+
+
+def disjoint(given: Json) -> bool:
+    """Whether something was measured, and on other samples than what chose it."""
+    before, on = (
+        [oracle_driven_tube.span(t["digest"]) for t in given[k]]
+        for k in ("designed_on", "measured_on")
+    )
+    return bool(on) and not any(oracle_driven_tube.overlap(a, b) for a, b in product(before, on))
+
+
+def beside(model: Json, funnel: Json, p: int) -> bool:
+    """What is assumed of the output error, and the alarm, if there are any."""
+    if "response" in funnel:
+        response = funnel["response"]
+        widths, given = [exact(w) for w in response["half_widths"]], response["assumption"]
+        measured, factor = exact(given["measured"]), exact(given["safety_factor"])
+        if len(widths) != p or min(widths) <= 0 or measured < 0 or factor < 1:
+            return False
+        if factor * measured > 1 or not disjoint(given):
+            return False
+        if "follows" in response and not follows(response["follows"], model, p):
+            return False
+    if "cusum" in funnel:
+        cusum = funnel["cusum"]
+        sizes = [exact(d) for d in cusum["deviation"]]
+        if len(sizes) != p or min(*sizes, exact(cusum["threshold"])) <= 0:
+            return False
+        if exact(cusum["drift"]) < 0:
+            return False
+    return True
+
+
 def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
     """Whether every obligation holds, for the funnel's and the proof's content."""
     F, m, box, ray, hull = form(model, funnel.get("box"))
     H = outputs(model, m, len(F))
+    if not beside(model, funnel, len(H)):
+        return False
     trees = proof.get("multipliers", [None] * len(funnel["tubes"]))
     if not 1 <= len(trees) == len(funnel["tubes"]) <= 8 or ("multipliers" in proof) != (m > 0):
         return False
@@ -240,11 +294,11 @@ def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
             return False
         if inlet < 0 or measured < 0 or factor < 1 or level < factor**2 * measured:
             return False
-        before, on = (
-            [oracle_driven_tube.span(t["digest"]) for t in given[k]]
-            for k in ("designed_on", "measured_on")
-        )
-        if not on or any(oracle_driven_tube.overlap(a, b) for a, b in product(before, on)):
+        if "follows" in tube and not (
+            given["kind"] == "fading" and inlet == 0 and follows(tube["follows"], model, 1)
+        ):
+            return False
+        if not disjoint(given):
             return False
         if not holds(F, H, m, tube, tree, (box, ray, hull)):
             return False

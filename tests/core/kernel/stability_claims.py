@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -96,6 +97,11 @@ def monotone() -> MonotoneEquation:
     )  # fmt: skip
 
 
+def straight() -> MonotoneEquation:
+    """A linear e: lightly damped, which no multiplier of a ray proves."""
+    return replace(monotone(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]))
+
+
 MODELS: dict[str, Callable[[], Any]] = {
     "linear": linear,
     "quadratic": quadratic,
@@ -106,6 +112,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "split": split,
     "cascade": two_phases,
     "monotone": monotone,
+    "straight": straight,
 }
 
 

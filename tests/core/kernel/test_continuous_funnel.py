@@ -101,19 +101,58 @@ def random_claim(rng: np.random.Generator) -> Files:
         proof["sides"] = first
     if pushed:
         proof["kappa"] = rng.uniform(0.5, 2, (intervals, n_w)).tolist()
-    modes = product((-1, 0, 1), repeat=limited)
-    vertices = 1 if pushed else 2**n_w
+    modes = list(product((-1, 0, 1), repeat=limited))
+    claimed = random_hold(rng, files=(field, policy), proof=proof)
+    held = 2**m if claimed else 1
+    vertices = held if pushed else held * 2**n_w
     for k, mode, vertex in product(range(intervals), modes, range(vertices)):
         level = int(rng.integers(0, 2))
         for index in range(2**level):
             proof["pieces"].append(random_piece(rng, proof, k, vertex, level, index, mode))
+    if "hold" in claimed:
+        proof["rates"] = rng.uniform(0.5, 2, (intervals, m)).tolist()
+        proof["rate_pieces"] = []
+        counts = Oracle(field, policy, funnel, proof, claimed).rate_vertices()
+        for k, mode, v, i, sign in product(range(intervals), modes, range(counts), range(m),
+                                           (-1, 1)):  # fmt: skip
+            if i >= limited or not mode[i]:
+                piece = random_piece(rng, proof, k, v, 0, 0, (0, *mode))
+                del piece["mu"]
+                piece |= {"input": i, "sign": sign, "mode": list(mode)}
+                if not mode:
+                    del piece["mode"]
+                proof["rate_pieces"].append(piece)
     about = {role: {"file": f"{role}.json", "digest": ""}
              for role in ("vector_field", "policy", "funnel")}  # fmt: skip
-    claim = {"kind": "continuous_funnel", "about": about}
+    claim = {"kind": "continuous_funnel", "about": about, **claimed}
     files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
              PROOF: proofs.proof_document(claim, proof)}  # fmt: skip
     bind(files)
     return files
+
+
+def random_hold(rng: np.random.Generator, *, files: tuple[Any, Any], proof: Any) -> Any:
+    """A hold, a measurement error, both or none; then f is affine in u, and u and K continuous."""
+    (field, policy), claimed = files, {}
+    if files[0]["inputs"] and rng.uniform() < 0.5:
+        claimed["hold"] = float(rng.uniform(0.01, 2))
+        for name in ("u", "K"):
+            for before, after in pairwise(policy[name]):
+                after[0] = before[-1]
+        proof["sides"] = proof["basis"]
+    if rng.uniform() < 0.5:
+        claimed["error"] = rng.uniform(0, 1, field["states"]).tolist()
+    if claimed:
+        n, m = field["states"], field["inputs"]
+        for equation in (e for span in field["pieces"] for e in span):
+            rows = {}
+            for row, c in zip(equation["exponents"], equation["coefficients"], strict=True):
+                single = [*row[: 1 + n], *(min(e, 1) for e in row[1 + n : 1 + n + m]),
+                          *row[1 + n + m :]]  # fmt: skip
+                rows[tuple(single)] = c
+            equation["exponents"] = [list(row) for row in sorted(rows)]
+            equation["coefficients"] = [rows[row] for row in sorted(rows)]
+    return claimed
 
 
 def random_piece(
@@ -168,14 +207,15 @@ def test_the_kernel_rebuilds_exactly_what_the_page_says(
     monkeypatch.setattr(continuous_funnel, "positive", record)
     verdict = proofs.decide(files[PROOF], files)
     proof = files[PROOF]["proof"]
-    oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], proof)
+    oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], proof, files[PROOF]["claim"])
     assert verdict.margin == Fraction(proof["margin"])
-    assert len(seen) == len(proof["pieces"])
-    for (c, ring), piece in zip(seen, proof["pieces"], strict=True):
+    pieces = [(oracle.c, piece) for piece in proof["pieces"]]
+    pieces += [(oracle.rate_left, piece) for piece in proof.get("rate_pieces", [])]
+    for (c, ring), (claimed, piece) in zip(seen, pieces, strict=True):
         for _ in range(2):
             s = Fraction(int(rng.integers(0, 100)), 99)
             x = [fraction(rng) for _ in range(oracle.n)]
-            assert value(c, ring, s, x) == oracle.c(piece, s, x)
+            assert value(c, ring, s, x) == claimed(piece, s, x)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 5])
@@ -284,8 +324,8 @@ def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_pa
         f"{count} pieces of time decided, on its boundary V falls by at least the margin, in 1/s"
     )
     assert verdict.assumptions == (
-        "the state obeys the stored equations and the stored policy is applied at every time, u0 "
-        "clipped to [-1.5, 2]",
+        "the state obeys the stored equations and the stored policy is applied continuously, "
+        "with no hold and no delay, u0 clipped to [-1.5, 2]",
         "at every time w0 in [-0.125, 0.25]",
         "the equations expand others, and that the ranges of w cover what they leave out is an "
         "assumption of the vector field, computed by: by hand",

@@ -48,6 +48,30 @@ def test_the_sentences_are_those_of_the_page() -> None:
     assert "(2) innovation energy: sum of e^2 <= " in said[3]
 
 
+def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
+    model, funnel, proof = claim("following")
+    terms = [
+        {"inputs": [], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.0},
+        {"inputs": [0], "of": "value", "centre": 0.5, "scale": 2.0, "fading": 0.0},
+        {"inputs": [0], "of": "change", "centre": 0.0, "scale": 1.5, "fading": 0.9},
+    ]
+    tubes(funnel)["follows"] = {"terms": terms, "weights": [[0.25, 3.0, 7.5]]}
+    funnel["response"]["follows"] = {"terms": terms, "weights": [[1.0, 0.0, 2.0]]}
+    u = model["u"]
+    said = str(decide(model, funnel, proof)).splitlines()
+    name = u["name"] if u["name"].isidentifier() else f'"{u["name"]}"'
+    unit = f" {u['unit']}".rstrip()
+    assert " sqrt(g) for ever" in said[0]
+    assert " g after every sample, E+ = " in said[2]
+    assert (
+        f", g = 0.25 + 3 (({name} - 0.5{unit}) / 2{unit})^2 + 7.5 sum 0.9^i "
+        f"(change of {name} / 1.5{unit})^2 (largest of 5 distinct trials" in said[2]
+    )
+    assert said[3].startswith("  assuming output error: |speed - simulated| / (")
+    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 sum 0.9^i (change of {name}" in said[3]
+    assert "probability at most 1/6)" in said[3]
+
+
 def test_trials_that_the_model_was_fitted_on_and_windows_are_said() -> None:
     model, funnel, proof = claim("linear")
     trials = [tube["assumption"]["measured_on"] for tube in funnel["tubes"]]
@@ -125,6 +149,53 @@ def test_tau_is_proved_up_to_the_oracles_limit_and_refused_a_tenth_of_a_percent_
     decide(model, funnel, proof)
     tubes(funnel)["tau"][0] = false
     with pytest.raises(CertificateRejected, match=r"the bound on .* by V"):
+        decide(model, funnel, proof)
+
+
+def term(funnel: Json, i: int = 0) -> Json:
+    return tubes(funnel)["follows"]["terms"][i]  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda f: tubes(f)["follows"]["weights"][0].__setitem__(0, -1e-9), "0 or more"),
+        (lambda f: tubes(f)["follows"].update(weights=[[0.0] * len(tubes(f)["follows"]["terms"])]),
+         "some of each row positive"),
+        (lambda f: tubes(f)["follows"].update(weights=[]), "should have shape"),
+        (lambda f: tubes(f)["follows"].update(terms=[]), "list of 1 to 200"),
+        (lambda f: term(f).update(fading=1.0), "fading in"),
+        (lambda f: term(f).update(fading=-0.1), "fading in"),
+        (lambda f: term(f).update(scale=0.0), "scale should be positive"),
+        (lambda f: term(f).update(inputs=[1]), "among the model's 1"),
+        (lambda f: term(f).update(inputs=[-1]), "among the model's 1"),
+        (lambda f: term(f).update(of="square"), "value or change"),
+        (lambda f: term(f).update(future=1), "unknown member 'future'"),
+        (lambda f: tubes(f).update(inlet=1e-12), "without an inlet"),
+        (lambda f: scaled(tubes(f), "level", 0.999), "below safety_factor"),
+        (lambda f: scaled(f["response"]["assumption"], "measured", 1.01), "below safety_factor"),
+        (lambda f: f["response"]["assumption"].update(safety_factor=0.9), "1 or more"),
+        (lambda f: f["response"]["assumption"].update(measured_on=[]), "on no trial"),
+        (lambda f: f["response"]["assumption"].update(
+            measured_on=f["response"]["assumption"]["designed_on"]), "cannot measure it"),
+        (lambda f: f["response"].update(half_widths=[0.0]), "half-widths should be positive"),
+        (lambda f: f["cusum"].update(deviation=[0.0]), "should be positive"),
+        (lambda f: f["cusum"].update(drift=-1.0), "drift 0 or more"),
+        (lambda f: f["cusum"].update(deviation=[1.0, 1.0]), "should have shape"),
+    ],
+)  # fmt: skip
+def test_a_level_by_commands_that_makes_no_sense_is_refused(
+    change: Callable[[Json], Any], reason: str
+) -> None:
+    model, funnel, proof = claim("following")
+    change(funnel)
+    assert not oracle.agrees(
+        proofs.proof_document(
+            {"kind": "tube", "about": {"model": proofs.binding(MODEL, model),
+                                       "funnel": proofs.binding(FUNNEL, funnel)}}, proof),
+        {MODEL: model, FUNNEL: funnel},
+    )  # fmt: skip
+    with pytest.raises(CertificateRejected, match=reason):
         decide(model, funnel, proof)
 
 

@@ -13,6 +13,8 @@ from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign
+from nlsid_core.design.levels import LevelKind
+from nlsid_core.funnels.level import LevelMeter
 from nlsid_core.models import ImplicitModel, Signal
 from nlsid_core.running.stepping import Stepper
 from tests import implicit_models
@@ -35,6 +37,8 @@ MODELS: dict[str, Callable[[], Any]] = {
         implicit_models.linear(np.array([[0.6, 0.3], [-0.2, 0.5]])), (0, 1)
     ),
     "implicit_box": lambda: recorded(implicit_models.cubic_spring(), (0, 0)),
+    "following": stability_claims.MODELS["linear"],
+    "two_following": stability_claims.MODELS["two_outputs"],
 }  # fmt: skip
 LOW, HIGH = -0.5, 0.9  # of the inputs: inside every model's range
 
@@ -60,11 +64,14 @@ def dataset(model: Any, seed: int, count: int = 5, samples: int = 120) -> Datase
 
 @cache
 def design(name: str) -> OutputTubeDesign:
-    """A fading tube, and one of energy beside it for the linear model."""
+    """A fading tube, and one of energy beside it for two models; levels by commands for two."""
     model = MODELS[name]()
     box = ((-1.5, 1.5), (-1.0, 1.5)) if name == "implicit_box" else None
     horizon = 40 * model.period if name in ("linear", "two_outputs") else None
-    problem = OutputTube(model, dataset(model, 0), dataset(model, 100), horizon=horizon, box=box)
+    level: LevelKind = "commands" if "following" in name else "constant"
+    problem = OutputTube(
+        model, dataset(model, 0), dataset(model, 100), horizon=horizon, box=box, level=level
+    )
     return designing.design(problem)
 
 
@@ -89,7 +96,8 @@ def decide(model: Json, funnel: Json, proof: Json) -> proofs.Verdict:
 
 
 def attacks(design: OutputTubeDesign, i: int, kind: str, samples: int, seed: int) -> FloatArray:
-    """|o_j| over the width that level and tau give, (samples, p), with tube i's E at its level.
+    """|o_j| over the width that level and tau give, (samples, p), with tube i's E at its level;
+    0 where E is above a level that fell.
 
     The robot is what the innovations make of the observer. kind: `random` directions and sizes;
     `sign`, innovations that push the output error on where it is; `held`, one direction with which
@@ -100,8 +108,9 @@ def attacks(design: OutputTubeDesign, i: int, kind: str, samples: int, seed: int
     lags = design.funnel.settling
     u = np.zeros((lags, n_u))
     x = np.tile(stepper.begin(np.zeros((lags, p)), u), (2, 1))
-    spent, widths = 0.0, np.sqrt(tube.level / tube.tau)
-    o = np.zeros((samples, p))
+    spent = 0.0
+    used = np.zeros((samples, p))
+    meter = None if tube.follows is None else LevelMeter(tube.follows)
     now, held = u[0], rng.normal(size=p)
     for k in range(samples):
         if rng.random() < 0.2:
@@ -114,12 +123,14 @@ def attacks(design: OutputTubeDesign, i: int, kind: str, samples: int, seed: int
             "sign": np.sign(y[0] - y[1] + 1e-12 * rng.normal(size=p)) * rng.random(p),
             "held": held,
         }[kind]
-        left = max(tube.level - tube.rho * spent, 0.0)
+        level = tube.level * (1.0 if meter is None else meter.update(now.tolist())[0])
+        left = max(level - tube.rho * spent, 0.0)
         part = 1.0 if kind == "held" or rng.random() < 0.3 else rng.random()
         e = e * np.sqrt(part * left / (e @ tube.R @ e))
         spent = tube.rho * spent + float(e @ tube.R @ e)
-        o[k] = y[0] + e - y[1]
+        if spent <= level * (1.0 + 1e-12):  # a level that falls is not kept at once
+            used[k] = np.abs(y[0] + e - y[1]) / np.sqrt(level / tube.tau)
         x[0] = x[0] + tube.L @ e
         if tube.samples is not None and k % tube.samples == tube.samples - 1:
             x[0], spent = x[1], 0.0  # the energy is over: another run
-    return np.asarray(np.abs(o) / widths)
+    return used

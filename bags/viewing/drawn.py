@@ -1,0 +1,39 @@
+"""What of a design is drawn beside the signals: their names, and how wide the tube is."""
+
+import numpy as np
+
+from bags.designs.design import AnyDesign
+from nlsid_core.dynamics import VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.running.reading import Reading
+
+
+def signal_names(design: AnyDesign) -> tuple[str, ...]:
+    """Of the measured signals, with their units."""
+    if isinstance(design.model, VectorField):
+        return tuple(f"x{i}" for i in range(design.model.n))
+    return tuple(f"{s.name} [{s.unit}]" if s.unit else s.name for s in design.signals[0])
+
+
+class HalfWidths:
+    """The most that each measured signal can be off the nominal, in its unit."""
+
+    def __init__(self, design: AnyDesign) -> None:
+        self._period, funnel = design.period, design.funnel
+        if isinstance(funnel, ContinuousFunnel):
+            steps = np.arange(round((funnel.tf - funnel.t0) / self._period) + 1) * self._period
+            rows = [funnel.widths(t) for t in np.minimum(funnel.t0 + steps, funnel.tf)]
+        elif isinstance(funnel, SampledFunnel):
+            rows = list(funnel.half_widths)
+        else:
+            rows = [funnel.half_widths]
+        self._rows = [tuple(map(float, row)) for row in rows]
+
+    def of(self, reading: Reading) -> dict[str, float]:
+        """By name, at a reading; of several signals with their index."""
+        place = min(max(round(reading.t / self._period), 0), len(self._rows) - 1)
+        row = tuple(reading.half_widths) or self._rows[place]
+        if len(row) == 1:
+            return {"half_width": row[0]}
+        return {f"half_width[{i}]": width for i, width in enumerate(row)}

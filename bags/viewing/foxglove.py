@@ -1,0 +1,127 @@
+"""The same for Foxglove: its websocket protocol, by foxglove-sdk (extra `view`).
+
+Topics: /nlsid/margin, /nlsid/signals, /nlsid/status (JSON) and /nlsid/events (foxglove.Log), logged
+at the judged samples' stamps. config/foxglove_layout.json shows them.
+"""
+
+import importlib.util
+import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+from bags.viewing.scene import ERROR, MONITORING, OK, STALE, WARN, Event, Sample, Scene
+from nlsid_core.errors import DataError
+
+TICK: Final = 0.05  # s between looks at the scene
+REPEAT: Final = 10  # ticks: the status is said twice a second while it stays the same
+MARGIN, SIGNALS, STATUS, EVENTS = (
+    f"/nlsid/{name}" for name in ("margin", "signals", "status", "events")
+)
+_NUMBER = {"type": "number"}
+_TEXT = {"type": "string"}
+SCHEMAS: Final[dict[str, dict[str, Any]]] = {
+    MARGIN: dict.fromkeys(MONITORING, _NUMBER),
+    SIGNALS: {
+        "signals": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {"name": _TEXT}
+                | dict.fromkeys(("nominal", "lower", "upper", "measured"), _NUMBER),
+            },
+        }
+    },
+    STATUS: {"word": _TEXT, "level": {"type": "integer"}, "text": _TEXT, "source": _TEXT},
+}
+
+
+@contextmanager
+def serve_foxglove(scene: Scene, *, host: str, port: int) -> Iterator[str]:
+    """Serve until the block ends; gives the address. port 0: a free one.
+
+    DataError if foxglove-sdk is not installed; RuntimeError if the port is taken.
+    """
+    if importlib.util.find_spec("foxglove") is None:
+        raise DataError("foxglove-sdk is not installed: pip install 'nlsid[view]', or use --page")
+    import foxglove
+
+    context = foxglove.Context()
+    server = foxglove.start_server(name="nlsid view", host=host, port=port, context=context)
+    closing = threading.Event()
+    thread = threading.Thread(target=_send, args=(scene, context, closing))
+    thread.start()
+    try:
+        yield f"ws://{host}:{server.port}"
+    finally:
+        closing.set()
+        thread.join()
+        server.stop()
+
+
+def _send(scene: Scene, context: Any, closing: threading.Event) -> None:
+    import foxglove
+    from foxglove.channels import LogChannel
+
+    channels = {
+        topic: foxglove.Channel(
+            topic, schema={"type": "object", "properties": properties}, context=context
+        )
+        for topic, properties in SCHEMAS.items()
+    }
+    log = LogChannel(EVENTS, context=context)
+    sampled = told = tick = 0
+    newest_ns, before = 0, None
+    while not closing.wait(TICK):
+        sampled, samples = scene.samples_after(sampled, 10**9)
+        told, events = scene.events_after(told)
+        for sample in samples:
+            newest_ns = max(newest_ns, sample.stamp_ns)
+            channels[MARGIN].log(_margin(sample), log_time=sample.stamp_ns)
+            channels[SIGNALS].log(_signals(sample, scene.names), log_time=sample.stamp_ns)
+        for event in events:
+            newest_ns = max(newest_ns, event.stamp_ns)
+            log.log(_log(event), log_time=event.stamp_ns)
+        said, tick = scene.verdict(), tick + 1
+        if said != before or tick % REPEAT == 0:
+            before = said
+            status = {"word": said.word, "level": said.level, "text": said.text}
+            channels[STATUS].log(status | {"source": scene.source}, log_time=newest_ns or None)
+
+
+def _margin(sample: Sample) -> dict[str, float]:
+    """What is not finite is left out: JSON has no word for it."""
+    return {n: v for n in MONITORING if math.isfinite(v := sample.numbers.get(n, math.nan))}
+
+
+def _signals(sample: Sample, names: tuple[str, ...]) -> dict[str, Any]:
+    entries = []
+    for i in range(sample.signals):
+        nominal, width = sample.signal("nominal", i), sample.signal("half_width", i)
+        numbers = {
+            "nominal": nominal,
+            "lower": nominal - width,
+            "upper": nominal + width,
+            "measured": sample.signal("measured", i),
+        }
+        known: dict[str, Any] = {n: v for n, v in numbers.items() if math.isfinite(v)}
+        entries.append({"name": names[i] if i < len(names) else f"signal {i + 1}"} | known)
+    return {"signals": entries}
+
+
+def _log(event: Event) -> Any:
+    from foxglove.messages import Log, LogLevel, Timestamp
+
+    levels = {
+        OK: LogLevel.Info,
+        WARN: LogLevel.Warning,
+        ERROR: LogLevel.Error,
+        STALE: LogLevel.Warning,
+    }
+    return Log(
+        timestamp=Timestamp(sec=event.stamp_ns // 10**9, nsec=event.stamp_ns % 10**9),
+        level=levels.get(event.level, LogLevel.Warning),
+        message=event.text,
+        name=event.node,
+    )

@@ -1,0 +1,51 @@
+"""A recording shown as a live robot is: the readings of `nlsid monitor`, at their stamps' pace."""
+
+import threading
+from pathlib import Path
+
+from bags.designs.design import AnyDesign
+from bags.designs.documents import Proved
+from bags.monitoring.replay import replay_bag, replay_messages
+from bags.monitoring.watch import Stamped
+from bags.viewing.drawn import HalfWidths, signal_names
+from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
+from nlsid_core.running.alarm import State
+from nlsid_core.running.comparison import Centre
+
+MONITOR = "replay"
+LEVELS = {
+    State.INSIDE: OK,
+    State.WARNING: WARN,
+    State.UNKNOWN: STALE,
+    State.ASSUMPTION_VIOLATED: ERROR,
+    State.OUTSIDE: ERROR,
+}
+
+
+class Recording:
+    """A bag's readings and what is drawn beside them; raises BagError as `replay_messages`."""
+
+    def __init__(self, proved: Proved[AnyDesign], bag: Path, *, centre: Centre) -> None:
+        design = proved.design
+        self.name = bag.name
+        self._stamped = replay_messages(design, bag, centre=centre)
+        summary = replay_bag(proved, bag, centre=centre)
+        self._verdict = " ".join(filter(None, [f"verdict: {summary.verdict}.", summary.reason]))
+        self._widths, self._names = HalfWidths(design), signal_names(design)
+
+    def play(self, scene: Scene, rate: float, closing: threading.Event) -> None:
+        """Feed `scene` until the end, or until `closing` is set; rate 1: as recorded."""
+        first_ns, waited = self._stamped[0].stamp_ns, 0.0
+        for entry in self._stamped:
+            due = (entry.stamp_ns - first_ns) / 1e9 / rate
+            if due > waited and closing.wait(due - waited):
+                return
+            waited = max(waited, due)
+            self._show(scene, entry)
+        scene.end(self._verdict)
+
+    def _show(self, scene: Scene, entry: Stamped) -> None:
+        stamp_ns, reading, state = entry
+        text = state.value + (f": {reading.reason}" if reading.reason else "")
+        scene.say(stamp_ns, MONITOR, LEVELS[state], text, names=self._names)
+        scene.sample(stamp_ns, {**reading.numbers, **self._widths.of(reading)})

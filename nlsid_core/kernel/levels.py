@@ -1,0 +1,92 @@
+"""A level that follows the commands: g_r(k) = Σ_i w_ri G_i(k), read and put into words.
+
+    G(k) = fading G(k-1) + v(k)²,   G = 0 before the run
+v = (s - centre)/scale, or the change of s since the last sample over scale, s a product of inputs.
+Whatever g is, a bound E <= level g(k) at every sample is the tube theorem's; that g >= 0 and that
+it is known from the commands up to k is all that is needed. Source: docs/certificate_tube.md.
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+from . import text
+from .exact import Matrix
+from .files import Node, Rejected
+from .increments import Signal
+
+MAX_TERMS = 200
+MAX_FACTORS = 4
+
+
+@dataclass(frozen=True)
+class Term:
+    """One G; change: of s since the last sample, else s - centre."""
+
+    inputs: tuple[int, ...]
+    change: bool
+    centre: Fraction
+    scale: Fraction
+    fading: Fraction
+
+
+@dataclass(frozen=True)
+class CommandLevel:
+    """weights: (rows, len(terms)), not negative, some positive in every row."""
+
+    terms: list[Term]
+    weights: Matrix
+
+
+def read_level(node: Node, inputs: int, rows: int) -> CommandLevel:
+    """{terms, weights} for a model with so many inputs."""
+    parts = node.members("terms weights")
+    terms = [_term(entry, inputs) for entry in parts["terms"].items(1, MAX_TERMS)]
+    weights = parts["weights"].array(rows, len(terms))
+    if min(min(row) for row in weights) < 0 or not min(sum(row) for row in weights):
+        raise Rejected(f"{node.where}: weights should be 0 or more, some of each row positive")
+    return CommandLevel(terms, weights)
+
+
+def _term(node: Node, inputs: int) -> Term:
+    parts = node.members("inputs of centre scale fading")
+    factors = parts["inputs"].integers(0, MAX_FACTORS)
+    if any(not 0 <= i < inputs for i in factors):
+        raise Rejected(f"{node.where}: inputs should be among the model's {inputs}")
+    of = parts["of"].text()
+    if of not in ("value", "change"):
+        raise Rejected(f"{node.where}: of should be value or change, not {of!r}")
+    term = Term(
+        factors, of == "change", parts["centre"].number(), parts["scale"].number(),
+        parts["fading"].number(),
+    )  # fmt: skip
+    if not term.scale > 0 or not 0 <= term.fading < 1:
+        raise Rejected(f"{node.where}: scale should be positive, fading in [0, 1)")
+    return term
+
+
+def formula(level: CommandLevel, row: int, u: tuple[Signal, ...]) -> str:
+    """g as a sum, every number exact."""
+    summands = []
+    for weight, term in zip(level.weights[row], level.terms, strict=True):
+        if not weight:
+            continue
+        square = _square(term, u)
+        if term.fading:
+            square = f"sum {text.exact(term.fading)}^i {square or '1'}"
+        summands.append(f"{text.exact(weight)} {square}".rstrip())
+    return " + ".join(summands)
+
+
+def _square(term: Term, u: tuple[Signal, ...]) -> str:
+    """v² in words; empty where it is 1."""
+    if not term.inputs and not term.change and term.centre == 0 and term.scale == 1:
+        return ""
+    product = " x ".join(u[i].name for i in term.inputs) or "1"
+    unit = Signal("", " ".join(u[i].unit for i in term.inputs if u[i].unit))
+    if term.change:
+        of = f"change of {product}"
+    elif term.centre:
+        of = f"({product} - {unit.quantity(text.exact(term.centre))})"
+    else:
+        of = product
+    return f"({of} / {unit.quantity(text.exact(term.scale))})^2"

@@ -1,0 +1,431 @@
+"""What a person is shown: fresh words only, the worst samples, names as text, this machine only."""
+
+import http.client
+import json
+import math
+import shutil
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+from xml.etree import ElementTree
+
+import pytest
+
+from bags.chain.config import load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.designs import documents
+from bags.monitoring.replay import replay_messages
+from bags.samples import f1tenth
+from bags.viewing import foxglove, scene
+from bags.viewing.drawn import HalfWidths
+from bags.viewing.foxglove import serve_foxglove
+from bags.viewing.page import MOST_READERS, PAGE, serve_page
+from bags.viewing.replay import Recording
+from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
+from bags.viewing.serving import serve
+from nlsid_core.errors import DataError
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Status
+from tests.browser import CHROMIUM, MISSING, Page, browser
+from tests.websocket import WebSocket
+
+LOCAL = "127.0.0.1"
+GOOD = {"margin": 0.5, "assumption": 0.1, "nominal": 1.0, "measured": 1.1, "half_width": 0.4}
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
+
+
+@pytest.fixture(scope="module")
+def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("chain")
+    config = load_config(config_file("f1tenth.yaml"))
+    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    design_funnel_files(out / documents.MODEL, config, out)
+    return out / documents.FUNNEL
+
+
+@pytest.fixture
+def watched() -> Scene:
+    """A monitor that says inside, and a good sample."""
+    shown = Scene("a robot", "monitor")
+    shown.sample(10**9, GOOD)
+    shown.say(10**9, "monitor", OK, "inside", names=["speed [m/s]"])
+    return shown
+
+
+class Clock:
+    """`time.monotonic` of the scene, which a test may move on."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.ahead, self._real = 0.0, time.monotonic
+        patch.setattr("bags.viewing.scene.time.monotonic", lambda: self._real() + self.ahead)
+
+
+def test_inside_is_said_while_word_and_samples_are_fresh(watched: Scene) -> None:
+    assert watched.verdict() == scene.Verdict("inside", OK, "")
+
+
+def test_inside_ends_when_no_sample_comes_though_the_monitor_goes_on(
+    watched: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Clock(monkeypatch).ahead = scene.LATE + 0.1
+    watched.say(2 * 10**9, "monitor", OK, "inside")
+    said = watched.verdict()
+    assert (said.word, said.level) == ("late", STALE)
+    assert "no sample has come for 1.1 s" in said.text
+
+
+def test_inside_ends_when_the_monitor_is_silent_though_samples_come(
+    watched: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Clock(monkeypatch).ahead = scene.SILENT + 0.6
+    watched.sample(2 * 10**9, GOOD)
+    said = watched.verdict()
+    assert (said.word, said.level) == ("stale", STALE)
+    assert "has said nothing for 3 s" in said.text
+
+
+@pytest.mark.parametrize(
+    ("level", "text", "word", "shown"),
+    [
+        (WARN, "warning", "warning", WARN),
+        (ERROR, "outside: outside the tube", "outside", ERROR),
+        (ERROR, "assumption violated: energy", "assumption violated", ERROR),
+        (STALE, "unknown: no speed for 0.1 s", "unknown", STALE),
+        (STALE, "inside", "unknown", STALE),
+        (ERROR, "inside; design refused: forged", "error", ERROR),
+        (OK, "whatever", "unknown", OK),
+    ],
+)
+def test_only_the_monitors_own_word_at_its_own_level_counts(
+    watched: Scene, level: int, text: str, word: str, shown: int
+) -> None:
+    watched.say(2 * 10**9, "monitor", level, text)
+    said = watched.verdict()
+    assert (said.word, said.level) == (word, shown)
+
+
+@pytest.mark.parametrize("margin", [math.nan, -0.1, -math.inf])
+def test_inside_is_not_said_over_a_sample_that_is_not(watched: Scene, margin: float) -> None:
+    watched.sample(2 * 10**9, GOOD | {"margin": margin})
+    assert watched.verdict().word == "unknown"
+
+
+def test_another_node_cannot_speak_for_the_monitor() -> None:
+    shown = Scene("a robot", "monitor")
+    shown.sample(1, GOOD)
+    for name in ("other/monitor", "monitor2", *(f"node {i}" for i in range(100))):
+        shown.say(1, name, OK, "inside")
+    assert shown.verdict().word == "waiting"
+    assert len(shown.nodes()) <= scene.MOST_NODES
+    shown.say(1, "monitor", OK, "inside")
+    assert shown.verdict().word == "inside", "a crowd does not keep the monitor out"
+
+
+def test_of_too_many_samples_the_worst_are_kept() -> None:
+    shown = Scene("a robot", "monitor")
+    margins = [0.5] * 1000
+    margins[123], margins[456] = -0.2, math.nan
+    for k, margin in enumerate(margins):
+        shown.sample(k, {"margin": margin})
+    seen, kept = shown.samples_after(0, 10)
+    assert (seen, len(kept)) == (1000, 10)
+    assert kept[1].stamp_ns == 123
+    assert kept[4].stamp_ns == 456
+    assert shown.samples_after(seen, 10) == (1000, [])
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("speed\u202eknis\x00\x1b[31m", "speed knis [31m"),
+        ("a\n\tb", "a b"),
+        ("x" * 10_000, "x" * 299 + "…"),
+        ("<b>ü</b>", "<b>ü</b>"),
+    ],
+)
+def test_text_from_outside_is_printable_and_short(given: str, shown: str) -> None:
+    assert scene.clean(given) == shown
+
+
+def news(address: str) -> Iterator[dict[str, object]]:
+    """What the page's stream sends."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=30)
+    connection.request("GET", "/stream")
+    answer = connection.getresponse()
+    try:
+        while line := answer.readline():
+            if line.startswith(b"data: "):
+                yield json.loads(line[6:], parse_constant=lambda name: pytest.fail(name))
+    finally:
+        connection.close()
+
+
+def test_the_stream_begins_with_the_past_and_goes_on_with_what_is_new(watched: Scene) -> None:
+    watched.sample(2 * 10**9, GOOD | {"margin": math.nan, "time_to_exit": math.inf})
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        stream = news(address)
+        first = next(stream)
+        watched.sample(3 * 10**9, GOOD)
+        later = next(part for part in stream if part["samples"])
+        stream.close()  # type: ignore[attr-defined]
+    assert first["first"]
+    assert first["verdict"] == ["unknown", STALE, "the newest sample is not judged inside"]
+    samples = first["samples"]
+    assert isinstance(samples, list)
+    assert samples[0][2:] == [0.5, 0.1, None, None, [[1.0, 0.4, 1.1]]]
+    assert samples[1][2:5] == [None, 0.1, "inf"]
+    assert not later["first"]
+    assert [sample[0] for sample in later["samples"]] == [3.0]  # type: ignore[attr-defined]
+    assert later["verdict"] == ["inside", OK, ""]
+
+
+@pytest.mark.parametrize(
+    ("path", "host", "status"),
+    [
+        ("/", "localhost:80", 200),
+        ("/", "127.0.0.1", 200),
+        ("/", "evil.example", 403),
+        ("/stream", "evil.example:8080", 403),
+        ("/page.html", "localhost", 404),
+        ("/../scene.py", "localhost", 404),
+        ("//etc/passwd", "localhost", 404),
+    ],
+)
+def test_the_page_serves_two_paths_to_its_own_name(
+    watched: Scene, path: str, host: str, status: int
+) -> None:
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=30)
+        connection.request("GET", path, headers={"Host": host})
+        answer = connection.getresponse()
+        assert answer.status == status
+        assert answer.getheader("Access-Control-Allow-Origin") is None
+        if status == 200:
+            assert answer.read() == PAGE.read_bytes()
+            assert "default-src 'none'" in str(answer.getheader("Content-Security-Policy"))
+        connection.close()
+
+
+def test_readers_are_limited_and_one_that_leaves_makes_room(watched: Scene) -> None:
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        readers = [news(address) for _ in range(MOST_READERS)]
+        for reader in readers:
+            next(reader)
+        assert list(news(address)) == []
+        readers[0].close()  # type: ignore[attr-defined]
+        deadline = time.monotonic() + 30
+        while not list(zip(range(1), news(address), strict=False)):
+            assert time.monotonic() < deadline
+
+
+def test_a_port_that_is_taken_is_said(watched: Scene) -> None:
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        port = urlsplit(address).port
+        assert port is not None
+        said = f"cannot serve on {LOCAL}, port {port}"
+        with pytest.raises(DataError, match=said), serve(watched, page=True, host=LOCAL, port=port):
+            pass
+
+
+def test_the_page_loads_nothing_from_elsewhere() -> None:
+    text = PAGE.read_text()
+    assert "http://" not in text
+    assert "https://" not in text
+    assert "innerHTML" not in text
+    assert " src=" not in text
+    assert "href=" not in text
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    with browser(tmp_path / "profile") as opened:
+        yield opened
+    shutil.rmtree(tmp_path / "profile", ignore_errors=True)
+
+
+@needs_browser
+def test_a_browser_shows_the_words_and_takes_inside_back(page: Page, watched: Scene) -> None:
+    going = threading.Event()
+
+    def feed() -> None:
+        k = 1
+        while not going.wait(0.05):
+            k += 1
+            watched.sample(k * 50_000_000 + 10**9, GOOD)
+            watched.say(10**9, "monitor", OK, "inside")
+
+    feeder = threading.Thread(target=feed)
+    feeder.start()
+    word: Callable[[], str] = lambda: page.text("#word").lower()  # noqa: E731
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        page.open(address)
+        page.wait(lambda: word() == "inside")
+        assert page.text("#signals h2").startswith("speed [m/s]")
+        assert page.text("#n-spent") == "10 %"
+        drawn = "[...document.querySelectorAll('canvas')].map(c => c.width * c.height)"
+        assert all(page.value(drawn))
+        going.set()
+        feeder.join()
+        page.wait(lambda: word() == "late")
+        page.wait(lambda: word() == "stale")
+        assert page.text("#n-margin") == "unknown"
+    page.wait(lambda: word() == "no connection")
+    assert "what is shown is old" in page.text("#why")
+
+
+@needs_browser
+def test_a_browser_says_no_connection_when_the_stream_stands_still(
+    page: Page, watched: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server is there and the connection open; only nothing comes."""
+    monkeypatch.setattr(scene, "SILENT", 1e9)
+    monkeypatch.setattr(scene, "LATE", 1e9)
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        page.open(address)
+        page.wait(lambda: page.text("#word").lower() == "inside")
+        with watched._lock:  # whoever asks the scene waits
+            page.wait(lambda: page.text("#word").lower() == "no connection")
+        page.wait(lambda: page.text("#word").lower() == "inside")
+
+
+@needs_browser
+def test_a_browser_shows_hostile_names_as_text(page: Page) -> None:
+    hostile = "<img src=x onerror=\"document.title='run'\"><script>document.title='run'</script>"
+    shown = Scene(hostile, hostile)
+    shown.sample(1, GOOD)
+    shown.say(1, hostile, OK, "inside: " + hostile, names=[hostile])
+    with serve_page(shown, host=LOCAL, port=0) as address:
+        page.open(address)
+        page.wait(lambda: hostile in page.text("#nodes"))
+        for where in ("#source", "#events", "#signals h2"):
+            assert hostile in page.text(where)
+        assert page.value("document.querySelectorAll('img, main script').length") == 0
+        assert page.value("document.title") != "run"
+
+
+def test_a_recording_is_shown_with_the_readings_of_the_replay(funnel: Path, tmp_path: Path) -> None:
+    proved = documents.load_proved(funnel)
+    trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
+    bad = tmp_path / "bad"
+    write_faulty_copy(trial, bad, str(proved.design.response), FAULTS["scaled by 0.6"])
+    readings = replay_messages(proved.design, bad, centre=Centre.COMMAND)
+    shown = Scene("a recording", "replay")
+    Recording(proved, bad, centre=Centre.COMMAND).play(shown, 1e6, threading.Event())
+    _, samples = shown.samples_after(0, 10**9)
+    assert [s.stamp_ns for s in samples] == [entry.stamp_ns for entry in readings]
+    margins = [s.numbers["margin"] for s in samples]
+    assert margins == pytest.approx([e.reading.margin for e in readings], nan_ok=True, abs=0.0)
+    width = proved.design.funnel.half_width  # type: ignore[union-attr]
+    assert {s.signal("half_width", 0) for s in samples} == {width}
+    said = shown.verdict()
+    assert (said.word, said.level) == ("recording over", STALE)
+    first = next(e.reading for e in readings if e.reading.status is Status.OUTSIDE
+                 or e.reading.status is Status.ASSUMPTION_VIOLATED)  # fmt: skip
+    assert said.text.startswith(f"verdict: {first.status.value}.")
+    assert shown.names == ("speed [m/s]",)
+
+
+def test_a_replay_keeps_the_pace_of_the_stamps_and_stops_when_asked(funnel: Path) -> None:
+    proved = documents.load_proved(funnel)
+    trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
+    recording = Recording(proved, trial, centre=Centre.COMMAND)
+    stamps = [e.stamp_ns for e in replay_messages(proved.design, trial, centre=Centre.COMMAND)]
+    span = (max(stamps) - stamps[0]) / 1e9
+    shown, closing = Scene("a recording", "replay"), threading.Event()
+    began = time.monotonic()
+    recording.play(shown, span / 0.3, closing)
+    assert time.monotonic() - began >= 0.3
+    closing.set()
+    again = Scene("a recording", "replay")
+    recording.play(again, 1.0, closing)
+    assert again.samples_after(0, 10**9)[0] < len(stamps)
+    assert again.verdict().word != "recording over"
+
+
+def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None:
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk (extra `view`)")
+    with serve_foxglove(watched, host=LOCAL, port=0) as address:
+        port = urlsplit(address).port
+        assert port is not None
+        with WebSocket(port, protocol="foxglove.sdk.v1") as client:
+            assert client.accepted
+            channels: dict[str, int] = {}
+            while len(channels) < 4:
+                message = json.loads(client.receive())
+                for each in message.get("channels", ()):
+                    channels[each["topic"]] = each["id"]
+            wanted = [{"id": i, "channelId": i} for i in channels.values()]
+            client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+            heard: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+            names = {i: topic for topic, i in channels.items()}
+            deadline, k = time.monotonic() + 60, 1
+            while not {foxglove.MARGIN, foxglove.SIGNALS, foxglove.STATUS, foxglove.EVENTS} <= set(
+                heard
+            ):
+                assert time.monotonic() < deadline, heard
+                k += 1
+                watched.sample(k * 10**9, GOOD | {"time_to_exit": math.inf})
+                watched.say(k * 10**9, "monitor", OK, "inside")
+                watched.say(k * 10**9, "controller", OK, f"sample {k}")
+                data = client.receive()
+                if data[:1] != b"\x01":
+                    continue
+                identifier, stamp_ns = struct.unpack("<IQ", data[1:13])
+                topic = names[identifier]
+                body = {} if topic == foxglove.EVENTS else json.loads(data[13:])
+                if topic == foxglove.EVENTS:
+                    assert b"monitor" in data or b"controller" in data
+                heard.setdefault(topic, []).append((stamp_ns, body))
+    stamp_ns, margin = heard[foxglove.MARGIN][0]
+    assert stamp_ns % 10**9 == 0
+    assert margin == {"margin": 0.5, "assumption": 0.1}, "inf is left out"
+    [signal] = heard[foxglove.SIGNALS][0][1]["signals"]
+    assert signal == pytest.approx(
+        {"name": "speed [m/s]", "nominal": 1.0, "lower": 0.6, "upper": 1.4, "measured": 1.1}
+    )
+    assert heard[foxglove.STATUS][0][1]["word"] == "inside"
+
+
+def test_without_foxglove_it_says_what_to_install(
+    watched: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with (
+        pytest.raises(DataError, match="pip install 'nlsid\\[view\\]', or use --page"),
+        serve_foxglove(watched, host=LOCAL, port=0),
+    ):
+        pass
+
+
+def test_the_foxglove_layout_asks_for_what_is_published() -> None:
+    layout = json.loads(config_file("foxglove_layout.json").read_text())
+    panels = layout["configById"]
+    paths = [p["value"] for panel in panels.values() for p in panel.get("paths", ())]
+    paths += [panel["path"] for panel in panels.values() if "path" in panel]
+    for path in filter(lambda path: path.startswith("/"), paths):
+        topic, _, fields = path.partition(".")
+        schema = {"properties": foxglove.SCHEMAS[topic]}
+        for field in fields.split("."):
+            name, _, index = field.partition("[")
+            schema = schema["properties"][name]
+            schema = schema["items"] if index else schema
+        assert schema["type"] in ("number", "string")  # type: ignore[comparison-overlap]
+    assert panels["RosOut!events"]["topicToRender"] == foxglove.EVENTS
+    assert set(json.dumps(layout["layout"]).split('"')) >= set(panels)
+    words = {rule["rawValue"] for rule in panels["Indicator!verdict"]["rules"]}
+    assert words >= set(scene.WORDS) | {"late", "stale", "waiting", "recording over", "error"}
+
+
+def test_the_plotjuggler_layout_asks_for_what_is_published(funnel: Path) -> None:
+    root = ElementTree.parse(config_file("plotjuggler_layout.xml")).getroot()
+    asked = {curve.attrib["name"].split("/")[3] for curve in root.iter("curve")}
+    proved = documents.load_proved(funnel)
+    trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
+    reading = replay_messages(proved.design, trial, centre=Centre.COMMAND)[-1].reading
+    assert asked <= set(reading.numbers | HalfWidths(proved.design).of(reading))
