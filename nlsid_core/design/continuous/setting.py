@@ -5,14 +5,15 @@ Everything that can be wrong with what a user gives is found here, before anythi
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.design.continuous.expansion import Expansion
+from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     MAX_DEGREE,
     LSteps,
@@ -20,6 +21,7 @@ from nlsid_core.design.continuous.lstep import (
     refuse_degree,
     section_at,
 )
+from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
 from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
@@ -56,6 +58,8 @@ class Setting:
     """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it.
 
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
+    hold: how the input that is applied may differ from the policy's; None if it may not. rates:
+    (K-1, m) what |dũ/dt| stays below in every funnel that is looked for.
     """
 
     steps: LSteps
@@ -64,12 +68,24 @@ class Setting:
     rho_final: float
     goal: Goal
     expansion: Expansion | None = None
+    hold: Hold | None = None
+    rates: FloatArray | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
         t = self.policy.t
         rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
         return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
+
+    def rate_proof(self, funnel: ContinuousFunnel) -> Json:
+        """The members of a proof about how fast the input changes in the funnel."""
+        if self.hold is None or not self.hold.period or self.rates is None:
+            return {}
+        return {
+            "rates": self.rates.tolist(),
+            "rate_pieces": prove_rates(self.steps, self.policy, funnel, self.rates),
+            "sides": affine(funnel.n).tolist(),
+        }
 
     def margin(self, rho: float) -> float:
         """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
@@ -93,6 +109,8 @@ def prepare(
     gain: str,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
+    hold: float | Literal["largest"] | None = None,
+    error: ArrayLike | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -103,19 +121,22 @@ def prepare(
     weights = default_weights(field, nominal, wanted)
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
+    held = Hold.of(hold, error, field.n)
+    gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
     refuse_saturated(policy)
-    many_cases = expansion is not None or len(policy.limits) > 0
-    pushed = field.only_pushes and (field.is_pushed or many_cases)
+    pushed = field.only_pushes and (field.is_pushed or expansion is not None)
     nonlinear = None
     if expansion is not None and (pushed or not len(field.uncertain)):
         nonlinear = expansion.nonlinear_states()
     steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
+    if held is not None:
+        held.refuse(field, policy)
     rho_final, target = _final(steps, policy, S, wanted, expansion)
-    return Setting(steps, policy, S, rho_final, target, expansion)
+    return Setting(steps, policy, S, rho_final, target, expansion, held)
 
 
 def default_weights(
