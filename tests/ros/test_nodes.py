@@ -104,7 +104,7 @@ def test_the_graph_of_the_running_processes_is_the_documented_one(tmp_path: Path
         spin_until(lambda: set(names) <= set(node.get_node_names()))
         for name in names:
             expected = documented(name)
-            assert len(expected) >= 3
+            assert len(expected) >= (2 if name == "viewer" else 3), "it hears two topics"
             try:
                 spin_until(lambda n=name, e=expected: running(node, n) == e)  # type: ignore[misc]
             except AssertionError:
@@ -119,6 +119,7 @@ EACH: dict[str, dict[str, object]] = {
     "tracking_controller": {"highest": 0.4},
     "funnel_monitor": {},
     "plant": {"kind": "pendulum"},
+    "viewer": {"page": True, "port": 18_080},
 }
 
 
@@ -186,7 +187,8 @@ def test_what_can_be_changed_while_a_node_runs_is_and_the_rest_is_refused(funnel
         assert ask("funnel_monitor", "stale_after", 0.5) == ""
         assert "stale_after" in ask("funnel_monitor", "stale_after", -1.0)
         assert "warning_margin" in ask("funnel_monitor", "warning_margin", 1.5)
-        assert "read-only" in ask("funnel_monitor", "nominal", "profile")
+        refused = ask("funnel_monitor", "nominal", "profile")
+        assert refused == "nominal: read when the node is configured"
         assert ask("tracking_controller", "highest", 0.3) == ""
         assert ask("tracking_controller", "highest", 1) == "", "a whole number is a number"
         assert "is not a number" in ask("tracking_controller", "highest", "much")
