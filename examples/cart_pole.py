@@ -3,7 +3,7 @@
 x = (cart position in m, angle from hanging in rad, their rates), u the force on the cart in N.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
@@ -46,14 +46,16 @@ def problem() -> tuple[VectorField, Nominal]:
     return field, nominal_through(t, x, u, field)
 
 
-def designed() -> FunnelDesign:
-    """The funnel, proved for every t and for the true dynamics."""
+def designed(hold: float | Literal["largest"] | None = None) -> FunnelDesign:
+    """The funnel, proved for every t and for the true dynamics; the force is held for `hold` s."""
     field, nominal = problem()
     end = nominal.x.ends()[-1]
     A, B = field.jacobians(SECONDS, end, nominal.u.ends()[-1])
     S = solve_continuous_are(A, B, Q, R)
     goal = Goal(end, (S + S.T) / 2 / LEVEL)
-    return design(ContinuousTracking(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL))
+    return design(
+        ContinuousTracking(field, nominal, goal=goal, Q=Q / LEVEL, R=R / LEVEL, hold=hold)
+    )
 
 
 def main() -> tuple[float, float]:

@@ -298,8 +298,8 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     """Columns of A to unit size, then b and q to unit size; undone afterwards."""
     size = np.sqrt(np.asarray(program.A.multiply(program.A).sum(axis=0)).ravel())
     D = 1.0 / np.where(size > 0, size, 1.0)
-    primal = 1.0 / max(float(np.abs(program.b).max(initial=0.0)), 1e-300)
-    dual = 1.0 / max(float(np.abs(D * program.q).max(initial=0.0)), 1e-300)
+    primal = 1.0 / (float(np.abs(program.b).max(initial=0.0)) or 1.0)
+    dual = 1.0 / (float(np.abs(D * program.q).max(initial=0.0)) or 1.0)
     scaled = ConeProgram(
         P=sp.csc_matrix(sp.diags(D) @ program.P @ sp.diags(D) * (dual / primal)),
         q=dual * D * program.q,

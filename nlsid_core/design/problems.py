@@ -122,6 +122,11 @@ class ContinuousTracking:
     K varies between knots: "constant", "linear" or "cubic". limits: rows (input, low, high) at
     which inputs saturate; the proof then covers every mode of them.
 
+    hold: s, how old the input that is applied may be: the time between samples, and any delay
+    ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
+    assumed to act continuously). K is then linear between knots. error: (n,)
+    bounds of how much each state is measured wrong (None: not at all).
+
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
     """
@@ -136,6 +141,8 @@ class ContinuousTracking:
     R: ArrayLike | None = None
     gain: str = "constant"
     limits: ArrayLike | None = None
+    hold: float | Literal["largest"] | None = None
+    error: ArrayLike | None = None
 
     def __post_init__(self) -> None:
         require_one_of(self, "shape", get_args(Shape))

@@ -203,7 +203,7 @@ class ImplicitRows:
         lags = range(1, self.model_class.lags + 1)
         model = ImplicitModel(
             h=h,
-            shift=_shift(n - n_v, n + len(names.w)),
+            shift=delayed_states(n - n_v, n + len(names.w)),
             monotonicity=monotonicity,
             period=self.dataset.period,
             states=tuple(f"{name}(t-{k})" for k in lags for name in first.y_names),
@@ -274,7 +274,7 @@ def _refuse_data_outside(rows: ImplicitRows) -> None:
                 )
 
 
-def _shift(size: int, variables_: int) -> Polynomials:
+def delayed_states(size: int, variables_: int) -> Polynomials:
     """ã(x, w): the first `size` states."""
     return Polynomials(np.eye(variables_, dtype=np.int64)[:size], np.eye(size))
 

@@ -50,11 +50,16 @@ Objects = NDArray[np.object_]
 
 @dataclass(frozen=True, eq=False)
 class ImplicitFit:
-    """The model, its exact proof, and the bound: the mean of |x - x̂|²_Q, in squared spreads."""
+    """The model, its exact proof, and the bound: the mean of |x - x̂|²_Q, in squared spreads.
+
+    e, f: its coefficients (m, n_v) for scaled signals.
+    """
 
     model: ImplicitModel
     proof: ImplicitProof
     bound: float
+    e: FloatArray
+    f: FloatArray
 
 
 def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> ImplicitFit:
@@ -66,30 +71,44 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
     solver does.
     """
     n_v, names = len(rows.y_scale[0]), rows.names
-    e, f = _unknowns(rows)
+    e, f = unknowns(rows)
     S = symmetric_template("S", n_v)
-    parts = _conditions(rows, e, f, S, slowest)
+    parts = set_constraints(rows, e, f, S, slowest)
     found, bound = _interior([*parts, *_weighted(rows, S)], names)
     lowest = float(np.linalg.eigvalsh(_values(found, S))[0])
-    model = rows.model(*_coefficients(found, rows), HALF * lowest / 2.0)
-    delta = HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0)
-    proof = _proved(model, rows, delta)
+    best = coefficients(found, rows)
+    model, proof = kept_in_set(rows, *best, lowest)
     if proof is None:
         raise Infeasible(
             f"no exact proof in set {rows.model_class.set} for the minimiser; try lower degrees, "
             "a box, or more data"
         )
-    return ImplicitFit(model, proof, bound)
+    return ImplicitFit(model, proof, bound, *best)
+
+
+def kept_in_set(
+    rows: ImplicitRows, e: FloatArray, f: FloatArray, monotone: float
+) -> tuple[ImplicitModel, ImplicitProof | None]:
+    """The model of scaled coefficients for which the set's inequality kept Q, and its proof.
+
+    monotone: what was kept of ∂e/∂v + (∂e/∂v)' in scaled signals.
+    """
+    model = rows.model(e, f, HALF * monotone / 2.0)
+    return model, _proved(model, rows, HALF * (FARTHEST if rows.model_class.lags > 1 else 1.0))
 
 
 def implicit_equation_error(rows: ImplicitRows) -> ImplicitModel:
     """Least squares on the equation error with a 1-monotone e: well posed, perhaps unstable."""
-    e, _ = _unknowns(rows)
+    return rows.model(*least_squares_coefficients(rows), HALF / 2.0)
+
+
+def least_squares_coefficients(rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:
+    """Scaled e (m_e, n_v) and f (m_f, n_v) of `implicit_equation_error`."""
+    e, _ = unknowns(rows)
     one = np.eye(len(e), dtype=np.int64).astype(object)
     entries, bound = _residual(rows), variables("bound")[0]
     parts = [_monotone(e, one, rows.names), NormBound(tuple(entries.ravel()), bound)]
-    found, _ = _interior(parts, rows.names)
-    return rows.model(*_coefficients(found, rows), HALF / 2.0)
+    return coefficients(_interior(parts, rows.names)[0], rows)
 
 
 def prove_in_set(model: ImplicitModel, rows: ImplicitRows) -> ImplicitProof | None:
@@ -111,7 +130,7 @@ def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitP
     )  # fmt: skip
 
 
-def _unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
+def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
     """e in v and f in (x, w), a decision at every coefficient."""
     names = rows.names
     known = (*names.x, *names.w)
@@ -126,7 +145,7 @@ def _unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
     return e, f
 
 
-def _conditions(
+def set_constraints(
     rows: ImplicitRows, e: Objects, f: Objects, S: Objects, rate: float
 ) -> list[Constraint]:
     """The set's inequalities with Q and S kept, and e monotone wherever v is."""
@@ -204,11 +223,12 @@ def _residual(rows: ImplicitRows) -> Objects:
     columns, n_v = [], len(rows.y_scale[0])
     for i in range(n_v):
         right = [-c for c in variables([f"f{i}[{k}]" for k in range(len(rows.right))])]
-        columns.append([*_left_coefficients(rows, i, n_v), *right])
+        columns.append([*left_coefficients(rows, i, n_v), *right])
     return np.asarray(rows.R @ np.array(columns, dtype=object).T)
 
 
-def _left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+    """The decisions in e of equation i, in the order of the rows' monomials."""
     if rows.model_class.set != "2.19":
         return list(variables([f"e{i}[{k}]" for k in range(len(rows.left))]))
     E = symmetric_template("E", n_v)
@@ -217,9 +237,7 @@ def _left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]
 
 def _interior(constraints: list[Constraint], names: Names) -> tuple[Solution, float]:
     """A point well inside the constraints whose bound is near the least, and its bound."""
-    (bound,) = variables("bound")
-    size = max(len(names.x) + max(len(names.x), len(names.v)), len(names.v)) + 1
-    indeterminates = (*names.all, *forms_of(size))
+    (bound,), indeterminates = variables("bound"), indeterminates_of(names)
     best = solve(Program(indeterminates, tuple(constraints), minimise=bound)).objective
     allowed = max(best, 0.0) * (1.0 + ROOM) + NOISE_FREE
     inside = NonNegative(allowed - bound)
@@ -227,10 +245,16 @@ def _interior(constraints: list[Constraint], names: Names) -> tuple[Solution, fl
     return found, float(found.values["bound"])
 
 
-def _coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:
+def indeterminates_of(names: Names) -> tuple[str, ...]:
+    """What the inequalities of any of the sets hold for."""
+    size = max(len(names.x) + max(len(names.x), len(names.v)), len(names.v)) + 1
+    return (*names.all, *forms_of(size))
+
+
+def coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:
     """e (m_e, n_v) and f (m_f, n_v)."""
     n_v = len(rows.y_scale[0])
-    e = [[float(found.value(p)) for p in _left_coefficients(rows, i, n_v)] for i in range(n_v)]
+    e = [[float(found.value(p)) for p in left_coefficients(rows, i, n_v)] for i in range(n_v)]
     f = [[found.values[f"f{i}[{k}]"] for k in range(len(rows.right))] for i in range(n_v)]
     return np.array(e).T, np.array(f).T
 

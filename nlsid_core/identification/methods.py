@@ -115,10 +115,10 @@ class Sem:
 
 @dataclass(frozen=True)
 class CertifiedSem:
-    """`Sem` inside the stable models, from every proved model at hand, of which the best is kept.
+    """`Sem` inside a convex set of stable models, from several starts, of which the best is kept.
 
-    iterations: of `Rse` or `CertifiedRse`, one of its starts. Source: thesis Definition 2.2
-    and (4.1)-(4.3).
+    iterations: of `Rse` or `CertifiedRse`, one of its starts, for linear and state-affine models;
+    else of its own steps from each start. Source: thesis Definition 2.2, Chapter 2, (4.1)-(4.3).
     """
 
     iterations: int = 40

@@ -75,7 +75,7 @@ def minimise_moment_rie(
     Raises DataError if the moments are not those of a signal, Infeasible if the minimiser has no
     exact proof, SolverError if the solver gives up.
     """
-    problem = _Problem.of(moments, model_class.lags, slowest)
+    problem = Problem.of(moments, model_class.lags, slowest)
     solution = problem.solve(kappa=kappa)
     x = problem.columns * solution.x
     layout = problem.layout
@@ -112,7 +112,7 @@ def moment_bound(model: MonotoneEquation, moments: Moments, *, kappa: float | No
         )
     if model.e[moments.degree :].any():
         raise DataError("moments for a linear e do not judge a model whose e is cubic")
-    problem = _Problem.of(moments, len(model))
+    problem = Problem.of(moments, len(model))
     coefficients = np.concatenate([model.e[: moments.degree], [-model.c], -model.a, -model.b])
     return float(problem.solve(fixed=coefficients, kappa=kappa).objective * problem.unit**2)
 
@@ -260,7 +260,7 @@ class Layout:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class Problem:
     """Scaled data: unknowns x = columns·x̄, moments of unit diagonal, errors in units of `unit`."""
 
     layout: Layout
@@ -272,7 +272,7 @@ class _Problem:
     negative: float
 
     @classmethod
-    def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "_Problem":
+    def of(cls, moments: Moments, n: int, slowest: float = 1.0) -> "Problem":
         """The scaled problem for n lags."""
         raw = moments.matrix()
         layout = Layout(n, len(raw) - moments.degree - 1 - n, moments.degree)

@@ -131,7 +131,7 @@ def minimise_monotone_simulation_error(
     def jacobian(values: FloatArray) -> FloatArray:
         candidate = model(values)
         assert candidate is not None, "the minimiser accepts finite costs only"
-        return np.concatenate([_sensitivities(candidate, trial)[:, free] for trial in trials])
+        return np.concatenate([sensitivities(candidate, trial)[:, free] for trial in trials])
 
     if float(np.max(residual(theta[free]))) == DIVERGED:
         raise DataError("the simulation of the first model diverges; start from a stable one")
@@ -172,7 +172,7 @@ def simulate_banded(model: MonotoneEquation, trial: Trajectory) -> FloatArray | 
     return None
 
 
-def _sensitivities(model: MonotoneEquation, trial: Trajectory) -> FloatArray:
+def sensitivities(model: MonotoneEquation, trial: Trajectory) -> FloatArray:
     """(N - history, 2 + 1 + n + n_w): ∂ŷ/∂[e₂, e₃, c, a, b]."""
     h, n = model.history, len(model)
     simulated = simulate_banded(model, trial)

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,9 +14,16 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.fit import History, Proof, Step
-from nlsid_core.identification.implicit_class import ImplicitClass, build_implicit_rows
+from nlsid_core.identification.implicit_class import (
+    ImplicitClass,
+    ImplicitRows,
+    build_implicit_rows,
+)
+from nlsid_core.identification.implicit_descent import minimise_certified_implicit
+from nlsid_core.identification.implicit_proof import ImplicitProof
 from nlsid_core.identification.implicit_search import (
     implicit_equation_error,
+    least_squares_coefficients,
     minimise_implicit_rie,
     prove_in_set,
 )
@@ -50,11 +57,19 @@ from nlsid_core.identification.monotone import (
     least_squares_equation,
     minimise_monotone_simulation_error,
 )
+from nlsid_core.identification.monotone_descent import minimise_certified
+from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import prove_stability
-from nlsid_core.identification.starts import reflected, stable_starts
+from nlsid_core.identification.starts import (
+    as_implicit,
+    as_monotone,
+    linear_start,
+    reflected,
+    stable_starts,
+)
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
     StateAffineRows,
@@ -70,6 +85,10 @@ from nlsid_core.models import (
     StateAffineModel,
 )
 
+T = TypeVar("T", bound=Model)
+S = TypeVar("S")
+R = TypeVar("R")
+Coefficients = tuple[FloatArray, FloatArray]  # scaled e and f of an implicit model
 log = logging.getLogger(__name__)
 BOUND = "bound on the simulation error"
 CERTIFIABLE_DEGREE = 2  # of G_0, at most: a quadratic is bounded on a box by the S-procedure
@@ -209,9 +228,45 @@ def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[Mo
     trail.add_proved(Rie, lambda method: solved(method, biased()))
     if train.repeats() or isinstance(task.method, MomentRie):
         trail.add_proved(MomentRie, lambda method: solved(method, without_bias(method)))
-    starts = (equation_error, lambda: biased().model)
+
+    def straight() -> MonotoneEquation:
+        found = linear_start(train, model_class.lags, model_class.delays)
+        if found is None:
+            raise Infeasible("no linear model to start from")
+        return as_monotone(found, model_class)
+
+    starts = (equation_error, lambda: biased().model, straight)
     trail.add(Sem, lambda _: _best_minimum(starts, train))
+
+    def inside(method: CertifiedSem) -> MonotoneEquation:
+        def minimised(start: MonotoneEquation) -> MonotoneEquation | None:
+            return minimise_certified(
+                start, plain, model_class, train.trajectories,
+                slowest=task.searched_rate, steps=method.iterations,
+            )  # fmt: skip
+
+        begun = (*starts, lambda: _best_minimum(starts, train))
+        found = [model for start in begun if (model := _tried(start, minimised)) is not None]
+        return _least_error([m for m in found if prove_stability(m) is not None], train)
+
+    trail.add(CertifiedSem, inside)
     return trail
+
+
+def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | None:
+    """What a search makes of a start; None if there is no start, or it leads to nothing."""
+    try:
+        return minimised(start())
+    except (DataError, SolverError) as reason:
+        log.info("no model from this start: %s", reason)
+        return None
+
+
+def _least_error(models: Sequence[T], train: Dataset) -> T:
+    """The proved model that simulates the training data best; Infeasible if there is none."""
+    if not models:
+        raise Infeasible("no start of the search leads to a model with a proof of stability")
+    return min(models, key=lambda model: simulation_percent(model, train))
 
 
 def _best_minimum(
@@ -245,7 +300,35 @@ def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[Im
 
     trail.add(LeastSquares, lambda _: implicit_equation_error(rows))
     trail.add_proved(Rie, search)
+    trail.add_proved(CertifiedSem, lambda method: _inside(rows, task, method))
     return trail
+
+
+def _inside(
+    rows: ImplicitRows, task: Task, method: CertifiedSem
+) -> tuple[ImplicitModel, ImplicitProof]:
+    """The best of the local minima of the simulation error in the set, from all starts at hand."""
+    made = rows.model_class
+
+    def bounded() -> Coefficients:
+        found = minimise_implicit_rie(rows, slowest=task.searched_rate)
+        return found.e, found.f
+
+    def straight() -> Coefficients:
+        found = linear_start(rows.dataset, made.lags, made.delays)
+        if found is None:
+            raise Infeasible("no linear model to start from")
+        return as_implicit(found, rows)
+
+    def minimised(start: Coefficients) -> tuple[ImplicitModel, ImplicitProof] | None:
+        return minimise_certified_implicit(
+            rows, start, slowest=task.searched_rate, steps=method.iterations
+        )
+
+    starts = (bounded, lambda: least_squares_coefficients(rows), straight)
+    found = [one for start in starts if (one := _tried(start, minimised)) is not None]
+    best = _least_error([model for model, _ in found], rows.dataset)
+    return next(one for one in found if one[0] is best)
 
 
 def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[ImplicitModel]:
@@ -257,6 +340,9 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
         return found.model, found.proof
 
     trail.add_proved(LeastSquares, search)
+    if task.wanted(CertifiedSem) is not None:
+        rows = build_implicit_rows(train, ImplicitClass(1, (1,), "2.19", 1))
+        trail.add_proved(CertifiedSem, lambda method: _inside(rows, task, method))
     return trail
 
 
@@ -284,10 +370,12 @@ OFFERS: dict[type, Offer] = {
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     MonotoneClass: Offer(
-        monotone, (MomentRie, Rie, LeastSquares, Sem), (LeastSquares, Rie, MomentRie)
+        monotone,
+        (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),
+        (LeastSquares, Rie, MomentRie),
     ),
-    ImplicitClass: Offer(implicit, (Rie, LeastSquares), (LeastSquares, Rie)),
-    LinearStateClass: Offer(linear_states, (LeastSquares,), ()),
+    ImplicitClass: Offer(implicit, (Rie, LeastSquares, CertifiedSem), (LeastSquares, Rie)),
+    LinearStateClass: Offer(linear_states, (LeastSquares, CertifiedSem), ()),
 }
 
 

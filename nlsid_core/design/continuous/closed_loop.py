@@ -107,16 +107,44 @@ def closed_loop_polynomial(
         c = add(c, multiply({1: -2 * PT[:, :, i]}, error, n))
     for term in loop.bounded_pushes(PT):
         c = add(c, negative(term))
-    W: Graded = {}
     PdotT = _product((P[:, 1] - P[:, 0])[:, None], pieces.T)
     for i in range(n):
-        W = add(W, multiply({1: PT[:, :, i]}, x_bar[i], n))
         c = add(c, multiply({1: -PdotT[:, :, i]}, x_bar[i], n))
-    level: Graded = {0: loop.restricted(rho)[:, :, None]}
-    c = add(c, multiply(_multiplier(pieces), add(level, negative(W)), n))
+    c = add(c, multiply(_multiplier(pieces), loop.gap(), n))
     for term in loop.held():
         c = add(c, negative(term))
     return c
+
+
+def rate_polynomial(
+    field: VectorField,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    pieces: Pieces,
+    w: FloatArray,
+    *,
+    room: FloatArray,
+    entry: IntArray,
+    sign: IntArray,
+) -> Graded:
+    """h room - sign dũ_i/ds - τ(ρ - x̄'Px̄) of every piece, as `closed_loop_polynomial` writes c.
+
+    w: (B, n_w). room: (B,) in input units per s. entry: (B,) i. τ: the first of the piece's.
+    """
+    n, k = field.n, pieces.interval
+    loop = _Loop(field, policy, funnel, pieces, w)
+    every = np.arange(len(k))
+    gains = policy.K.control[k][every, :, entry]
+    turned = _product(loop.restricted(_slope(gains))[:, :, None], pieces.T)[:, :, 0]
+    steered = loop.restricted(_slope(policy.u.control[k][every, :, entry]))
+    change: Graded = {0: steered[:, :, None], 1: -turned}
+    along, x_rate = loop.restricted(gains), loop.nominal_rate()
+    for j, rate in enumerate(loop.field_times_h()):
+        error = add(rate, {0: -x_rate[:, :, j][:, :, None]})
+        change = add(change, multiply({0: -along[:, :, j][:, :, None]}, error, n))
+    c: Graded = {q: -sign[:, None, None] * part for q, part in change.items()}
+    c = add(c, {0: (np.diff(funnel.t)[k] * room)[:, None, None]})
+    return add(c, negative(multiply(_squares(pieces.tau[:, :, 0]), loop.gap(), n)))
 
 
 def error_at_end(
@@ -162,8 +190,13 @@ class _Loop:
         policy: ContinuousPolicy,
         funnel: ContinuousFunnel,
         pieces: Pieces,
+        w: FloatArray | None = None,
     ) -> None:
         self.field, self.pieces = field, pieces
+        vertices = field.vertices()
+        if w is None and pieces.kappa is None:
+            w = vertices[pieces.vertex % len(vertices)]
+        self.w = np.tile(field.uncertain.mean(axis=1), (len(pieces), 1)) if w is None else w
         self.policy, self.funnel = policy, funnel
         spans = np.searchsorted(field.breaks, funnel.t[:-1], side="right")[pieces.interval]
         self.span = int(spans[0])
@@ -178,11 +211,16 @@ class _Loop:
 
     def nominal_rate(self) -> FloatArray:
         """dx₀/ds (B, d, n)."""
-        control = self.funnel.x.control[self.pieces.interval]
-        degree = control.shape[1] - 1
-        if degree == 0:
-            return np.zeros((len(control), 1, control.shape[2]))
-        return self.restricted(degree * np.diff(control, axis=1))
+        return self.restricted(_slope(self.funnel.x.control[self.pieces.interval]))
+
+    def gap(self) -> Graded:
+        """ρ - x̄'Px̄."""
+        k, n = self.pieces.interval, self.field.n
+        PT = _product(self.restricted(_linear(self.funnel.P)[k]), self.pieces.T)
+        W: Graded = {}
+        for i in range(n):
+            W = add(W, multiply({1: PT[:, :, i]}, {1: self.pieces.T[:, i][:, None]}, n))
+        return add({0: self.restricted(_linear(self.funnel.rho)[k])[:, :, None]}, negative(W))
 
     def field_times_h(self) -> list[Graded]:
         """h·f_i along the closed loop."""
@@ -248,10 +286,6 @@ class _Loop:
         u = self.restricted(self.policy.u.control[k])
         KT = _product(self.restricted(self.policy.K.control[k]), T)
         time = self.restricted(_linear(self.funnel.t)[k])
-        vertices = self.field.vertices()
-        w = vertices[self.pieces.vertex % len(vertices)]
-        if self.pieces.kappa is not None:
-            w = np.tile(self.field.uncertain.mean(axis=1), (len(self.pieces), 1))
         forms: list[Graded] = [{0: time[:, :, None]}]
         forms += [{0: x[:, :, i][:, :, None], 1: T[:, None, i]} for i in range(self.field.n)]
         self.demands: list[Graded] = [
@@ -259,7 +293,7 @@ class _Loop:
         ]
         for i, applied in enumerate(self._clipped()):
             forms.append(add(applied, {0: self.pieces.push[:, i][:, None, None]}))
-        forms += [{0: w[:, None, i][:, :, None]} for i in range(w.shape[1])]
+        forms += [{0: part[:, None, None]} for part in self.w.T]
         return forms
 
     def _clipped(self) -> list[Graded]:
@@ -289,6 +323,12 @@ def _squares(S: FloatArray) -> Graded:
             part[:, :, home] += entries[:, :, entry]
         result[degree] = part
     return result
+
+
+def _slope(control: FloatArray) -> FloatArray:
+    """Control points (B, d, ...) of the derivative in s of curves with (B, d+1, ...)."""
+    degree = control.shape[1] - 1
+    return degree * np.diff(control, axis=1) if degree else 0.0 * control
 
 
 def _product(A: FloatArray, T: FloatArray) -> FloatArray:

@@ -3,14 +3,16 @@
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
-from nlsid_core.design.continuous.lstep import sections
+from nlsid_core.design.continuous.held import Hold, fastest
+from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Goal, Setting, prepare
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
@@ -23,6 +25,7 @@ from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 RETRIES = 6
+SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
 CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 KIND = "continuous_funnel"
@@ -65,6 +68,8 @@ def design_funnel(
     R: ArrayLike | None = None,
     gain: str = "constant",
     limits: ArrayLike | None = None,
+    hold: float | Literal["largest"] | None = None,
+    error: ArrayLike | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FunnelDesign:
@@ -75,13 +80,16 @@ def design_funnel(
     """
     started = time.perf_counter()
     setting = prepare(
-        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits
-    )
+        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
+        hold=hold, error=error,
+    )  # fmt: skip
     if shape == "P":
         refuse_shape(setting.steps)
+        if setting.hold is not None:
+            raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
-    funnel, proved, margin = _swept(setting, progress)
+    setting, funnel, proved, margin = _found(setting, progress)
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -112,6 +120,9 @@ def decided(
         raise Infeasible("the funnel's end is not inside the goal")
     proof = proof_of(setting.steps, policy, funnel, proved) | {"goal_multiplier": multiplier}
     claim = {"kind": KIND, "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()}}
+    if setting.hold is not None:
+        claim |= setting.hold.claim()
+        proof |= setting.rate_proof(funnel)
     found = ContinuousSearch(goal, proved, setting.first_guess(), tuple(history), seconds)
     try:
         design = Design.proved(
@@ -123,9 +134,12 @@ def decided(
     return design
 
 
-def validity_caps(field: VectorField, policy: ContinuousPolicy, P: FloatArray) -> FloatArray:
+def validity_caps(
+    field: VectorField, policy: ContinuousPolicy, P: FloatArray, widths: FloatArray | None = None
+) -> FloatArray:
     """(K,) the largest ρ at each knot with which x and u stay where the dynamics are valid.
 
+    widths: (K-1, m) that the applied input is off.
     Raises DataError if the nominal itself does not.
     """
     caps = np.full(len(P), np.inf)
@@ -144,6 +158,8 @@ def validity_caps(field: VectorField, policy: ContinuousPolicy, P: FloatArray) -
                 np.inf if most <= high else high - float(np.max(centre)),
                 np.inf if low <= least else float(np.min(centre)) - low,
             )
+            if widths is not None and entry >= field.n:
+                room -= float(widths[k, entry - field.n])
             if room <= 0:
                 raise DataError(
                     f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
@@ -155,11 +171,83 @@ def validity_caps(field: VectorField, policy: ContinuousPolicy, P: FloatArray) -
     return caps
 
 
-def _swept(setting: Setting, progress: Progress | None) -> tuple[ContinuousFunnel, Proved, float]:
+def _found(
+    setting: Setting, progress: Progress | None
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+    """ρ by the backward sweep, and its proof; where inputs are held, for bounds of their change.
+
+    Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
+    """
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    if setting.hold is None:
+        return setting, *_swept(setting, validity_caps(steps.field, policy, P), progress)
+    free = _free(setting, progress)
+    periods = setting.hold.tried()
+    for period in periods:
+        try:
+            found = _held(setting, replace(setting.hold, period=period), free, progress)
+        except Infeasible:
+            if period == periods[-1]:
+                raise
+            continue
+        break
+    if len(periods) > 1:  # between what was proved and what was not
+        with suppress(Infeasible):
+            longer = replace(setting.hold, period=period * 2**0.5)
+            found = _held(setting, longer, free, progress)
+    return found
+
+
+def _held(
+    setting: Setting, hold: Hold, free: FloatArray, progress: Progress | None
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+    """The funnel for one hold, within scaled copies of the free one."""
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    for scale in SCALES:
+        outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
+        held = LSteps(steps.field, policy, widths=np.zeros((len(P) - 1, steps.field.m)))
+        held.bound_pushes(P[-1])
+        rates, widths = fastest(held, policy, outer, hold)
+        held.widths = widths
+        setting = replace(setting, steps=held, hold=hold, rates=rates)
+        try:
+            caps = validity_caps(steps.field, policy, P, widths)
+            return setting, *_swept(setting, np.minimum(caps, outer.rho), progress)
+        except (Infeasible, DataError) as error:
+            refusal = error
+    k, i = np.unravel_index(np.argmax(widths), widths.shape)
+    plan = (
+        hold.period
+        * np.abs(np.diff(policy.u.control, axis=1)).sum(axis=1)
+        / np.diff(policy.t)[:, None]
+    )
+    raise Infeasible(
+        f"no funnel in which the input may be {hold.period:g} s old and the state wrong by "
+        f"{hold.error.tolist()}: input {i} is then off by up to {widths[k, i]:.3g} at "
+        f"{policy.t[k]:.3g} s, of which {plan[k, i]:.3g} is the plan's own change. Take a shorter "
+        "hold (hold='largest' finds one), a smoother plan, a larger goal, or Q and R that decay "
+        f"faster ({refusal})"
+    ) from refusal
+
+
+def _free(setting: Setting, progress: Progress | None) -> FloatArray:
+    """ρ (K,) as it is found if nothing is held."""
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    caps = validity_caps(steps.field, policy, P)
+    rho_final = min(setting.rho_final, float(caps[-1]))
+    rho, _ = sweep_rho(
+        steps, sections(steps.field, policy, P), margin=setting.margin(rho_final),
+        rho_final=rho_final, caps=caps, progress=progress,
+    )  # fmt: skip
+    return rho
+
+
+def _swept(
+    setting: Setting, caps: FloatArray, progress: Progress | None
+) -> tuple[ContinuousFunnel, Proved, float]:
     """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
     steps, policy, P = setting.steps, setting.policy, setting.P
     pairs = sections(steps.field, policy, P)
-    caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
 
     def search(margin: float) -> tuple[FloatArray, list[Ends] | None]:

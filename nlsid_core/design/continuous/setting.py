@@ -5,14 +5,16 @@ Everything that can be wrong with what a user gives is found here, before anythi
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import LSteps, refuse_degree, section_at
+from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError, Infeasible
@@ -42,19 +44,35 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it."""
+    """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it.
+
+    hold: how the input that is applied may differ from the policy's; None if it may not. rates:
+    (K-1, m) what |dũ/dt| stays below in every funnel that is looked for.
+    """
 
     steps: LSteps
     policy: ContinuousPolicy
     P: FloatArray
     rho_final: float
     goal: Goal
+    hold: Hold | None = None
+    rates: FloatArray | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
         t = self.policy.t
         rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
         return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
+
+    def rate_proof(self, funnel: ContinuousFunnel) -> Json:
+        """The members of a proof about how fast the input changes in the funnel."""
+        if self.hold is None or not self.hold.period or self.rates is None:
+            return {}
+        return {
+            "rates": self.rates.tolist(),
+            "rate_pieces": prove_rates(self.steps, self.policy, funnel, self.rates),
+            "sides": affine(funnel.n).tolist(),
+        }
 
     def margin(self, rho: float) -> float:
         """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
@@ -72,6 +90,8 @@ def prepare(
     R: ArrayLike | None,
     gain: str,
     limits: ArrayLike | None = None,
+    hold: float | Literal["largest"] | None = None,
+    error: ArrayLike | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -83,15 +103,19 @@ def prepare(
     R = definite(np.eye(field.m) if R is None else R, field.m, "R", strict=True)
     refuse_degree(field)
     wanted = _wanted_goal(goal, nominal, field.n)
+    held = Hold.of(hold, error, field.n)
+    gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=np.asarray(limits, dtype=np.float64))
     refuse_saturated(policy)
     steps = LSteps(field, policy)
+    if held is not None:
+        held.refuse(field, policy)
     steps.bound_pushes(S[-1])
     rho_final, target = _final(steps, policy, S, wanted)
-    return Setting(steps, policy, S, rho_final, target)
+    return Setting(steps, policy, S, rho_final, target, held)
 
 
 def refuse_first(setting: Setting, rho: FloatArray) -> None:

@@ -35,8 +35,6 @@ def refuse_shape(steps: LSteps) -> None:
             "V-steps (shape P, alternation) search one polynomial at a time: with limits take "
             "shape rho by the sweep"
         )
-    if steps.widths is not None:
-        raise DataError("V-steps search without hold or error: take shape rho")
     if steps.kappa is not None:
         raise DataError("V-steps take w at its corners: they are for fewer than three pushes")
     if steps.field.degree > MAX_DEGREE:

@@ -77,7 +77,8 @@ def piece_margins(
     field: VectorField, policy: ContinuousPolicy, funnel: ContinuousFunnel, pieces: Pieces
 ) -> FloatArray:
     """Each piece's margin in 1/s; nan where its Gram matrices are not positive definite."""
-    curves = _Curves.of(field, policy, funnel, pieces)
+    c = closed_loop_polynomial(field, policy, funnel, pieces)
+    curves = _Curves.of(funnel, pieces, c)
     lowest = np.linalg.eigvalsh(curves.scaled()).min(axis=(1, 2))
     margins = np.full(len(pieces), np.nan)
     sound = np.isfinite(lowest) & (lowest > 0)
@@ -106,24 +107,52 @@ def documents(
 
     Raises Infeasible if no factors of few enough degrees in s are near enough.
     """
-    curves = _Curves.of(field, policy, funnel, pieces)
+    curves = _Curves.of(funnel, pieces, closed_loop_polynomial(field, policy, funnel, pieces))
     grams = curves.grams
     grams[:, :, curves.one, curves.one] -= margin * curves.room
-    found = []
+    return [_written(pieces, curves, b) for b in range(len(pieces))]
+
+
+def multipliers_of_rates(pieces: Pieces) -> Pieces:
+    """The pieces with τ of few bits, and how a proof states it: the rest of τ is zero."""
+    n = pieces.basis.shape[1]
+    sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
+    nothing = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
+    tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
     for b in range(len(pieces)):
-        squares = witness(pieces.basis, curves.fitted(grams[b]))
-        found.append(
-            {
-                "interval": int(pieces.interval[b]),
-                "vertex": int(pieces.vertex[b]),
-                "level": int(pieces.level[b]),
-                "index": int(pieces.index[b]),
-                **pieces.stated[b],
-                "columns": squares["columns"],
-                "squares": squares["squares"],
-            }
-        )
+        found = multiplier(sides, pieces.tau[b, :, 0], bits=TAU_BITS)
+        tau[b, :, 0] = matrices(found["columns"], found["squares"])
+        first = {"columns": found["columns"], "squares": found["squares"]}
+        stated[b] = {"tau": [first] + [nothing] * pieces.mode.shape[1]}
+        if pieces.mode.shape[1]:
+            stated[b]["mode"] = pieces.mode[b].tolist()
+    return replace(pieces, tau=tau, stated=stated)
+
+
+def rate_documents(funnel: ContinuousFunnel, pieces: Pieces, c: Graded) -> list[Json | None]:
+    """The rate pieces as the kernel reads them; None where one is not shown to be positive."""
+    curves = _Curves.of(funnel, pieces, c)
+    lowest = np.linalg.eigvalsh(curves.scaled()).min(axis=(1, 2))
+    found: list[Json | None] = []
+    for b in range(len(pieces)):
+        try:
+            found.append(_written(pieces, curves, b) if lowest[b] > 0 else None)
+        except Infeasible:
+            found.append(None)
     return found
+
+
+def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:
+    squares = witness(pieces.basis, curves.fitted(curves.grams[b]))
+    return {
+        "interval": int(pieces.interval[b]),
+        "vertex": int(pieces.vertex[b]),
+        "level": int(pieces.level[b]),
+        "index": int(pieces.index[b]),
+        **pieces.stated[b],
+        "columns": squares["columns"],
+        "squares": squares["squares"],
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,15 +170,10 @@ class _Curves:
     charged: tuple[IntArray, IntArray]
 
     @classmethod
-    def of(
-        cls,
-        field: VectorField,
-        policy: ContinuousPolicy,
-        funnel: ContinuousFunnel,
-        pieces: Pieces,
-    ) -> "_Curves":
+    def of(cls, funnel: ContinuousFunnel, pieces: Pieces, polynomials: Graded) -> "_Curves":
+        """Of pieces whose Gram matrices are nearly those of the polynomials."""
         basis = pieces.basis
-        c, rows = _together(closed_loop_polynomial(field, policy, funnel, pieces), basis.shape[1])
+        c, rows = _together(polynomials, basis.shape[1])
         N = c.shape[1] - 1
         c = c / np.array([comb(N, j) for j in range(N + 1)])[:, None]
         of_pairs = positions((basis[:, None] + basis[None]).reshape(-1, basis.shape[1]), rows)

@@ -1,0 +1,368 @@
+"""The hold between samples: how fast the policy's input changes in a funnel, bounded and proved.
+
+The applied input differs from the policy's by δ, |δ_i| ≤ W_i: the hold times the fastest change
+R_i of the intervals before, and what measurement errors do. R holds in a funnel, and the funnel is
+searched for W; so R is bounded in a larger one first. Nothing here is trusted.
+Source: docs/theory-funnels.md, "The hold between samples".
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal
+
+import numpy as np
+
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.design.continuous.closed_loop import Pieces, rate_polynomial
+from nlsid_core.design.continuous.graded import Graded, monomials_of, positions
+from nlsid_core.design.continuous.lstep import LSteps, section_at
+from nlsid_core.design.continuous.pieces import (
+    MAX_LEVEL,
+    Part,
+    proof_basis,
+    substitution,
+    unsolved,
+)
+from nlsid_core.design.continuous.witnesses import multipliers_of_rates, rate_documents
+from nlsid_core.dynamics.vector_field import VectorField
+from nlsid_core.errors import DataError, Infeasible, OptionError
+from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
+ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
+QUARTICS = (0.03, 0.1, 0.3, 1.0, 3.0)  # λ₁ over the cubic part's size
+LEAST_QUARTIC = 1e-3  # of the linear part's size
+GOLDEN = (5**0.5 - 1) / 2
+SEARCHES = 40  # of a golden section: to 1e-8 of its bracket
+LONGEST, HALVINGS = 0.064, 9  # s, down to a quarter of a millisecond
+MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
+SETTLED = 1.005  # of the rates before: ROOM holds what is left
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """period: how old the applied input is at most, s. error: (n,) bounds of measurement errors.
+
+    longest: the period is where a search for the longest one starts.
+    """
+
+    period: float
+    error: FloatArray
+    longest: bool = False
+
+    @classmethod
+    def of(
+        cls, hold: float | Literal["largest"] | None, error: ArrayLike | None, n: int
+    ) -> "Hold | None":
+        """What a user asks for; None if nothing. OptionError on what cannot be."""
+        if hold is None and error is None:
+            return None
+        hold = float(hold) if isinstance(hold, int) else hold
+        bounds = np.zeros(n) if error is None else np.asarray(error, dtype=np.float64)
+        longest = hold == "largest"
+        if not (longest or hold is None or (isinstance(hold, float) and 0 < hold < np.inf)):
+            raise OptionError("hold", hold, "seconds above 0, 'largest' or None")
+        if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
+            raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
+        period = hold if isinstance(hold, float) else LONGEST if longest else 0.0
+        return cls(period, bounds, longest)
+
+    def tried(self) -> list[float]:
+        """The periods to try, the longest first."""
+        return [self.period / 2**i for i in range(HALVINGS if self.longest else 1)]
+
+    def claim(self) -> Json:
+        """The members of the claim."""
+        stated: Json = {"hold": self.period} if self.period else {}
+        return stated | ({"error": self.error.tolist()} if self.error.any() else {})
+
+    def refuse(self, field: VectorField, policy: ContinuousPolicy) -> None:
+        """Raise DataError for dynamics and policies that no hold is searched for."""
+        inputs = slice(1 + field.n, 1 + field.n + field.m)
+        if any((p.exponents[:, inputs] > 1).any() for e in field.pieces for p in e):
+            raise DataError("a hold needs dynamics that are affine in each input")
+        if self.period and field.degree > MAX_DEGREE:
+            raise DataError(
+                f"a hold is searched for dynamics of degree up to {MAX_DEGREE}, not "
+                f"{field.degree}: take a Taylor polynomial of degree {MAX_DEGREE}"
+            )
+        if self.period and not (policy.u.is_continuous() and policy.K.is_continuous()):
+            raise DataError(
+                "a hold needs a policy that does not jump at knots: take gain='linear', and inputs "
+                "of the nominal that are continuous"
+            )
+
+    def widths(self, policy: ContinuousPolicy, rates: FloatArray) -> FloatArray:
+        """(intervals, m) W for rates (intervals, m)."""
+        shaken = (np.abs(policy.K.control) @ self.error).max(axis=1)
+        first = np.searchsorted(policy.t[1:], policy.t[:-1] - self.period, side="right")
+        return np.array(
+            [
+                self.period * rates[j : k + 1].max(axis=0) + shaken[j : k + 1].max(axis=0)
+                for k, j in enumerate(np.minimum(first, np.arange(len(first))).tolist())
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rates:
+    """Rates of inputs in one time span: pieces of time at vertices, corners and modes.
+
+    w: (B, n_w). entry, sign: (B,) of the input. taken: (B,) what entries of w that only push add to
+    the rate, in input units per s.
+    """
+
+    pieces: Pieces
+    w: FloatArray
+    entry: IntArray
+    sign: IntArray
+    taken: FloatArray
+
+    def polynomial(
+        self, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray
+    ) -> Graded:
+        """What has to be positive for rates (intervals, m)."""
+        room = rates[self.pieces.interval, self.entry] - self.taken
+        return rate_polynomial(
+            steps.field, policy, funnel, self.pieces, self.w, room=room, entry=self.entry,
+            sign=self.sign,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """For each rate at one end of its part of time, in z: the least h(R - taken), and its witness.
+
+    multipliers: (B, 2) λ₀ and λ₁. gram: (B, k, k) but for its constant, which is h(R - taken) more.
+    """
+
+    least: FloatArray
+    multipliers: FloatArray
+    gram: FloatArray
+
+
+def fastest(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, hold: Hold
+) -> tuple[FloatArray, FloatArray]:
+    """(intervals, m) R and W for a funnel: each for the other, R with room."""
+    rates = np.zeros((len(funnel.t) - 1, steps.field.m))
+    parts, h = [Part(k, 0, 0) for k in range(len(rates))], np.diff(funnel.t)
+    for _ in range(MAX_ROUNDS if hold.period else 0):
+        steps.widths, before = hold.widths(policy, rates), rates.copy()
+        for batch in _batches(steps, policy, parts):
+            k = batch.pieces.interval
+            for end in (0, 1):
+                shown, _ = _shown(steps, policy, funnel, batch, end)
+                np.maximum.at(rates, (k, batch.entry), ROOM * (shown.least / h[k] + batch.taken))
+        if (rates <= SETTLED * before).all():
+            break
+    return rates, hold.widths(policy, rates)
+
+
+def prove_rates(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray
+) -> list[Json]:
+    """The rate pieces of a proof; Infeasible if a rate is not shown on some part of time."""
+    waiting = [Part(k, 0, 0) for k in range(len(rates))]
+    found: list[Json] = []
+    while waiting:
+        written: dict[Part, list[Json | None]] = {}
+        for batch in _batches(steps, policy, waiting):
+            batch = _witnessed(steps, policy, funnel, batch, rates)
+            c = batch.polynomial(steps, policy, funnel, rates)
+            rows = rate_documents(funnel, batch.pieces, c)
+            places = zip(batch.entry.tolist(), batch.sign.tolist(), rows, strict=True)
+            for b, (entry, sign, row) in enumerate(places):
+                part = Part(*(int(e[b]) for e in (batch.pieces.interval, batch.pieces.level,
+                                                  batch.pieces.index)))  # fmt: skip
+                stated = None if row is None else row | {"input": entry, "sign": sign}
+                written.setdefault(part, []).append(stated)
+        waiting = []
+        for part, stated_rows in written.items():
+            shown = [row for row in stated_rows if row is not None]
+            if len(shown) == len(stated_rows):
+                found += shown
+            elif part.level < MAX_LEVEL:
+                waiting += part.halves()
+            else:
+                raise Infeasible(
+                    "the input's rate is not shown to keep its bound from "
+                    f"{unsolved(policy, (part,))}: try more knots there"
+                )
+    return found
+
+
+def _batches(steps: LSteps, policy: ContinuousPolicy, parts: list[Part]) -> Iterator[_Rates]:
+    """Every rate on these parts of time, one span of the equations after the other."""
+    field, n = steps.field, steps.program.n
+    pushing = _pushing(field)
+    ends = field.uncertain.tolist()
+    boxes = [((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(ends)]
+    corners = list(product(*boxes))
+    values = np.array(corners).reshape(len(corners), -1)
+    limited = steps.limits[:, 0].astype(int).tolist()
+    cases = [
+        (v, entry, sign, mode)
+        for v in range(len(values) * len(steps.corners))
+        for entry in range(field.m)
+        for sign in (-1, 1)
+        for mode in range(len(steps.modes))
+        if entry not in limited or not steps.modes[mode][limited.index(entry)]
+    ]
+    vertex, entry, sign, mode = np.array(cases).reshape(-1, 4).T
+    basis, limits = proof_basis(steps.program), len(steps.limits)
+    halves = np.ptp(field.uncertain, axis=1) / 2
+    spans = {part: field.span(float(policy.t[part.interval])) for part in parts}
+    for span in sorted(set(spans.values())):
+        alike = [part for part in parts if spans[part] == span]
+        count = len(alike) * len(cases)
+        place = np.repeat(np.array([(p.interval, p.level, p.index) for p in alike]),
+                          len(cases), axis=0)  # fmt: skip
+        v, i, side, m = (np.tile(row, len(alike)) for row in (vertex, entry, sign, mode))
+        assert steps.widths is not None  # a search for a hold sets them first
+        pieces = Pieces(
+            basis, interval=place[:, 0], vertex=v, level=place[:, 1], index=place[:, 2],
+            T=np.tile(np.eye(n), (count, 1, 1)),
+            mu=np.zeros((count, 2, 0)), gram=np.zeros((count, 2, len(basis), len(basis))),
+            mode=steps.modes[m], tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
+            push=steps.corners[v // len(values)] * steps.widths[place[:, 0]],
+            stated=np.empty(count, dtype=object),
+        )  # fmt: skip
+        g = _pushes(field, span, pushing)
+        gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
+        taken = np.abs(gains @ g).max(axis=1) @ halves
+        yield _Rates(pieces, values[v % len(values)], i, side, taken)
+
+
+def _pushing(field: VectorField) -> list[int]:
+    """The entries of w that do nothing but add constants to ẋ, in all time spans."""
+    first = 1 + field.n + field.m
+    rows = np.concatenate([p.exponents for equations in field.pieces for p in equations])
+    return [
+        j
+        for j in range(len(field.uncertain))
+        if (rows[rows[:, first + j] > 0].sum(axis=1) == 1).all()
+    ]
+
+
+def _pushes(field: VectorField, span: int, pushing: list[int]) -> FloatArray:
+    """(n, n_w) what each entry of w that only pushes adds to ẋ; zero for the others."""
+    g, first = np.zeros((field.n, len(field.uncertain))), 1 + field.n + field.m
+    for i, p in enumerate(field.pieces[span]):
+        for exponent, coefficient in p.terms():
+            for j in pushing:
+                if exponent[first + j]:
+                    g[i, j] += float(coefficient)
+    return g
+
+
+def _shown(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates, end: int
+) -> tuple[_Shown, FloatArray]:
+    """The least rates at one end of each part, in z with x̄ = Tz; and T (B, n, n)."""
+    pieces, n = batch.pieces, funnel.n
+    frames: dict[tuple[int, ...], FloatArray] = {}
+    T = np.empty((len(pieces), n, n))
+    for b, key in enumerate(zip(pieces.interval.tolist(), pieces.level.tolist(),
+                                pieces.index.tolist(), strict=True)):  # fmt: skip
+        if key not in frames:
+            s, k = Part(*key).ends()[end], key[0]
+            rho = (1 - s) * funnel.rho[k] + s * funnel.rho[k + 1]
+            frames[key] = np.sqrt(rho) * section_at(steps.field, policy, funnel.P, k, s).base
+        T[b] = frames[key]
+    framed = replace(batch, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)),
+                     taken=np.zeros_like(batch.taken))  # fmt: skip
+    nothing = np.zeros((len(policy.t) - 1, steps.field.m))
+    c = framed.polynomial(steps, policy, funnel, nothing)
+    sizes = [len(monomials_of(n, q)) for q in range(4)]
+    parts = [c[q][:, -end] if q in c else np.zeros((len(T), size)) for q, size in enumerate(sizes)]
+    return _least(pieces.basis, [-part for part in parts]), T
+
+
+def _least(basis: IntArray, p: list[FloatArray]) -> _Shown:
+    """The least r with r - p - (λ₀ + λ₁|z|²)(1 - |z|²) a sum of squares, p by degree, (B, M_q)."""
+    n, count = basis.shape[1], len(p[0])
+    order = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
+    linear, (quadratic, cubic) = p[1][:, order], (monomials_of(n, q) for q in (2, 3))
+    Q, C = np.zeros((count, n, n)), np.zeros((count, n, len(quadratic)))
+    for place, row in enumerate(quadratic):
+        a, b = np.repeat(np.arange(n), row).tolist()
+        Q[:, a, b] += p[2][:, place] / 2
+        Q[:, b, a] += p[2][:, place] / 2
+    for place, row in enumerate(cubic):
+        for i in np.flatnonzero(row).tolist():
+            rest = (row - np.eye(n, dtype=np.int64)[i])[None]
+            C[:, i, int(positions(rest, quadratic)[0])] += p[3][:, place] * row[i] / 3
+    D = np.where((quadratic == 2).any(axis=1), 1.0, 2.0)
+    N = C / D @ C.swapaxes(1, 2) / 4
+    size = np.linalg.norm(linear, axis=1) + np.abs(p[0][:, 0]) + np.linalg.norm(Q, axis=(1, 2))
+    size = np.maximum(size, np.finfo(float).tiny)
+    best = np.full(count, np.inf)
+    found = np.zeros((count, 2))
+    for scale in QUARTICS:
+        quartic = scale * np.sqrt(np.linalg.norm(N, axis=(1, 2))) + LEAST_QUARTIC * size
+        G = Q + quartic[:, None, None] * np.eye(n) + N / quartic[:, None, None]
+        values, vectors = np.linalg.eigh(G)
+        turned = np.einsum("bij,bi->bj", vectors, linear)
+        constant = _smallest(values, turned, LEAST_QUARTIC * size)
+        rate = p[0][:, 0] + constant + (turned**2 / (constant[:, None] - values)).sum(axis=1) / 4
+        better = rate < best
+        best = np.where(better, rate, best)
+        found[better] = np.stack([constant, quartic], axis=1)[better]
+    gram = np.zeros((count, len(basis), len(basis)))
+    one = int(np.flatnonzero(~basis.any(axis=1))[0])
+    first, second = positions(np.eye(n, dtype=np.int64), basis), positions(quadratic, basis)
+    gram[:, one, one] = -p[0][:, 0] - found[:, 0]
+    gram[:, one, first] = gram[:, first, one] = -linear / 2
+    gram[:, first[:, None], first] = (found[:, :1] - found[:, 1:])[..., None] * np.eye(n) - Q
+    gram[:, first[:, None], second] = -C / 2
+    gram[:, second[:, None], first] = -C.swapaxes(1, 2) / 2
+    gram[:, second, second] = found[:, 1:] * D
+    return _Shown(best, found, gram)
+
+
+def _smallest(values: FloatArray, b: FloatArray, least: FloatArray) -> FloatArray:
+    """(B,) μ > max(values, 0) that makes μ + Σ b²/(μ - values)/4 least, by golden section."""
+    low = np.maximum(values[:, -1], 0.0) + least
+    high = low + np.linalg.norm(b, axis=1) / 2
+
+    def cost(mu: FloatArray) -> FloatArray:
+        return np.asarray(mu + (b**2 / (mu[:, None] - values)).sum(axis=1) / 4)
+
+    for _ in range(SEARCHES):
+        a, c = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        left = cost(a) < cost(c)
+        low, high = np.where(left, low, a), np.where(left, c, high)
+    return np.asarray((low + high) / 2)
+
+
+def _witnessed(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates,
+    rates: FloatArray,
+) -> _Rates:  # fmt: skip
+    """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
+    pieces, k = batch.pieces, batch.pieces.interval
+    tau, gram = pieces.tau.copy(), pieces.gram.copy()
+    room = np.diff(funnel.t)[k] * (rates[k, batch.entry] - batch.taken)
+    one = int(np.flatnonzero(~pieces.basis.any(axis=1))[0])
+    for end in (0, 1):
+        shown, T = _shown(steps, policy, funnel, batch, end)
+        inverse = np.linalg.inv(T)
+        shown.gram[:, one, one] += room
+        constant, quartic = shown.multipliers.T
+        shape = inverse.swapaxes(1, 2) @ inverse
+        rho = funnel.rho[k] + _ends(pieces)[end] * (funnel.rho[k + 1] - funnel.rho[k])
+        tau[:, end, 0, 0, 0] = constant / rho
+        tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * shape
+        for b in range(len(pieces)):
+            M = substitution(pieces.basis, inverse[b])
+            gram[b, end] = M.T @ shown.gram[b] @ M
+    return replace(batch, pieces=multipliers_of_rates(replace(pieces, tau=tau, gram=gram)))
+
+
+def _ends(pieces: Pieces) -> tuple[FloatArray, FloatArray]:
+    """(B,) start and end of each part, as fractions of the interval."""
+    whole = 2.0**pieces.level
+    return pieces.index / whole, (pieces.index + 1) / whole

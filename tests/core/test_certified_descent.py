@@ -1,0 +1,168 @@
+"""Simulation error minimised inside the convex sets: proved, and as low as without a proof."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nlsid_core import proofs
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.identification import (
+    CertifiedSem,
+    ImplicitClass,
+    LeastSquares,
+    LinearStateClass,
+    MonotoneClass,
+    Rie,
+    Sem,
+    identify,
+)
+from nlsid_core.identification.implicit_class import build_implicit_rows
+from nlsid_core.identification.implicit_descent import ImplicitSet
+from nlsid_core.identification.implicit_search import least_squares_coefficients
+from nlsid_core.identification.moment_rie import Problem
+from nlsid_core.identification.moments import Offsets, offsets_of, plain_moments
+from nlsid_core.identification.monotone_descent import MonotoneSet
+from nlsid_core.identification.starts import as_implicit, as_monotone, linear_start
+from tests.repeated import CLASS, run, truth
+
+
+def noisy(samples: int, seed: int, noise: float = 0.1) -> Dataset:
+    return Dataset((run(np.random.default_rng(seed).uniform(-2, 2, samples), noise, seed),))
+
+
+def resonant(samples: int, seed: int) -> Dataset:
+    """A lightly damped response, which no V of the monotone set proves: poles of radius 0.97."""
+    rng = np.random.default_rng(seed)
+    made = replace(truth(), e=np.array([2.0, 0.0, 0.2]), a=np.array([3.6, -1.9]), c=0.0)
+    u = rng.uniform(-1.0, 1.0, samples)
+    y = made.simulate(u) + 0.05 * rng.standard_normal(samples)
+    return Dataset((Trajectory(t=0.01 * np.arange(samples), y=y, u=u),))
+
+
+def coupled(samples: int, seed: int) -> Dataset:
+    """Two states x⁺ = A x + B u, measured with noise in different units."""
+    rng = np.random.default_rng(seed)
+    A, B = np.array([[0.9, 0.2], [-0.3, 0.8]]), np.array([[1.0, 0.0], [0.3, -0.5]])
+    u, x = rng.uniform(-1.0, 1.0, (samples, 2)), np.zeros((samples, 2))
+    for t in range(1, samples):
+        x[t] = A @ x[t - 1] + B @ u[t - 1]
+    y = (x + 0.4 * rng.standard_normal(x.shape)) * [1.0, 30.0] + [0.0, 5.0]
+    return Dataset((Trajectory(t=0.1 * np.arange(samples), y=y, u=u),))
+
+
+def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
+    fit = identify(noisy(1500, 1), CLASS, method=CertifiedSem(), comparators=(Sem(), Rie()))
+    free, proved = (fit.errors["train"][name] for name in ("sem", "sem_certified"))
+    assert proved == pytest.approx(free, rel=1e-4)
+    assert proved < 0.95 * fit.errors["train"]["rie"]
+    assert fit.proof.rate < 1.0
+
+
+def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> None:
+    data = resonant(1500, 0)
+    model_class = MonotoneClass(2, (0,))
+    fit = identify(data, model_class, method=CertifiedSem(), comparators=(Sem(), Rie()))
+    errors = fit.errors["train"]
+    assert errors["sem"] < errors["sem_certified"] < 0.98 * errors["rie"]
+    assert fit["sem"].proof is None, "the truth is outside the set"
+    assert fit.proof.rate <= fit.max_rate
+    decided = proofs.decide(
+        fit.proof.document(fit.model, "m.json"), {"m.json": fit.model.document()}
+    )
+    assert "incremental stability" in decided.statement
+
+
+def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
+    fast = identify(noisy(800, 1), CLASS, method=CertifiedSem(), comparators=(), max_rate=0.4)
+    assert fast.proof.rate <= 0.4
+    free = identify(noisy(800, 1), CLASS, method=CertifiedSem(), comparators=())
+    assert free.proof.rate > 0.4
+    assert free.errors["train"]["sem_certified"] < fast.errors["train"]["sem_certified"]
+
+
+@pytest.mark.parametrize(
+    "model_class",
+    [
+        ImplicitClass(2, (0,)),
+        ImplicitClass(2, (0,), "2.10"),
+        ImplicitClass(1, (0,), "2.12"),
+        ImplicitClass(1, (0,), "2.13"),
+        ImplicitClass(1, (0,), "2.13", 5, 3),
+        ImplicitClass(1, (0,), "2.19", 1),
+        ImplicitClass(1, (0,), "2.11", 3, 2, box=((-4.0, 4.0), (-2.1, 2.1))),
+    ],
+    ids=str,
+)
+def test_every_set_of_implicit_models_has_a_proved_minimum_below_its_bounds(
+    model_class: ImplicitClass,
+) -> None:
+    fit = identify(
+        noisy(500, 1), model_class, method=CertifiedSem(), comparators=(LeastSquares(), Rie())
+    )
+    errors = fit.errors["train"]
+    assert errors["sem_certified"] < min(errors["rie"], errors["least_squares"]) * (1 + 1e-9)
+    document = fit.proof.document(fit.model, "m.json")
+    assert document["claim"]["set"] == model_class.set
+    proofs.decide(document, {"m.json": fit.model.document()})
+
+
+def test_linear_models_of_several_measured_states_are_found_and_proved() -> None:
+    data, test = coupled(400, 0), coupled(400, 1)
+    fit = identify(
+        data, LinearStateClass(), method=CertifiedSem(), comparators=(LeastSquares(),), test=test
+    )
+    for name in ("train", "test"):
+        errors = fit.errors[name]
+        assert errors["sem_certified"] < 0.9 * errors["least_squares"], "noise biases the latter"
+    none = np.zeros((1, 2))
+    A = fit.model.jacobian(none, none, none)[0, :, :2] * [[1.0, 30.0], [1.0 / 30.0, 1.0]]
+    assert np.abs(A - [[0.9, 0.2], [-0.3, 0.8]]).max() < 0.05
+
+
+def test_the_sensitivities_are_those_of_the_simulation() -> None:
+    data = noisy(60, 1)
+    rows = build_implicit_rows(
+        data, ImplicitClass(2, (0, 1), right_degree=2, box=((-9, 9), (-3, 3)))
+    )
+    implicit = ImplicitSet(rows, 1.0)
+    at = np.concatenate(least_squares_coefficients(rows)).ravel()
+    offsets = offsets_of(data.trajectories)
+    moments = plain_moments(data.trajectories, CLASS, offsets)
+    monotone = MonotoneSet(
+        Problem.of(moments, 2, 1.0), CLASS, Offsets(offsets.y, offsets.u), data.trajectories
+    )
+    c = np.concatenate([truth().e[1:], [-truth().c], -truth().a, -truth().b]) / truth().e[0]
+    for problem, theta in ((implicit, at), (monotone, c)):
+        direction = np.random.default_rng(0).normal(size=theta.size) * np.abs(theta)
+        found = problem.outputs(theta)
+        moved = [problem.outputs(theta + s * 1e-6 * direction) for s in (1.0, -1.0)]
+        assert found is not None
+        assert moved[0] is not None
+        assert moved[1] is not None
+        change = (moved[0].r - moved[1].r) / 2e-6
+        np.testing.assert_allclose(found.J @ direction, change, atol=1e-6 * np.abs(change).max())
+        assert problem.cost(theta) == pytest.approx(float(found.r @ found.r))
+
+
+def test_a_linear_model_begins_as_itself_in_the_other_classes() -> None:
+    data = noisy(400, 3)
+    start = linear_start(data, 2, (0, 1))
+    assert start is not None
+    trial = data.trajectories[0]
+    expected = start.simulate(trial.u, trial.y[:2])[:, 0]
+    straight = as_monotone(start, MonotoneClass(2, (0, 1), degree=1))
+    np.testing.assert_allclose(straight.simulate(trial.u, trial.y[:2, 0]), expected, atol=1e-9)
+    rows = build_implicit_rows(data, ImplicitClass(2, (0, 1)))
+    found = ImplicitSet(rows, 1.0).outputs(np.concatenate(as_implicit(start, rows)).ravel())
+    assert found is not None
+    error = (expected - trial.y[:, 0])[2:] / rows.y_scale[1][0]
+    np.testing.assert_allclose(found.r, error, atol=1e-9)
+
+
+def test_of_a_random_walk_there_is_a_stable_model_too() -> None:
+    u = np.random.default_rng(1).uniform(-1.0, 1.0, 300)
+    y = np.cumsum(np.random.default_rng(0).standard_normal(300))
+    data = Dataset((Trajectory(t=np.arange(300.0), y=y, u=u),))
+    fit = identify(data, MonotoneClass(1, (0,)), method=CertifiedSem(), comparators=())
+    assert fit.proof.rate <= fit.max_rate

@@ -1,0 +1,174 @@
+"""Funnels whose input is held between samples and whose state is measured wrong."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core import proofs
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
+from tests.funnel_files import POLICY, PROOF, Files, bind, copy_of, saved
+
+HOLD, STEPS = 0.01, 10  # s; Runge-Kutta steps between samples
+ERROR = [0.002, 0.01]
+
+
+def turning(x: Any, u: Any, w: Any) -> Any:
+    """A push of either sign on a pendulum that falls, its sine a cubic."""
+    return np.array([x[1] + w[0], 9.0 * x[0] - 1.5 * x[0] ** 3 + u[0]])
+
+
+def moved(x: FloatArray, u: FloatArray, w: float) -> FloatArray:
+    """The same for states (N, 2)."""
+    return np.stack([x[:, 1] + w, 9.0 * x[:, 0] - 1.5 * x[:, 0] ** 3 + u[:, 0]], axis=1)
+
+
+def tracking(**options: Any) -> ContinuousTracking:
+    """A swing of 0.3 rad in a second."""
+    field = VectorField.from_function(turning, 2, 1, uncertain=[[-0.01, 0.01]])
+    nominal = integrate_nominal(
+        field, lambda t: np.array([-9.0 * 0.3 * np.cos(2.0 * t)]), t=np.linspace(0, 1, 26),
+        start=np.array([0.25, 0.0]),
+    )  # fmt: skip
+    return ContinuousTracking(
+        field, nominal, goal=np.diag([25.0, 4.0]), Q=np.diag([500.0, 40.0]), R=[[1.0]], **options
+    )
+
+
+@pytest.fixture(scope="module")
+def held() -> FunnelDesign:
+    """Held and measured wrong."""
+    return design(tracking(hold=HOLD, error=ERROR))
+
+
+@pytest.fixture
+def files(held: FunnelDesign, tmp_path: Path) -> Files:
+    """Its documents."""
+    return saved(held, tmp_path)
+
+
+def largest(
+    found: FunnelDesign, rate: Any, *, hold: float, error: Any = 0.0, starts: int = 500
+) -> float:
+    """The largest V at any sample of simulated runs from the boundary, with the input held."""
+    rng = np.random.default_rng(5)
+    policy, funnel, n = found.policy, found.funnel, found.funnel.n
+    directions = rng.normal(size=(starts, n))
+    x = funnel.boundary(0.0, directions / np.linalg.norm(directions, axis=1)[:, None])
+    worst, wrong = 0.0, np.asarray(error)
+    times = np.arange(0.0, funnel.tf + hold / 2, hold)
+    for start, end in zip(times[:-1], np.minimum(times[1:], funnel.tf), strict=True):
+        measured = x + rng.choice([-1.0, 1.0], size=x.shape) * wrong
+        u, h = policy(float(start), measured), (end - start) / STEPS
+        for _ in range(STEPS):
+            a = rate(x, u)
+            b = rate(x + h / 2 * a, u)
+            c = rate(x + h / 2 * b, u)
+            x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c, u))
+        worst = max(worst, float(funnel.value(float(end), x).max()))
+    return worst
+
+
+def test_runs_that_are_held_and_measured_wrong_stay_inside(held: FunnelDesign) -> None:
+    for w in (-0.01, 0.01):
+        rate = partial(moved, w=w)
+        assert largest(held, rate, hold=HOLD, error=ERROR) < 1
+        assert largest(held, rate, hold=HOLD / 3, error=ERROR) < 1
+
+
+def test_the_claim_says_how_often_and_how_wrong(held: FunnelDesign) -> None:
+    said = held.verdict.assumptions[0]
+    assert "applied every 0.01 s or more often" in said
+    assert "measured wrong by at most: x0 by 0.002, x1 by 0.01" in said
+    assert "no hold" in design(tracking()).verdict.assumptions[0]
+
+
+def test_holding_costs_room(held: FunnelDesign) -> None:
+    free = design(tracking())
+    assert 0.2 < held.funnel.volume(0.0) / free.funnel.volume(0.0) < 1
+
+
+def refused(files: Files, reason: str) -> None:
+    """The kernel refuses the documents, all digests fresh."""
+    bind(files)
+    with pytest.raises(CertificateRejected, match=reason):
+        proofs.decide(files[PROOF], files)
+
+
+def test_what_is_a_little_more_than_was_proved_is_refused(files: Files) -> None:
+    longer = copy_of(files)
+    longer[PROOF]["claim"]["hold"] *= 1.5
+    refused(longer, "not positive")
+    shakier = copy_of(files)
+    shakier[PROOF]["claim"]["error"] = [5 * e for e in ERROR]
+    refused(shakier, "not positive")
+    slower = copy_of(files)
+    slower[PROOF]["proof"]["rates"][3][0] *= 0.5
+    refused(slower, "not positive")
+    fewer = copy_of(files)
+    del fewer[PROOF]["proof"]["rate_pieces"][7]
+    refused(fewer, "a piece of interval .* is missing")
+    unsigned = copy_of(files)
+    for piece in unsigned[PROOF]["proof"]["rate_pieces"]:
+        piece["sign"] = 1
+    refused(unsigned, "is missing")
+    still = copy_of(files)
+    still[PROOF]["proof"]["rates"][0][0] = 0.0
+    refused(still, "hold and rates should be positive")
+    jumping = copy_of(files)
+    jumping[POLICY]["K"][4][0][0][0] *= 1.001
+    refused(jumping, "the policy jumps at a knot")
+    bare = copy_of(files)
+    del bare[PROOF]["claim"]["hold"]
+    refused(bare, "unknown member")
+
+
+def test_an_input_that_is_clipped_may_be_held_too() -> None:
+    """ẋ = x - x³/3 + clip(u), which asks for more than it gets at its funnel's edge."""
+    field = VectorField.from_function(lambda x, u: x - x**3 / 3 + u, 1, 1)
+    nominal = integrate_nominal(field, lambda _: [0.0], t=np.linspace(0, 0.5, 5), start=[0.0])
+    found = design(
+        ContinuousTracking(field, nominal, goal=[[1.0]], limits=[[0, -1.5, 2.0]], hold=0.02)
+    )
+    edge = found.funnel.widths(0.0)[0]
+    assert found.policy.K.control[0, 0, 0, 0] * edge > 1.5
+    assert largest(found, lambda x, u: x - x**3 / 3 + u, hold=0.02) < 1
+    assert "every 0.02 s or more often" in found.verdict.assumptions[0]
+
+
+def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
+    with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
+        design(tracking(hold=1.0))
+
+
+def test_the_largest_hold_is_found_and_said() -> None:
+    found = design(tracking(hold="largest"))
+    assert HOLD <= found.claim["hold"] < 0.1
+    assert f"{found.claim['hold']:.17g}" in found.verdict.assumptions[0]
+    assert largest(found, partial(moved, w=0.01), hold=found.claim["hold"]) < 1
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"hold": 0.0}, "hold is 0.0"),
+        ({"hold": "longest"}, "hold is 'longest'"),
+        ({"error": [0.1]}, "2 bounds of 0 or more"),
+        ({"error": [0.1, -0.1]}, "2 bounds of 0 or more"),
+    ],
+)
+def test_what_cannot_be_held_is_refused(options: Any, reason: str) -> None:
+    with pytest.raises(OptionError, match=reason):
+        design(tracking(**options))
+
+
+def test_a_hold_needs_dynamics_that_are_affine_in_the_input() -> None:
+    field = VectorField.from_function(lambda u: u**2 + u, 1, 1)
+    nominal = integrate_nominal(field, lambda _: [0.1], t=np.linspace(0, 1, 5), start=[0.0])
+    with pytest.raises(DataError, match="affine in each input"):
+        design(ContinuousTracking(field, nominal, goal=[[1.0]], hold=0.01))
