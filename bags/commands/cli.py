@@ -300,7 +300,11 @@ def monitor(
         bool, typer.Option("--replay", help="Replay the bags (live monitoring is funnel_monitor).")
     ] = False,
     config: Annotated[
-        Path | None, typer.Option(help="Takes `split.test` (which bags) and `monitor.nominal`.")
+        Path | None,
+        typer.Option(help="Takes `split.test` (which bags), `monitor.nominal`, `definitions`."),
+    ] = None,
+    definitions: Annotated[
+        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
@@ -327,7 +331,8 @@ def monitor(
     from bags.designs.design import Wiring
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
-    from bags.recordings.folders import expand_bags
+    from bags.recordings.definitions import read_definitions
+    from bags.recordings.folders import expand_bags, trial_name
 
     if not replay:
         raise typer.BadParameter(
@@ -338,13 +343,14 @@ def monitor(
     proved = documents.load_proved(funnel, wiring=wiring)
     folders = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in folders if f.name in settings.split.test] or folders
+        folders = [f for f in folders if trial_name(f) in settings.split.test] or folders
+    types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
-            replays.append(replay_bag(proved, bag, centre=centre))
+            replays.append(replay_bag(proved, bag, centre=centre, definitions=types))
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
         drawn = report_available() and all(entry.half_width for entry in replays)

@@ -1,5 +1,6 @@
 """`nlsid init`: a first configuration from bags, asked for on a terminal or said by options."""
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,10 +65,14 @@ def run_init(
         definitions=definitions,
         types=types,
     )
+    if definitions:  # a configuration's paths are seen from where it is
+        proposal.content["definitions"] = [
+            os.path.relpath(path, target.parent) for path in definitions
+        ]
     write_atomically(target, yaml_text(proposal).encode())
     for text in (*chosen_u, *chosen_y):
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
-    for wall in proposal.walls:
+    for wall in dict.fromkeys(proposal.walls):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
     given = "TRIALS" if live else " ".join(map(str, bags))
