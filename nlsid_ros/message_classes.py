@@ -5,11 +5,8 @@ import re
 from functools import cache
 from typing import Any, Final
 
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
-from rosbags.typesys.store import Typestore
-
-from bags.recordings.definitions import definitions_from
-from bags.recordings.message_types import standard_types, types_in_bag
+from bags.recordings.definitions import types_from
+from bags.recordings.message_types import standard_types
 from nlsid_core.errors import BagError
 
 _NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)", re.ASCII)
@@ -30,8 +27,8 @@ def message_class(msgtype: str) -> Any:
 
 
 @cache
-def installed_types(msgtype: str) -> Typestore:
-    """The types of `msgtype` and of what it is made of, as they are installed.
+def installed_types(msgtype: str) -> Any:
+    """The type store of `msgtype` and of what it is made of, as they are installed.
 
     Raises BagError if the type is neither standard nor installed.
     """
@@ -39,8 +36,7 @@ def installed_types(msgtype: str) -> Typestore:
         return standard_types()
     texts: dict[str, str] = {}
     _describe(msgtype, texts)
-    text = definitions_from(texts)[msgtype].text
-    return types_in_bag(msgtype, MessageDefinition(MessageDefinitionFormat.MSG, text))
+    return types_from(msgtype, texts)
 
 
 def _describe(msgtype: str, texts: dict[str, str]) -> None:
