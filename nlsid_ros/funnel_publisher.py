@@ -30,6 +30,7 @@ from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
 
 NAME = "funnel_publisher"
 LOOK = 0.5  # s between looks at the files
+REDRAW = 1.0  # s between pictures, which last three
 POLL = 0.1  # s between looks at a check that is on
 REPORT = 1.0  # s between diagnostics while nothing changes
 
@@ -44,7 +45,9 @@ class FunnelPublisher(ManagedNode):
         """Declare them; take the values that they have now."""
         what = "funnel.json, with its proof beside it"
         self._path = Path(declare_text(self, "funnel", "", what, tunable=True))
-        self._frame = declare_text(self, "frame", "map", "frame the tube is drawn in")
+        self._frame = declare_text(
+            self, "frame", "map", "frame the tube is drawn in and moves with"
+        )
         self._watch = bool(declare(self, "watch", True, "publish again when the files change"))
         self._latched: dict[str, Publisher] = {}
         self._check: Check | None = None
@@ -72,6 +75,7 @@ class FunnelPublisher(ManagedNode):
         self._publish(self._load(self._path))
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(REPORT, self._report, clock=wall)
+        self.create_timer(REDRAW, self._draw, clock=wall)
         if self._watch:
             self.create_timer(LOOK, self._look, clock=wall)
             self.create_timer(POLL, self._poll, clock=wall)
@@ -143,11 +147,18 @@ class FunnelPublisher(ManagedNode):
     def _publish(self, proved: tuple[Bundle, AnyDesign, str]) -> None:
         bundle, design, verdict = proved
         self._latched["design"].publish(String(data=bundle.text()))
-        if design.policy is not None:  # without a plan there is nothing to draw
-            self._latched["tube"].publish(tube_markers(design, self._frame))
+        self._drawn = design
+        self._draw()
+        if design.policy is not None:
             self._latched["nominal"].publish(nominal_trajectory(design))
         self._say(DiagnosticStatus.OK, verdict)
         self.get_logger().info(verdict)
+
+    def _draw(self) -> None:
+        """Again and again: the picture goes when the publisher does."""
+        if self._drawn.policy is not None:  # without a plan there is nothing to draw
+            now = self.get_clock().now().to_msg()
+            self._latched["tube"].publish(tube_markers(self._drawn, self._frame, now))
 
     def _say(self, level: bytes, message: str) -> None:
         self._said = level, message

@@ -2,6 +2,7 @@
 
 from nlsid_core.design.compose import compose_funnels
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
+from nlsid_core.design.continuous.motion import plan_motion
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import (
     Tracking,
@@ -11,8 +12,7 @@ from nlsid_core.design.continuous.tvlqr import (
     tvlqr,
 )
 from nlsid_core.design.design import design
-from nlsid_core.design.linear import TubeDesign, design_tube
-from nlsid_core.design.problems import ContinuousTracking, LinearTube, OutputTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
@@ -21,20 +21,18 @@ __all__ = [
     "Feedback",
     "FunnelDesign",
     "Goal",
-    "LinearTube",
     "OutputTube",
     "OutputTubeDesign",
     "SampledTracking",
     "Tracking",
-    "TubeDesign",
     "compose_funnels",
     "design",
     "design_funnel",
     "design_output_tube",
-    "design_tube",
     "discrete_tvlqr",
     "integrate_nominal",
     "lyapunov",
     "nominal_through",
+    "plan_motion",
     "tvlqr",
 ]

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import MarkerArray
+from visualization_msgs.msg import Marker, MarkerArray
 
 from bags.designs import documents
 from bags.designs.bundle import Bundle
@@ -213,9 +213,8 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
         for name in names:
             (tmp_path / place / name).write_bytes((funnel.parent / name).read_bytes())
     forged = files.load_document(tmp_path / "forged" / documents.FUNNEL)
-    files.write_document(
-        tmp_path / "forged" / documents.FUNNEL, forged | {"level": 2.0 * forged["level"]}
-    )
+    forged["tubes"][0]["level"] *= 2.0
+    files.write_document(tmp_path / "forged" / documents.FUNNEL, forged)
     with (
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_publisher", funnel=funnel) as publisher,
@@ -291,9 +290,14 @@ def test_the_funnels_picture_is_in_the_frame_that_was_asked_for(funnel: Path) ->
         node.create_subscription(
             JointTrajectory, "/funnel_publisher/nominal", plans.append, qos.DOCUMENT
         )
-        spin_until(lambda: bool(tubes) and bool(plans))
+        spin_until(lambda: len(tubes) > 1 and bool(plans))
         stop(publisher)
     assert {marker.header.frame_id for marker in tubes[0].markers} == {"odom"}
+    assert tubes[0].markers[0].action == Marker.DELETEALL
+    assert all(marker.header.stamp.sec > 0 for marker in tubes[0].markers)
+    assert all(marker.frame_locked for marker in tubes[0].markers[1:])
+    assert all(marker.lifetime.sec == 3 for marker in tubes[0].markers[1:]), "it goes with its node"
+    assert tubes[0].markers[1].header.stamp != tubes[1].markers[1].header.stamp
     assert all(marker.pose.orientation.w == 1.0 for marker in tubes[0].markers)
     times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in plans[0].points]
     assert times[:2] == [0.0, pytest.approx(0.025)]
