@@ -19,6 +19,7 @@ from nlsid_core.funnels.protocol import AnyFunnel
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.policies.protocol import AnyPolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
+from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Dynamics, refuse_mismatch
 from nlsid_core.running.observer import (
     MeasuredStateObserver,
@@ -77,8 +78,9 @@ class Controller:
     the caller's then. `lead`: s from a sample to the stamp of its input, not quite a period where
     the input is that of the next sample, so that a sample off the grid still finds it in force.
 
-    model, policy, funnel, period: as for `Monitor`. Raises CertificateMismatch if the parts do not
-    belong together, DataError if the limits cut off an input of the plan.
+    model, policy, funnel, period, held: as for `Monitor`. Raises CertificateMismatch if the parts
+    do not belong together, DataError if the limits cut off an input of the plan, or if the period
+    is longer than the hold that is proved.
     """
 
     def __init__(
@@ -90,8 +92,9 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float | None = None,
+        held: Held | None = None,
     ) -> None:
-        self._follow([(model, policy, funnel)], limits, settling, period)
+        self._follow([(model, policy, funnel)], limits, settling, period, held)
 
     @classmethod
     def of_stages(
@@ -101,10 +104,11 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
+        held: Held | None = None,
     ) -> "Controller":
         """The policies of a composition, one stage after another."""
         controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period)
+        controller._follow(list(stages), limits, settling, period, held)
         return controller
 
     def _follow(
@@ -113,6 +117,7 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float | None,
+        held: Held | None,
     ) -> None:
         for parts in stages:
             refuse_mismatch(*parts)
@@ -122,6 +127,8 @@ class Controller:
         if self._continuous:
             if period is None or not period > 0.0:
                 raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+            self._held = held or Held()
+            self._held.refuse(period)
             self.period, self._origin = period, float(funnel.t0)
             self._end = stages[-1][2].last - (1.0 - TOLERANCE) * period  # an input is held so long
         else:
@@ -185,6 +192,8 @@ class Controller:
         _, policy, funnel = self._stages[0]
         nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
         size = funnel.start_size(x - nominal)
+        if self._continuous:
+            size += self._held.reach(funnel.shape(self._origin))
         if size <= 1.0:
             self.k = 1 - self._observer.ahead
             self._answer(self._origin, x)
