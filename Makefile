@@ -15,13 +15,14 @@ PYTHON ?= $(shell \
     $$p -c '$(call SUITS,(3, 99))' 2>/dev/null && { echo $$p; exit; }; \
   done)
 
-.PHONY: demo test check lint benchmarks clean help
+.PHONY: demo test check lint docs benchmarks clean help
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo   run the chain on the shipped bags'
 	@echo 'make test   run the tests that need no ROS'
 	@echo 'make check  ruff, mypy and make test'
+	@echo 'make docs   build the site, running every block of its tutorials'
 	@echo 'make benchmarks  run them all: one JSON file each in benchmarks/results'
 	@echo 'make clean  remove what these made'
 
@@ -43,6 +44,11 @@ lint: $(VENV)/.test
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# Every page is read and run again: what the site shows is what this checkout does.
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet --builder html docs build/site
+	@echo 'wrote build/site/index.html'
+
 clean:
 	rm -rf .venv .venv-* nlsid-demo build install log *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -61,6 +67,9 @@ $(VENV)/.demo: pyproject.toml setup.py | $(BIN)/python
 
 $(VENV)/.test: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report$(COMMA)export$(COMMA)sim$(COMMA)test)
+
+$(VENV)/.docs: pyproject.toml setup.py | $(BIN)/python
+	$(call install,report$(COMMA)docs)
 
 $(VENV)/.bench: pyproject.toml setup.py | $(BIN)/python
 	$(call install,report$(COMMA)sim$(COMMA)bench)

@@ -60,6 +60,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "bridge_recordings": Benchmark("bridge_recordings", data="."),
         "drake_funnel": Benchmark("drake_funnel"),
         "f1tenth": Benchmark("f1tenth"),
+        "executors": Benchmark("executors"),
         "faults": Benchmark("faults"),
         "first_order_bias": Benchmark("first_order_bias"),
         "funnel_scaling": Benchmark("funnel_scaling"),

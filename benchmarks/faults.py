@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -328,6 +329,51 @@ def clock_faults(rig: Rig, only: str) -> Iterator[Seen]:
             yield _judged(rig, name, expected, since)
 
 
+BURNERS = 8  # processes that want the monitor's one processor, all before it
+
+
+def machine_faults(rig: Rig, folder: Path, only: str) -> Iterator[Seen]:
+    """A monitor that hardly gets a processor, and a recorder whose file can grow no further."""
+    name = "outside, with the processor starved"
+    if only in name:
+        with ExitStack() as stack:
+            patient = {"stale_after": STALE, "command_wait": 0.1}
+            monitor = stack.enter_context(python(*node(MONITOR, **patient)))
+            rig.need("the monitor", lambda: rig.odom.get_subscription_count() >= 1)
+            rig.need("its commands", lambda: rig.command.get_subscription_count() >= 2)
+            burners: list[subprocess.Popen[bytes]] = []
+
+            def starve(rig: Rig, _k: int, stamp_ns: int) -> None:
+                while len(burners) < BURNERS:
+                    burners.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+                    os.sched_setaffinity(burners[-1].pid, {0})
+                rig.sample(stamp_ns, speed=1.0)
+
+            os.sched_setaffinity(monitor.pid, {0})
+            os.setpriority(os.PRIO_PROCESS, monitor.pid, 10)
+            try:
+                yield _fed(rig, name, starve, "^(outside|unknown)")
+            finally:
+                for burner in burners:
+                    burner.kill()
+                    burner.wait()
+    name = "full disk"
+    if only in name:
+        rig.said.clear()
+        recorder, grown = "trajectory_recorder", 200_000
+        to = {"topics": ["/odom"], "bag": folder / "full", "compression": "none"}
+        with python(*node(recorder, **to)) as running:
+            rig.need("the recorder", lambda: rig.odom.get_subscription_count() >= 1)
+            resource.prlimit(running.pid, resource.RLIMIT_FSIZE, (grown, grown))
+            since, expected = time.monotonic(), "recording stopped"
+            while not rig.has_said(recorder, expected) >= 0 and time.monotonic() < since + PATIENCE:
+                rig.sample(time.time_ns())
+                rig.spin(0.002)
+            at, said = rig.has_said(recorder, expected), rig.said.get(recorder, Said())
+            named = at >= 0 and said.level == DiagnosticStatus.ERROR and running.poll() is None
+        yield Seen(name, expected, said.text, at - since, named)
+
+
 def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
     """Texts that are no proved design, and why they are refused."""
 
@@ -422,7 +468,8 @@ def loop(rig: Rig, funnel: Path) -> Iterator[dict[str, "subprocess.Popen[bytes]"
         "funnel_publisher": {"funnel": funnel},
         "plant": {"model": funnel.with_name(MODEL), "noise": 0.002, "push": 0.6},
         MONITOR: {**stale, **watching, "stop_service": f"/{CONTROLLER}/stop"},
-        CONTROLLER: {**stale, "highest": 0.4, "require_monitor": True},
+        # patience that is over before the plan, which lasts 2.9 s
+        CONTROLLER: {**stale, "highest": 0.4, "require_monitor": True, "monitor_patience": STALE},
     }
     with ExitStack() as stack:
         running = {
@@ -506,6 +553,7 @@ def run(folder: Path, only: str = "") -> Iterator[Seen]:
         rig.design.publish(String(data=good.text()))
         yield from message_faults(rig, only)
         yield from clock_faults(rig, only)
+        yield from machine_faults(rig, folder, only)
         yield from design_faults(rig, good, other, only)
     yield from loop_faults(made[0], only)
 

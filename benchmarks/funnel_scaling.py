@@ -51,7 +51,7 @@ def row(n: int) -> dict[str, Any]:
     goal = GOAL * np.eye(n)
     steps = LSteps(field)
     tracking = tvlqr(field, nominal, Q=np.eye(n), R=np.eye(half), S_final=1.01 * goal)
-    section = section_at(field, tracking.policy, tracking.S, KNOTS - 2, 1.0)
+    section = section_at(steps, tracking.policy, tracking.S, KNOTS - 2, 1.0)
     first = steps.solve(section, 1.0)
     started = time.perf_counter()
     steps.solve(section, 0.99, first)

@@ -152,7 +152,7 @@ class Ear(Node):
         self.ready = False
         publisher = self.create_publisher(String, f"{SOURCE}/design", qos.DOCUMENT)
         publisher.publish(String(data=bundle_of(design).text()))
-        lane = Lane(self)
+        lane = Lane(self, stays=True)
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
             lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)
         lane.subscribe(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)

@@ -310,7 +310,10 @@ def _rescaled(program: ConeProgram, tolerance: float) -> _Outcome:
     outcome = _clarabel(scaled, tolerance, refine=True)
     if outcome.x is None:
         return outcome
-    return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, outcome.z / dual)
+    # Without an objective no multiplier is needed: zero ones are optimal for every feasible x.
+    objective = program.q.any() or program.P.nnz
+    z = outcome.z / dual if objective else np.zeros_like(outcome.z)
+    return _Outcome(outcome.status, D * outcome.x / primal, outcome.s / primal, z)
 
 
 def _through_cvxpy(program: ConeProgram, name: str) -> _Outcome:

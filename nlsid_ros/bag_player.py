@@ -12,7 +12,6 @@ from typing import Any
 import rclpy
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.utilities import ok, try_shutdown
 
@@ -21,7 +20,7 @@ from bags.signals.grid import seconds
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.running import declare
+from nlsid_ros.running import PlainNode, declare
 
 NAME = "bag_player"
 SLICE = 0.05  # s: longest sleep, so that an interrupt is noticed
@@ -29,7 +28,7 @@ SETTLE = 1.0  # s: a subscriber learns of its match later than the publisher doe
 ACKNOWLEDGE = 5.0  # s: how long the end waits for reliable subscribers to have everything
 
 
-class BagPlayer(Node):
+class BagPlayer(PlainNode):
     """Plays one bag once."""
 
     def __init__(self) -> None:

@@ -31,7 +31,7 @@ from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.messages import SignalMessage
-from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "excitation"
 KINDS = ("multisine", "chirp", "prbs", "steps", "replay")
@@ -42,8 +42,11 @@ LAST_WORD = 1.0  # s for the last command to be received before the node goes
 class Excitation(ManagedNode):
     """Plays one signal `repeats` times, resting in between."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         number = partial(declare_number, self)
         self._kind = declare_text(self, "kind", "multisine", "one of " + ", ".join(KINDS))
         self._command = SignalMessage(
@@ -124,7 +127,9 @@ class Excitation(ManagedNode):
         self._state, self._failed, self._busy = "idle", False, False
         self._did: dict[str, object] = {}
         self._publisher = self.create_publisher(
-            self._command.kind, self._command.path.topic, qos.STREAM
+            self._command.kind,
+            self.signal_topic(self._command.path.topic),
+            qos.command(self._period),
         )
         self._experiment = self.create_publisher(String, "~/experiment", qos.DOCUMENT)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)

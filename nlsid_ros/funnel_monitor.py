@@ -31,7 +31,7 @@ from bags.monitoring.watch import WAITING, Stamped, Watch
 from bags.recordings.message_types import standard_types
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
-from nlsid_core.errors import BagError, NlsidError
+from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.alarm import SEVERITY, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
@@ -41,7 +41,7 @@ from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wi
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
-from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
 DISCOVERY = 0.1  # s: how often the graph is asked for the signals' types
@@ -61,17 +61,22 @@ ALARM = [field.name for field in fields(AlarmOptions)]
 class FunnelMonitor(ManagedNode):
     """Reads stamped signals, asks the core's Monitor, publishes what it says."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         self._source = declare_text(
             self, "source", "funnel_publisher", "node that publishes the funnel"
         )
         self._controller = declare_text(
             self, "controller", "", "node that announces when a run starts; empty: first sample"
         )
-        self._centre = Centre(
-            declare_text(self, "nominal", "command", "what the tube is around: command or profile")
-        )
+        what = "what the tube is around: command or profile"
+        nominal = declare_text(self, "nominal", "command", what)
+        if nominal not in [centre.value for centre in Centre]:
+            raise DataError(f"nominal is '{nominal}'; it should be command or profile")
+        self._centre = Centre(nominal)
         self._wiring = declare_wiring(self)
         self._expected = declare_expected(self)
         number = partial(declare_number, self, tunable=True)
@@ -104,7 +109,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals = Lane(self)
+        self._signals = Lane(self, stays=not self.shares)
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
@@ -206,7 +211,8 @@ class FunnelMonitor(ManagedNode):
         if self._watch is None:
             return
         for topic in self._watch.pairing.topics:
-            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+            name = self.signal_topic(topic)
+            publishers = self.get_publishers_info_by_topic(self.resolve_topic_name(name))
             kinds = list(dict.fromkeys(publisher.topic_type for publisher in publishers))
             if not kinds or self._kinds.get(topic) in kinds:
                 continue
@@ -221,7 +227,7 @@ class FunnelMonitor(ManagedNode):
             self._kinds[topic], self._unfit = kind, ""
             callback = partial(self._on_signal, topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.subscribe(message_class(kind), topic, callback, profile)
+            self._signals.subscribe(message_class(kind), name, callback, profile)
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
         """The first of the types that carries the signals; BagError about the last if none does."""
@@ -436,7 +442,7 @@ def main(args: list[str] | None = None) -> None:
     """Entry point of `ros2 run nlsid funnel_monitor`."""
     try:
         run(FunnelMonitor, args)
-    except (NlsidError, ValueError) as error:
+    except NlsidError as error:
         sys.exit(f"{NAME}: {error}")
 
 

@@ -23,12 +23,13 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
 from nlsid_core.errors import NlsidError
+from nlsid_ros.bag_player import BagPlayer
 from nlsid_ros.excitation import Excitation
 from nlsid_ros.funnel_monitor import FunnelMonitor
 from nlsid_ros.funnel_publisher import FunnelPublisher
 from nlsid_ros.model_identifier import ModelIdentifier
 from nlsid_ros.plant import PlantNode
-from nlsid_ros.running import ManagedNode
+from nlsid_ros.running import ManagedNode, PlainNode
 from nlsid_ros.tracking_controller import TrackingController
 from nlsid_ros.trajectory_recorder import TrajectoryRecorder
 from nlsid_ros.viewer import Viewer
@@ -40,8 +41,16 @@ graph of the running processes against it. `~` is the node's name; every name ca
 node put in a namespace. Topics in *italics* are named by the funnel's model or by a parameter; here
 they are the F1TENTH car's. All nodes also have the services of a
 [lifecycle node](https://design.ros2.org/articles/node_lifecycle.html). A parameter is read when the
-node is made; those marked • can be changed while it runs. The words are explained
+node is configured; those marked • can be changed while it runs. The words are explained
 in the [glossary](glossary.md).
+"""
+PLAYER = """## bag_player
+
+No lifecycle: it plays a bag once and ends.
+
+| topic or service | type | | QoS |
+|---|---|---|---|
+| *each topic of the bag* | as recorded | publishes | reliable, latched if it was, depth 5000 |
 """
 PATIENCE = 20.0  # s for the nodes to find each other
 SIGNALS = {"/odom", "/cmd_vel"}
@@ -63,7 +72,7 @@ def interfaces(folder: Path) -> str:
         for name, _, parameters in nodes
         for key, value in parameters.items()
         for part in ("-p", f"{name}:{key}:={json.dumps(value)}")
-    ]
+    ] + ["-p", "bag_player:bag:=bag"]
     rclpy.init(args=["--ros-args", "--log-level", "fatal", *settings])
     executor = SingleThreadedExecutor()
     made = []
@@ -77,7 +86,10 @@ def interfaces(folder: Path) -> str:
             if time.monotonic() > deadline:
                 raise NlsidError("the nodes did not find the robot's signals")
             executor.spin_once(timeout_sec=0.1)
-        return "\n".join([HEAD, *(_page(*each) for each in made)])
+        player = BagPlayer()
+        pages = [*(_page(*each) for each in made), PLAYER + _parameters(player)]
+        player.destroy_node()
+        return "\n".join([HEAD, *pages])
     finally:
         for node, *_ in made:
             node.destroy_node()
@@ -158,7 +170,11 @@ def _page(node: ManagedNode, before: set[int], activated: set[int]) -> str:
             continue  # a node that asks itself needs nobody
         rows.append((f"*`{shown}`*" if given else f"`{shown}`", _type_name(row[1]), *row[2:]))
     lines += [f"| {row[0]} | {row[1]} | {row[2]} | {row[3]} |" for row in sorted(rows)]
-    lines += ["\n| parameter | default | range | what |", "|---|---|---|---|"]
+    return "\n".join(lines) + "\n" + _parameters(node)
+
+
+def _parameters(node: ManagedNode | PlainNode) -> str:
+    lines = ["\n| parameter | default | range | what |", "|---|---|---|---|"]
     for declared in sorted(node.declared):
         between = "" if declared.between is None else "{:g} to {:g}".format(*declared.between)
         default = json.dumps(declared.default)

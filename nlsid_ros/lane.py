@@ -25,12 +25,13 @@ Received = Callable[[Any], None]
 class Lane:
     """Subscriptions of a node, which has to be spun by one thread.
 
-    In simulated time it stays for nothing: the clock comes by the executor.
+    In simulated time it stays for nothing: the clock comes by the executor. Neither does it with
+    `stays` False, for a node beside others on one executor.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, *, stays: bool) -> None:
         self._node = node
-        self._stays = not node.get_parameter("use_sim_time").value
+        self._stays = stays and not node.get_parameter("use_sim_time").value
         self._callbacks: dict[Subscription, Received] = {}
 
     def subscribe(self, kind: Any, topic: str, callback: Received, profile: QoSProfile) -> None:

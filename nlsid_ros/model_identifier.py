@@ -20,7 +20,7 @@ from nlsid_core.errors import DataError, NlsidError
 from nlsid_core.proofs import check
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.running import ManagedNode, declare, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
 
 NAME = "model_identifier"
 LOOK = 0.1  # s between looks at the worker
@@ -30,8 +30,11 @@ REPORT = 1.0  # s between diagnostics while nothing changes
 class ModelIdentifier(ManagedNode):
     """One identification at a time; callbacks only start, look at and end the worker."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         bags: Any = declare(
             self, "bags", [""], "bags or folders of bags, read when ~/identify is called"
         )

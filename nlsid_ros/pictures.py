@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from builtin_interfaces.msg import Duration
+from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -12,6 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from bags.designs.design import AnyDesign, is_continuous, is_linear, is_sampled
 from nlsid_core.arrays import FloatArray
 
+LIFETIME = 3  # s after the publisher last said so
 LINE = 0.005  # m, width of the lines
 NOMINAL, EDGE = ColorRGBA(r=0.2, g=0.4, b=1.0, a=1.0), ColorRGBA(r=0.2, g=0.7, b=0.2, a=1.0)
 
@@ -48,16 +49,20 @@ def plan_of(design: AnyDesign) -> Plan:
     return Plan(t, names, design.policy.x, design.funnel.half_widths, design.policy.u)
 
 
-def tube_markers(design: AnyDesign, frame: str) -> MarkerArray:
-    """The plan and the tube's edges over time: 1 m along x is 1 s, along y one unit."""
+def tube_markers(design: AnyDesign, frame: str, stamp: Time) -> MarkerArray:
+    """The plan and the tube's edges over time: 1 m along x is 1 s, along y one unit.
+
+    They move with `frame`, the robot's own as base_link, and go after LIFETIME.
+    """
     plan, markers = plan_of(design), [Marker(action=Marker.DELETEALL)]
-    markers[0].header.frame_id = frame
+    markers[0].header.frame_id, markers[0].header.stamp = frame, stamp
     columns = zip(plan.names, plan.nominal.T, plan.half_widths.T, strict=True)
     for name, nominal, width in columns:
         lines = ((nominal, NOMINAL), (nominal + width, EDGE), (nominal - width, EDGE))
         for number, (values, color) in enumerate(lines):
             marker = Marker(ns=f"tube {name}", id=number, type=Marker.LINE_STRIP, action=Marker.ADD)
-            marker.header.frame_id = frame
+            marker.header.frame_id, marker.header.stamp = frame, stamp
+            marker.frame_locked, marker.lifetime = True, Duration(sec=LIFETIME)
             marker.pose.orientation.w = 1.0
             marker.scale.x, marker.color = LINE, color
             marker.points = [

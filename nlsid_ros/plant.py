@@ -30,7 +30,7 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.plants import FieldPlant, ModelPlant, Pendulum, Plant, Satellite
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
-from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "plant"
 MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
@@ -41,8 +41,11 @@ FOR = "for kinds model and vector_field"
 class PlantNode(ManagedNode):
     """Steps a `Plant` in real time."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         number = partial(declare_number, self)
         self._kind = declare_text(self, "kind", "model", f"what is simulated: {', '.join(KINDS)}")
         what = "model.json, for kind model; vector_field.json, for kind vector_field"
@@ -138,11 +141,14 @@ class PlantNode(ManagedNode):
     def start(self) -> None:
         """Begin at the next sample."""
         self._publisher = self.create_publisher(
-            self._response.kind, self._response.path.topic, qos.STREAM
+            self._response.kind, self.signal_topic(self._response.path.topic), qos.STREAM
         )
         self._commands: list[tuple[int, FloatArray]] = [(0, np.zeros(self._inputs))]
         self.create_subscription(
-            self._command.kind, self._command.path.topic, self._on_command, qos.STREAM
+            self._command.kind,
+            self.signal_topic(self._command.path.topic),
+            self._on_command,
+            qos.STREAM,
         )
         self.create_service(Trigger, "~/push", self._on_push)
         self._period_ns = round(self._plant.period * 1e9)

@@ -28,8 +28,10 @@ from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
+UNCONFIGURED = "unconfigured"
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+Arguments = Sequence[str] | None  # of a node that shares its process: `--ros-args ...`
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
 
@@ -43,15 +45,27 @@ class Declared(NamedTuple):
     tunable: bool
 
 
-class ManagedNode(LifecycleNode):
-    """A node with ROS 2's lifecycle: parameters when made, `start` on activation, `stop` after.
-
-    Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
-    deactivation. With `autostart` it is configured and activated at once.
-    """
+class PlainNode(Node):
+    """A node without a lifecycle, which remembers what it declared."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
+        self.declared: list[Declared] = []
+
+
+class ManagedNode(LifecycleNode):
+    """A node with ROS 2's lifecycle: parameters and `prepare` when it is configured, `start` on
+    activation, `stop` after.
+
+    Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
+    deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
+    those instead of the process's, and leaves the executor to others after every message.
+    """
+
+    def __init__(self, name: str, arguments: Arguments = None) -> None:
+        shares = arguments is not None
+        super().__init__(name, cli_args=arguments, use_global_arguments=not shares)
+        self.shares = shares
         self.declared: list[Declared] = []
         self.add_on_set_parameters_callback(self._on_parameters)
         self.autostart = bool(
@@ -63,6 +77,15 @@ class ManagedNode(LifecycleNode):
         self.failure: Exception | None = None
         self._running = False
         self._made_before: set[object] = set()
+        try:
+            self.read_parameters()
+        except NlsidError as error:
+            if self.autostart:
+                raise
+            self.get_logger().warning(f"cannot be configured as it is: {error}")
+
+    def read_parameters(self) -> None:
+        """Declare the parameters and take their values; called again when it is configured."""
 
     def prepare(self) -> None:
         """Check whatever can be checked before starting: files, names."""
@@ -83,6 +106,15 @@ class ManagedNode(LifecycleNode):
         """The tunable parameters' values."""
         tunable = (declared for declared in self.declared if declared.tunable)
         return {d.name: _as_meant(d, self.get_parameter(d.name).value) for d in tunable}
+
+    def signal_topic(self, topic: str) -> str:
+        """Where a signal that a bag or a model calls `topic` is: in the node's namespace.
+
+        /odom is /robot1/odom for a node in /robot1, and so is /robot1/odom. Remapping comes after.
+        """
+        namespace = self.get_namespace()
+        inside = namespace == "/" or topic.startswith(f"{namespace}/")
+        return topic if inside else topic.removeprefix("/")
 
     def start_itself(self) -> None:
         """Configure and activate without a manager; raises what made it fail."""
@@ -115,7 +147,12 @@ class ManagedNode(LifecycleNode):
 
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: unconfigured to inactive."""
-        return self._attempt(self.prepare)
+
+        def configure() -> None:
+            self.read_parameters()
+            self.prepare()
+
+        return self._attempt(configure)
 
     def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: inactive to active."""
@@ -155,6 +192,10 @@ class ManagedNode(LifecycleNode):
             for each in self.declared:
                 if each.name in asked:
                     asked[each.name] = _as_meant(each, asked[each.name])
+            if self._state_machine.current_state[1] == UNCONFIGURED:
+                return SetParametersResult(successful=True)  # read when it is configured
+            if fixed := {d.name for d in self.declared} & asked.keys() - values.keys():
+                raise DataError(f"{', '.join(sorted(fixed))}: read when the node is configured")
             if not asked.keys() & values.keys():
                 return SetParametersResult(successful=True)
             self.tune({name: asked.get(name, value) for name, value in values.items()})
@@ -195,30 +236,37 @@ class ManagedNode(LifecycleNode):
 
 
 def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
-    """Make the node, start it if it starts itself, and spin until SIGINT or SIGTERM.
+    """`run_all` of one node, which takes `args`."""
+    run_all([make], args)
+
+
+def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) -> None:
+    """Make the nodes, start each that starts itself, and spin until SIGINT or SIGTERM.
 
     The signals are waited for here and not left to rclpy, which would end all communication before
     the node could send a last command. Raises what made the node fail to start.
     """
     woken = _wake_on_signals()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    node: ManagedNode | None = None
+    nodes: list[ManagedNode] = []
     try:
-        node = make()
-        if node.autostart:
-            node.start_itself()
+        for make in makes:
+            nodes.append(make())
+            if nodes[-1].autostart:
+                nodes[-1].start_itself()
         gc.collect()
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
-        _spin_until_signalled(node, woken)
+        _spin_until_signalled(nodes, woken)
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         try_shutdown()
 
 
-def _spin_until_signalled(node: ManagedNode, woken: socket.socket) -> None:
+def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
     executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    for node in nodes:
+        executor.add_node(node)
     asked = threading.Event()
 
     def wait() -> None:
@@ -249,14 +297,19 @@ def declare(
     between: tuple[float, float] | None = None,
     tunable: bool = False,
 ) -> Value:
-    """Declare a parameter with its description and range, and return its value.
+    """Declare a parameter with its description and range, once, and return its value.
 
-    It can be changed while the node runs only if `tunable`: `ManagedNode.tune` is told then.
+    Of a ManagedNode it can be changed while the node is unconfigured, and while it runs only if
+    `tunable`: `ManagedNode.tune` is told then.
 
     The default's type is the parameter's, and 2 is taken where 2.0 is meant. Raises DataError if
     the value given has another type or is out of range.
     """
-    descriptor = ParameterDescriptor(name=name, description=description, read_only=not tunable)
+    declared = Declared(name, default, description, between, tunable)
+    if node.has_parameter(name):
+        return _as_meant(declared, node.get_parameter(name).value)
+    is_fixed = not isinstance(node, ManagedNode)
+    descriptor = ParameterDescriptor(name=name, description=description, read_only=is_fixed)
     descriptor.dynamic_typing = isinstance(default, float)  # or ROS would refuse 2 for 2.0
     if between is not None:
         lo, hi = between
@@ -268,8 +321,7 @@ def declare(
         given = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise DataError(f"parameter {name} ({description}): {error}") from error
-    declared = Declared(name, default, description, between, tunable)
-    if isinstance(node, ManagedNode):
+    if isinstance(node, ManagedNode | PlainNode):
         node.declared.append(declared)
     return _as_meant(declared, given)
 

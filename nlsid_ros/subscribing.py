@@ -26,10 +26,13 @@ class Wanted(NamedTuple):
     msgtype: str
 
     @classmethod
-    def parse(cls, entry: str) -> "Wanted":
-        """From `/topic`, `/topic:=package/msg/Type` or `/pattern*`."""
+    def parse(cls, entry: str, namespace: str) -> "Wanted":
+        """From `/topic`, `/topic:=package/msg/Type` or `/pattern*`; without the first slash it is
+        in the namespace.
+        """
         topic, _, msgtype = entry.partition(":=")
-        return cls(topic if topic.startswith("/") else f"/{topic}", msgtype)
+        whole = topic if topic.startswith("/") else f"{namespace.rstrip('/')}/{topic}"
+        return cls(whole, msgtype)
 
     @property
     def is_pattern(self) -> bool:

@@ -40,7 +40,7 @@ from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.messages import SignalMessage, frame_of, off_clock, stamp_ns_of
-from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
 LAST_WORD = 1.0  # s for the last command to be received before the node goes
@@ -55,8 +55,11 @@ LIMITS = [field.name for field in fields(Limits)]
 class TrackingController(ManagedNode):
     """Samples in, inputs out; between runs it is silent, so that others may drive."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         number = partial(declare_number, self, tunable=True)
         self._source = declare_text(
             self, "source", "funnel_publisher", "node that publishes the funnel"
@@ -162,11 +165,11 @@ class TrackingController(ManagedNode):
         if self._design is None:
             self._command = message
             self._commands = self.create_publisher(
-                message.kind, message.path.topic, qos.command(design.period)
+                message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
             self.create_subscription(
                 message_class(self._response_type),
-                response.topic,
+                self.signal_topic(response.topic),
                 partial(self._on_response, response),
                 qos.SENSOR,
             )
@@ -222,7 +225,7 @@ class TrackingController(ManagedNode):
                 self._halt(ended)
                 return
             if waiting and controller.k >= 1:
-                self._judged = self._heard
+                self._judged, self._announced_ns = self._heard, stamp_ns
                 announced = Run(stamp_ns, self._digest).document()
                 self._announce.publish(String(data=files.encode(announced).decode()))
                 self._tell("tracking")
@@ -250,12 +253,21 @@ class TrackingController(ManagedNode):
             self._send(stamp_ns)
 
     def _on_margin(self, message: JointState) -> None:
-        """The required monitor has judged a sample."""
-        margin = dict(zip(message.name, message.position, strict=False)).get("margin", math.nan)
-        if margin >= 0.0:
-            self._judged = time.monotonic()
-        elif margin < 0.0 and self._controller is not None and self._controller.k >= 1:
+        """The required monitor has judged a sample; one not of this run and of now is none."""
+        stamp_ns = stamp_ns_of(message)
+        tracking = self._controller is not None and self._controller.k >= 1
+        if not tracking or stamp_ns < self._announced_ns:
+            return
+        if off_clock(stamp_ns, self.get_clock(), self._monitor_patience):
+            return
+        numbers = dict(zip(message.name, message.position, strict=False))
+        margin, assumption = (numbers.get(key, math.nan) for key in ("margin", "assumption"))
+        if margin < 0.0:
             self._halt(f"outside: {self._monitor} says margin {margin:.3g}")
+        elif assumption > 1.0:
+            self._halt(f"assumption violated: {self._monitor} says {assumption:.3g} of it is used")
+        elif margin >= 0.0:
+            self._judged = time.monotonic()
 
     def _look(self) -> None:
         """Watch on the wall's clock that responses come, commands go and the monitor judges."""

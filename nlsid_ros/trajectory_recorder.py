@@ -1,7 +1,8 @@
 """Node `trajectory_recorder`: topics into a bag, serialised as they arrive, safe against kill -9.
 
 Subscribes to each topic once a publisher shows its type and quality of service, and writes the
-messages undecoded: log time is the arrival, publish time the header stamp. What a killed recorder
+messages undecoded: log time is the arrival (of /clock, in simulated time), publish time the header
+stamp. What a killed recorder
 loses is what came after the last chunk, at most `chunk_period` and one POLL. Counts of received and
 lost messages, rate, jitter and gaps go to /diagnostics every second and into the bag's metadata.
 `~/start` and `~/stop` begin and end a bag, `~/pause` and `~/resume` leave out a part of one,
@@ -9,6 +10,7 @@ lost messages, rate, jitter and gaps go to /diagnostics every second and into th
 """
 
 import sys
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
@@ -28,7 +30,7 @@ from bags.recordings.part import COMPRESSIONS
 from bags.recordings.quality import Profile
 from bags.recordings.repair import repair, unfinished_bags
 from bags.recordings.writer import BagWriter
-from bags.signals.arrivals import Arrival, Recent
+from bags.signals.arrivals import Arrival, LogClock, Recent
 from bags.signals.recording import Recording
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -36,7 +38,7 @@ from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.message_classes import message_class
 from nlsid_ros.polling import Polled, Received
-from nlsid_ros.running import ManagedNode, declare, declare_number, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 from nlsid_ros.subscribing import Listener, Subscriptions, Wanted
 from nlsid_ros.type_descriptions import TypeDescriptions
 
@@ -50,8 +52,12 @@ EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said
 class TrajectoryRecorder(ManagedNode):
     """Records topics into one new bag after another."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+        self._bags = 0
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         topics: Any = declare(
             self, "topics", [""], "/topic, /topic:=package/msg/Type or /pattern*, each"
         )
@@ -95,11 +101,10 @@ class TrajectoryRecorder(ManagedNode):
             "excitation/experiment",
             "topic whose JSON goes into the bag's metadata; empty: none",
         )
-        self._wanted = [Wanted.parse(entry) for entry in topics if entry]
+        self._wanted = [Wanted.parse(entry, self.get_namespace()) for entry in topics if entry]
         if not self._wanted:
             raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
         self._given = [Path(path) for path in given if path]
-        self._bags = 0
 
     def prepare(self) -> None:
         """Finish what a killed recorder left, and refuse what could not be recorded."""
@@ -131,6 +136,8 @@ class TrajectoryRecorder(ManagedNode):
         self._snapshots = 0
         self._experiment: dict[str, str] = {}
         self._recording: Recording | None = None
+        self._simulated = bool(self.get_parameter("use_sim_time").value)
+        self._clock_of_log = LogClock()
         if self._at_once:
             self._begin()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
@@ -145,7 +152,7 @@ class TrajectoryRecorder(ManagedNode):
         if self._said_by:
             self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
         wall = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulated time stands still
-        self.create_timer(POLL, self._polled.take, clock=wall)
+        self.create_timer(POLL, self._take, clock=wall)
         self.create_timer(DISCOVERY, self._topics.look, clock=wall)
         self.create_timer(self._period, self._keep_up, clock=wall)
         self.create_timer(REPORT, self._report, clock=wall)
@@ -165,6 +172,15 @@ class TrajectoryRecorder(ManagedNode):
         self._polled.drop_all()
         if self._recording is not None:
             self._recording.close()
+
+    def _take(self) -> None:
+        """Take what has arrived; before there is simulated time it waits in the middleware."""
+        if self._simulated:
+            simulated_ns = self.get_clock().now().nanoseconds
+            if not simulated_ns:
+                return
+            self._clock_of_log.look(time.time_ns(), simulated_ns)
+        self._polled.take()
 
     def _begin(self) -> Path:
         """Open the next bag."""
@@ -207,7 +223,7 @@ class TrajectoryRecorder(ManagedNode):
     def _record(
         self, topic: str, msgtype: str, stamped: bool, data: bytes, info: dict[str, int]
     ) -> None:
-        arrival_ns = info["received_timestamp"]
+        arrival_ns = self._clock_of_log.at(info["received_timestamp"])
         stamp_ns = arrival_ns
         if stamped:
             with suppress(BagError):  # serialised by rules whose header we do not know
@@ -254,13 +270,13 @@ class TrajectoryRecorder(ManagedNode):
     def _on_start(self) -> tuple[bool, str]:
         if self._recording is not None and not self._recording.ended:
             return False, f"recording {self._recording.bag.path} already"
-        self._polled.take()  # what came before belongs to before
+        self._take()  # what came before belongs to before
         return True, str(self._begin())
 
     def _on_stop(self) -> tuple[bool, str]:
         if self._recording is None:
             return False, "nothing is being recorded"
-        self._polled.take()
+        self._take()
         self._recording.close()
         ended, path = self._recording.ended, self._recording.bag.path
         self._recording = None
@@ -269,7 +285,7 @@ class TrajectoryRecorder(ManagedNode):
     def _on_pause(self, pause: bool) -> tuple[bool, str]:
         if self._recording is None:
             return False, "nothing is being recorded"
-        self._polled.take()
+        self._take()
         self._recording.paused = pause
         return True, "paused" if pause else "recording"
 
@@ -277,7 +293,7 @@ class TrajectoryRecorder(ManagedNode):
         """Save the last seconds in a bag of their own."""
         if self._recent is None:
             return False, "no snapshots are kept; set the parameter snapshot to seconds"
-        self._polled.take()
+        self._take()
         self._snapshots += 1
         base = self._recording.bag.path if self._recording is not None else Path(self._name or NAME)
         path = base.with_name(f"{base.name}_snapshot_{self._snapshots}")
@@ -299,7 +315,7 @@ class TrajectoryRecorder(ManagedNode):
             text = "; ".join(f"{topic}: {why}" for topic, why in problems.items())
         if recording is not None and recording.ended:
             level, text = DiagnosticStatus.ERROR, recording.ended
-        if self.get_parameter("use_sim_time").value and not self.get_clock().now().nanoseconds:
+        if self._simulated and not self.get_clock().now().nanoseconds:
             level, text = DiagnosticStatus.ERROR, f"nobody publishes /clock; {text}"
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, name_of(self), level, text, values))

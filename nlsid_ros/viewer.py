@@ -17,7 +17,7 @@ from bags.viewing.serving import LOCAL, serve
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from nlsid_ros.running import ManagedNode, declare, declare_text, run
+from nlsid_ros.running import Arguments, ManagedNode, declare, declare_text, run
 
 NAME = "viewer"
 NAMES = "signals"  # where the monitor's diagnostics name the measured signals, one a line
@@ -26,8 +26,12 @@ NAMES = "signals"  # where the monitor's diagnostics name the measured signals, 
 class Viewer(ManagedNode):
     """Feeds a scene from what it hears; a server in threads of its own shows it."""
 
-    def __init__(self) -> None:
-        super().__init__(NAME)
+    def __init__(self, arguments: Arguments = None) -> None:
+        super().__init__(NAME, arguments)
+        self._served = ExitStack()
+
+    def read_parameters(self) -> None:
+        """Declare them; take the values that they have now."""
         self._monitor = declare_text(self, "monitor", "funnel_monitor", "node that is shown")
         self._page = bool(declare(self, "page", False, "true: a page for browsers, not Foxglove"))
         self._host = declare_text(
@@ -37,7 +41,6 @@ class Viewer(ManagedNode):
             self, "port", 0, "port; 0: 8765 for Foxglove, 8080 for the page", between=(0, 65535)
         )
         self._port = port
-        self._served = ExitStack()
 
     def start(self) -> None:
         """Listen, and serve."""

@@ -274,6 +274,51 @@ def check(
 
 
 @app.command()
+def report(
+    folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
+    bags: Annotated[
+        list[Path] | None, typer.Argument(help="Bags to hold against its funnel, for the page.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="Takes `split.test` (which bags) and `monitor.nominal`.")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
+    ] = None,
+) -> None:
+    """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
+
+    The proofs are decided again. The page needs nothing else, and prints.
+    """
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.designs import documents
+    from bags.monitoring.replay import replay_bag
+    from bags.pictures.folder_report import write_folder_report
+    from bags.pictures.report import report_available
+    from bags.recordings.folders import expand_bags
+
+    settings = load_config(config) if config is not None else None
+    target = page or folder / documents.DESIGN_REPORT
+    replays, drawn = [], ""
+    if bags:
+        proved = documents.load_proved(folder / documents.FUNNEL)
+        folders = expand_bags(bags)
+        if settings is not None:
+            folders = [f for f in folders if f.name in settings.split.test] or folders
+        with progress_bar("replaying") as progress:
+            for done, bag in enumerate(folders):
+                progress(bag.name, done / len(folders))
+                replays.append(replay_bag(proved, bag, centre=show.centre_of(settings)))
+        if report_available() and all(entry.half_width for entry in replays):
+            from bags.pictures import plots
+
+            drawn = plots.svg(plots.margins(replays))
+    write_folder_report(folder, target, replays=replays, drawn=drawn)
+    out.print(f"wrote {target}", soft_wrap=True)
+
+
+@app.command()
 def monitor(
     bags: BagsArgument,
     funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
@@ -384,15 +429,19 @@ def live(
         list[str] | None,
         typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
     ] = None,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", help="All nodes in one process, on one executor.")
+    ] = False,
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
     from bags.chain.shipped import shipped_file
-    from bags.commands.launching import LaunchFile, run_together
+    from bags.commands.launching import LaunchFile, in_one_process, run_together
 
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
-    raise typer.Exit(run_together(launch.commands(arguments or [])))
+    commands = launch.commands(arguments or [])
+    raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
 
 
 @app.command()

@@ -5,6 +5,7 @@ its language this knows what those files use: arg, node, param, remap, `$(var NA
 """
 
 import ctypes
+import json
 import os
 import re
 import signal
@@ -80,6 +81,12 @@ class LaunchFile:
             for a in self.arguments
         ]
         return "\n".join([f"{self.path.name} are", *lines])
+
+
+def in_one_process(commands: Sequence[Sequence[str]]) -> list[str]:
+    """The command of one process that holds the nodes of all these commands."""
+    nodes = [[module.rpartition(".")[2], *given] for _, _, module, *given in commands]
+    return [sys.executable, "-m", "nlsid_ros.together", json.dumps(nodes)]
 
 
 def run_together(commands: Sequence[Sequence[str]]) -> int:

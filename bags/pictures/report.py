@@ -21,6 +21,7 @@ from nlsid_core.models import (
     StateAffineModel,
 )
 
+MODEL_BEGINS, MODEL_ENDS = "<!-- model begins -->", "<!-- model ends -->"
 FUNNEL_BEGINS, FUNNEL_ENDS = "<!-- funnel begins -->", "<!-- funnel ends -->"
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto;
@@ -159,8 +160,9 @@ def page(
     return f"""<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>{escape(robot)}: identified model</title>
 <style>{STYLE}</style>
+<meta name="viewport" content="width=device-width, initial-scale=1">
 <h1>{escape(robot)}: identified model</h1>
-<p>{escape(_equation(chosen.model))}</p>
+{MODEL_BEGINS}<p>{escape(_equation(chosen.model))}</p>
 {_stability(chosen)}
 <h2>How well it simulates</h2>
 <table><thead><tr><th>method</th>{head}<th>time</th>
@@ -176,7 +178,7 @@ for this table and the pictures below{_calibrated(calibration)}.</p>
 <h2>Recordings</h2>
 <table class="left">
 <thead><tr><th>trial</th><th>samples</th><th>use</th><th>repeats of</th><th>digest</th></tr></thead>
-<tbody>{listed}</tbody></table>
+<tbody>{listed}</tbody></table>{MODEL_ENDS}
 <p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """

@@ -27,6 +27,27 @@ class Arrival(NamedTuple):
 
 
 @dataclass
+class LogClock:
+    """When messages came, in the time of a simulation; between two looks it goes on evenly."""
+
+    _before: tuple[int, int] = (0, 0)
+    _newest: tuple[int, int] = (0, 0)
+
+    def look(self, wall_ns: int, simulated_ns: int) -> None:
+        """At `wall_ns` the simulation's clock is at `simulated_ns`."""
+        self._before, self._newest = self._newest, (wall_ns, simulated_ns)
+
+    def at(self, wall_ns: int) -> int:
+        """The simulated time at `wall_ns`, in ns; the wall's where no clock was looked at."""
+        (first, begun), (last, now) = self._before, self._newest
+        if not last:
+            return wall_ns
+        if not first or not first <= wall_ns <= last:
+            return now
+        return begun + (now - begun) * (wall_ns - first) // max(last - first, 1)
+
+
+@dataclass
 class Regularity:
     """Rate and jitter of one topic's stamps, and the gaps in them; cheap enough for 10 kHz."""
 

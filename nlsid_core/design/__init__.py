@@ -2,6 +2,7 @@
 
 from nlsid_core.design.compose import compose_funnels
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
+from nlsid_core.design.continuous.motion import plan_motion
 from nlsid_core.design.continuous.setting import Goal
 from nlsid_core.design.continuous.tvlqr import (
     Tracking,
@@ -36,5 +37,6 @@ __all__ = [
     "integrate_nominal",
     "lyapunov",
     "nominal_through",
+    "plan_motion",
     "tvlqr",
 ]

@@ -115,12 +115,15 @@ class SampledTracking:
 class ContinuousTracking:
     """The largest funnel around a nominal motion that ends in a goal, proved for every t.
 
-    dynamics: a VectorField, or a polynomial function of some of t, x, u, w. goal: an ellipsoid, or
-    its matrix around the nominal's end (None: the largest set that the closed loop keeps at the
-    end). policy: None is a time-varying LQR with Q (n, n) and R (m, m) (None: identities), and P(t)
-    its cost-to-go; for a given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's
-    K varies between knots: "constant", "linear" or "cubic". limits: rows (input, low, high) at
-    which inputs saturate; the proof then covers every mode of them.
+    dynamics: a VectorField, or a function of some of t, x, u, w, named so; one that is no
+    polynomial is expanded on every interval around what the funnel needs there, see
+    `dynamics.taylor`. uncertain: rows (low, high) of the w of such a function. goal: half-widths
+    (n,) of an ellipsoid around the nominal's end, its matrix, or a `Goal` (None: the largest set
+    that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
+    R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
+    given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
+    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one pair (low, high)
+    for each input, at which inputs saturate; the proof then covers every mode of them.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
     ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
@@ -141,6 +144,7 @@ class ContinuousTracking:
     R: ArrayLike | None = None
     gain: str = "constant"
     limits: ArrayLike | None = None
+    uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None
     error: ArrayLike | None = None
 

@@ -41,6 +41,9 @@ cp: Any = cvxpy  # its functions are not seen by type checkers
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
+CLOSE = 1.25  # times the narrowest forecast: of these the tube that is narrowest for ever is taken
+SCALES = (1.0, 1e2, 1e4)  # of the balance, tried in order: slow vertices spread what V is worth
+CORNERS = 16  # vertices whose Gramians balance a program
 MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
@@ -283,6 +286,7 @@ class _Form:
     ray: bool
     rate: float
     inputs: tuple[FloatArray, FloatArray] | None
+    storage: FloatArray
 
     @classmethod
     def of(cls, model: StableModel, bounds: Json | None) -> "_Form":
@@ -308,7 +312,18 @@ class _Form:
         return cls(
             F, H, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
             H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
+            np.linalg.inv(proof.P),
         )  # fmt: skip
+
+    @property
+    def corners(self) -> list[FloatArray]:
+        """x̄⁺ of x̄ where E is one of its vertices, of a few: one of them may be much slower."""
+        m, vertices = self.m, [E for leaf in self.leaves for E in leaf]
+        if not m:
+            return [self.A]
+        chosen = vertices[:: max(1, len(vertices) // CORNERS)]
+        F = self.F
+        return [F[:, m:] - F[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]) for E in chosen]
 
     @property
     def m(self) -> int:
@@ -405,38 +420,51 @@ def _best(
     rhos: Sequence[float],
     decided: Callable[[_Found], str],
 ) -> _Found:
-    """The pair (L, ρ) whose forecast `samples` ahead is the narrowest of those solved and proved.
+    """The pair (L, ρ), solved and proved, of the narrowest tube with a forecast near the narrowest.
 
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
-    the most that E can be `samples` after 0. SOLVED are solved; while the kernel refuses all of
-    them (`decided` says why), as many more.
+    the most that E can be, `samples` after 0 or ever. SOLVED are solved; while the kernel refuses
+    all of them (`decided` says why), as many more. An energy's tube has its forecast's length.
     """
+    near = CLOSE if min(rhos) < 1.0 else 1.0
+
+    def widths(i: int, rho: float, R: FloatArray, variance: FloatArray) -> tuple[float, float]:
+        """A forecast's and the lasting tube's, per amplitude."""
+        spent = [np.einsum("ti,ij,tj->t", part[:, i], R, part[:, i]) for part in e]
+        weights = rho ** np.arange(samples + 1)
+        ahead = max(float(np.convolve(part, weights).max()) for part in spent)
+        ever = max(float(lfilter([1.0], [1.0, -rho], part).max()) for part in spent)
+        scale = float(np.mean(np.sqrt(variance) / amplitudes))
+        return scale * float(np.sqrt(ahead)), scale * float(np.sqrt(ever))
+
+    def ordered(found: list[tuple[float, float, Any]]) -> list[Any]:
+        """By the lasting width where the forecast is near the narrowest, then by the forecast."""
+        enough = near * min((ahead for ahead, _, _ in found), default=0.0)
+        keys = [(0.0, ever) if ahead <= enough else (ahead, 0.0) for ahead, ever, _ in found]
+        return [found[k][2] for k in sorted(range(len(found)), key=keys.__getitem__)]
+
     ranked = []
     for i, rho in product(range(len(gains)), rhos):
         try:
-            W, R = _mean_gramian(form, gains[i], rho, [part[:, i] for part in e])
+            W, R = _gramian(form, gains[i], rho, [part[:, i] for part in e])
         except (LinAlgError, ValueError):
             continue
         variance = np.diag(np.linalg.inv(R)) + np.einsum("ij,jk,ik->i", form.C, W, form.C) / rho
-        if not (np.isfinite(variance).all() and (variance > 0.0).all()):
-            continue
-        alpha = _forecast_budget([part[:, i] for part in e], R, rho, samples)
-        ranked.append((float(np.mean(np.sqrt(alpha * variance) / amplitudes)), i, rho))
-    ranked.sort()
-    refused = ""
-    for first in range(0, min(len(ranked), MOST), SOLVED):
-        tried: list[tuple[float, _Found]] = []
-        for _, i, rho in ranked[first : first + SOLVED]:
+        if np.isfinite(variance).all() and (variance > 0.0).all():
+            ranked.append((*widths(i, rho, R, variance), (i, rho)))
+    pairs, refused = ordered(ranked), ""
+    for first in range(0, min(len(pairs), MOST), SOLVED):
+        tried: list[tuple[float, float, Any]] = []
+        for i, rho in pairs[first : first + SOLVED]:
             found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
             if found is not None:
-                alpha = _forecast_budget([part[:, i] for part in e], found.R, rho, samples)
-                width = float(np.mean(np.sqrt(alpha / found.tau) / amplitudes))
-                tried.append((width, replace(found, at=i)))
-        for _, found in sorted(tried, key=lambda entry: entry[0]):
-            refused = decided(found)
+                entry = replace(found, at=i)
+                tried.append((*widths(i, rho, found.R, 1.0 / found.tau), entry))
+        for candidate in ordered(tried):
+            refused = decided(candidate)
             if not refused:
-                return found
+                return candidate  # type: ignore[no-any-return]
     if refused:
         raise Infeasible(f"no proved tube: {refused}")
     raise Infeasible(
@@ -445,16 +473,17 @@ def _best(
     )
 
 
-def _mean_gramian(
+def _gramian(
     form: _Form, L: FloatArray, rho: float, e: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """W of the mean increment, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
+    """W, mean over a few vertices, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
     p = len(form.H)
     most = np.max([_fading_squares(part, rho).max(axis=0) for part in e], axis=0)
     R = np.diag(1.0 / (p * np.maximum(most, np.finfo(float).tiny)))
     noise = L @ np.linalg.inv(R) @ L.T
     noise = noise + UNREACHED * (np.trace(noise) / len(noise) or 1.0) * np.eye(len(noise))
-    W = np.asarray(solve_discrete_lyapunov(form.A / np.sqrt(rho), noise))
+    Ws = [solve_discrete_lyapunov(A / np.sqrt(rho), noise) for A in form.corners]
+    W = np.mean(Ws, axis=0)
     return (W + W.T) / 2.0, R
 
 
@@ -463,25 +492,39 @@ def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
     return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
 
 
-def _forecast_budget(e: list[FloatArray], R: FloatArray, rho: float, samples: int) -> float:
-    """max_k Σ_{i=0..h} ρ^(h-i) |e_{k+i}|²_R over all starts k, h = `samples`."""
-    weights = rho ** np.arange(samples + 1)
-    return max(
-        float(np.convolve(np.einsum("ti,ij,tj->t", part, R, part), weights).max()) for part in e
-    )
-
-
 def _solved(
     form: _Form, L: FloatArray, rho: float, e: list[FloatArray], amplitudes: FloatArray
 ) -> _Found | None:
     """P, R, N, τ of the least Σ 1/(τ_j a_j²), E <= 1 on the trials (one output: R = 1).
 
-    Units: x in those of the mean increment's Gramian W^(1/2); e_j, o_j of √max S_jj; ν of what it
+    Units: x in those of the Gramian W^(1/2) of the increments at a few vertices, or of the inverse
+    of the stability proof's storage if that gives nothing; e_j, o_j of √max S_jj; ν of what it
     moves state and output by; E with an identity in ν at its mean.
     """
+    try:
+        W, R0 = _gramian(form, L, rho, e)
+    except (LinAlgError, ValueError):
+        return None
+    inverse = form.storage * (np.trace(W) / np.trace(form.storage))
+    for balance, scale in product((W, inverse), SCALES):
+        found = _balanced(form, L, rho, e, amplitudes, scale * balance, R0)
+        if found is not None:
+            return found
+    return None
+
+
+def _balanced(
+    form: _Form,
+    L: FloatArray,
+    rho: float,
+    e: list[FloatArray],
+    amplitudes: FloatArray,
+    W: FloatArray,
+    R0: FloatArray,
+) -> _Found | None:
+    """`_solved` in the units of W^(1/2)."""
     m, p = form.m, len(form.H)
     try:
-        W, R0 = _mean_gramian(form, L, rho, e)
         values, vectors = np.linalg.eigh(W)
         root = (vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))) @ vectors.T
         T = np.linalg.inv(root)

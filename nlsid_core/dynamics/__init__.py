@@ -7,16 +7,19 @@ from nlsid_core.dynamics.piecewise import (
     cubic_through,
     linear_through,
 )
-from nlsid_core.dynamics.taylor import expand, taylor_field
+from nlsid_core.dynamics.taylor import Rates, taylor_field
+from nlsid_core.dynamics.taylor_model import TaylorModel, solve
 from nlsid_core.dynamics.vector_field import VectorField
 
 __all__ = [
     "Nominal",
     "PiecewisePolynomial",
+    "Rates",
+    "TaylorModel",
     "VectorField",
     "constant_on",
     "cubic_through",
-    "expand",
     "linear_through",
+    "solve",
     "taylor_field",
 ]

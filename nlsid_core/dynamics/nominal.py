@@ -6,6 +6,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics.piecewise import PiecewisePolynomial
+from nlsid_core.dynamics.taylor import Rates
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, ShapeError
 
@@ -35,7 +36,7 @@ class Nominal:
         """(K,) knots in s."""
         return self.x.t
 
-    def defect(self, field: VectorField) -> tuple[float, float, int]:
+    def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
         """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""
         rate = self.x.derivative()
         worst = (0.0, float(self.t[0]), 0)

@@ -1,268 +1,450 @@
 """Dynamics that are not polynomial: cubic Taylor models along a motion, with remainders bounded.
 
-A Taylor model is a polynomial in d, x = c + r d, and a bound of what it leaves out for every
-d in [-1, 1]^k: +, -, ·, /, sin and cos carry both along, rounding included.
-Source: Makino and Berz, "Taylor models and other validated functional inclusion methods", 2003.
-Assumes IEEE 754 double precision, and sin and cos right to a few units in the last place.
+`Rates` holds a Python function of t, x, u and w; `Cubic` is what it becomes on one box. Rates that
+are cubics as they are written stay what they are; every other one has a bounded w of its own.
 """
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
-from math import cos, frexp, inf, nextafter, sin
+from math import inf, nextafter
 from typing import Any
 
 import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
-from nlsid_core.dynamics.vector_field import VectorField, variable_names
-from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
+from nlsid_core.dynamics.vector_field import ARGUMENTS, VectorField, variable_names
+from nlsid_core.errors import DataError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.polynomial import Polynomial
-from nlsid_core.polynomial.maps import monomials
+from nlsid_core.polynomial.algebra import as_polynomial, variables
 
-DEGREE = 3  # what L-steps take
 EXPANSION = (
     "cubic Taylor models with a remainder bounded in float64 arithmetic that counts every rounding "
-    "and trusts sin and cos to a few units in the last place"
+    "and trusts elementary functions to a few units in the last place"
 )
-ROUNDING = 2.0**-50  # relative, of one operation on coefficients: 8 units, where 1 to 4 are made
-SUMMED = 1 + 2.0**-40  # covers the roundings of a sum of bounds
-GRID = 2.0**-12  # of the centres, so that powers of x - c have short exact coefficients
+CENTRE_BITS = 12  # of a centre, relative to the radius: powers of x - c have short coefficients
 NEGLIGIBLE = 1e-12  # of a row's size: such coefficients go to its remainder
+MAX_TOTAL_DEGREE = 7  # of a monomial, t included, that the kernel reads
+MAX_PRODUCTS = 3  # uncertain entries, remainders included, with which w may multiply x: corners
+KNOWN = (
+    "+, -, *, /, abs, whole powers, np.sqrt, np.sin, np.cos, np.tan, np.exp, np.log, np.tanh, "
+    "np.arctan, np.arctan2, and nlsid_core.dynamics.solve(A, b) for small linear systems"
+)
 
 
 @dataclass(frozen=True, eq=False)
-class TaylorModel:
-    """Σ coefficients·d^exponents ± error; k: how many d. coefficients: (M,), degree 0 to 3."""
+class Rates:
+    """ẋ = function(...) of some of t, x (n,), u (m,), w, named so; w in the box `uncertain`.
 
-    k: int
-    coefficients: FloatArray
-    error: float
+    exact: the rates that are polynomials of degree 3 at most in (x, u); else None. uses: of every
+    other rate, the entries of z = (t, x, u, w) that it depends on.
+
+    Raises NlsidError, naming what is supported, on a function that nothing here expands.
+    """
+
+    function: Callable[..., Any]
+    n: int
+    m: int
+    uncertain: FloatArray
+    exact: tuple[Polynomial | None, ...]
+    uses: tuple[frozenset[int], ...]
 
     @classmethod
-    def variable(cls, k: int, j: int, centre: float, radius: float) -> "TaylorModel":
-        """centre + radius·d_j, exact."""
-        coefficients = np.zeros(len(_exponents(k)))
-        coefficients[0] = centre
-        coefficients[1 + _place_of_unit(k, j)] = radius
-        return cls(k, coefficients, 0.0)
+    def of(
+        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None
+    ) -> "Rates":
+        """Look at the function once, with symbols."""
+        box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
+        if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
+            raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
+        given = tuple(inspect.signature(function).parameters)
+        if not given or not set(given) <= set(ARGUMENTS):
+            raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        if len(box) and "w" not in given:
+            raise DataError("uncertain has rows, but the dynamics have no argument w")
+        if "w" in given and not len(box):
+            raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
+        names = ("t", *variable_names(n, m, len(box)))
+        blank = cls(function, n, m, box, (), ())
+        symbols = [_Symbol(p.exact(), frozenset([j])) for j, p in enumerate(variables(names))]
+        traced = [_Symbol.made(row) for row in blank.called(symbols)]
+        exact = tuple(row.cubic(names, 1 + n + m) for row in traced)
+        return cls(function, n, m, box, exact, tuple(row.uses for row in traced))
+
+    @classmethod
+    def numeric(cls, function: Callable[..., Any], n: int, m: int) -> "Rates":
+        """Only for values at points: nothing is asked of the function but numbers."""
+        return cls(function, n, m, np.zeros((0, 2)), (), ())
 
     @property
-    def size(self) -> float:
-        """A bound of its absolute value."""
-        return (float(np.abs(self.coefficients).sum()) + self.error) * SUMMED
+    def depends_on_time(self) -> bool:
+        """True if the function has an argument t."""
+        return "t" in inspect.signature(self.function).parameters
 
-    def __add__(self, other: Any) -> "TaylorModel":
-        if not isinstance(other, TaylorModel):
-            if not _is_number(other):
-                return NotImplemented
-            shifted = self.coefficients.copy()
-            shifted[0] += other
-            lost = 0.0 if other == 0 else ROUNDING * abs(shifted[0])
-            return self._made(shifted, self.error, lost)
-        total = self.coefficients + other.coefficients
-        both = (self.coefficients != 0) & (other.coefficients != 0)
-        return self._made(total, self.error + other.error, ROUNDING * np.abs(total[both]).sum())
+    @property
+    def inexact(self) -> list[int]:
+        """The rates that need expanding."""
+        return [i for i, p in enumerate(self.exact) if p is None]
 
-    def __mul__(self, other: Any) -> "TaylorModel":
-        if not isinstance(other, TaylorModel):
-            if not _is_number(other):
-                return NotImplemented
-            return self._scaled(float(other), _is_power_of_two(float(other)))
-        table, kept = _products(self.k)
-        outer = np.outer(self.coefficients, other.coefficients)
-        weighted = np.bincount(table[kept], outer[kept], len(self.coefficients))
-        total = weighted.astype(np.float64)
-        size = np.abs(outer)
-        error = self.error * other.size + other.error * self.size
-        return self._made(
-            total, error + float(size[~kept].sum()), len(total) * ROUNDING * float(size.sum())
+    @property
+    def expanded(self) -> list[int]:
+        """The entries of (x, u) that a rate depends on that needs expanding: they have a box."""
+        used = set().union(*(self.uses[i] for i in self.inexact)) if self.inexact else set()
+        return sorted(j - 1 for j in used if 0 < j <= self.n + self.m)
+
+    def called(self, z: Sequence[Any]) -> list[Any]:
+        """The rates for entries z = (t, x, u, w) of any kind."""
+        n, m = self.n, self.m
+        held = np.empty(len(z), dtype=object)
+        held[:] = list(z)
+        parts = {"t": z[0], "x": held[1 : 1 + n], "u": held[1 + n : 1 + n + m],
+                 "w": held[1 + n + m :]}  # fmt: skip
+        try:
+            rows = self.function(
+                *(parts[name] for name in inspect.signature(self.function).parameters)
+            )
+            rows = list(np.asarray(rows, dtype=object).reshape(-1)) if isinstance(
+                rows, np.ndarray) else list(rows)  # fmt: skip
+        except NlsidError:
+            raise
+        except ZeroDivisionError as error:
+            raise DataError(f"the dynamics divide by zero ({error})") from error
+        except Exception as error:
+            raise DataError(
+                f"the dynamics cannot be expanded ({type(error).__name__}: {error}); known are "
+                f"{KNOWN}. Write what is not known with these, or give its effect as a bounded w"
+            ) from error
+        if len(rows) != n:
+            raise ShapeError(f"the dynamics return {len(rows)} rates for {n} states")
+        return rows
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None = None
+    ) -> FloatArray:
+        """ẋ (N, n) at X (N, n), U (N, m), W (N, n_w) or (n_w,); w in the centre if not given."""
+        X, U = (np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in (X, U))
+        given = self.uncertain.mean(axis=1) if W is None else np.asarray(W, dtype=np.float64)
+        W = np.broadcast_to(given, (len(X), len(self.uncertain)))
+        names = tuple(inspect.signature(self.function).parameters)
+
+        def called(x: FloatArray, u: FloatArray, w: FloatArray) -> Any:
+            parts = {"t": t, "x": x, "u": u, "w": w}
+            return self.function(*(parts[name] for name in names))
+
+        first = np.asarray(called(X[0], U[0], W[0]), dtype=np.float64).reshape(-1)
+        if first.shape != (self.n,):
+            raise ShapeError(f"the dynamics return {len(first)} rates for {self.n} states")
+        if len(X) == 1:
+            return first[None]
+        try:  # all points at once, if the function is written so that this is the same
+            rows = [np.broadcast_to(row, (len(X),)) for row in called(X.T, U.T, W.T)]
+            last = np.asarray(called(X[-1], U[-1], W[-1]), dtype=np.float64).reshape(-1)
+            whole = np.array(rows, dtype=np.float64).T
+            if whole.shape == X.shape and np.allclose(whole[[0, -1]], [first, last], 1e-12, 1e-12):
+                return whole
+        except (TypeError, ValueError, IndexError):
+            pass
+        return np.array(
+            [called(x, u, w) for x, u, w in zip(X, U, W, strict=True)], dtype=np.float64
         )
 
-    def __truediv__(self, other: Any) -> "TaylorModel":
-        if isinstance(other, TaylorModel):
-            return self * other.reciprocal()
-        return self._scaled(1 / float(other), _is_power_of_two(float(other)))
-
-    def __rtruediv__(self, other: Any) -> "TaylorModel":
-        return self.reciprocal().__mul__(other)
-
-    def __neg__(self) -> "TaylorModel":
-        return TaylorModel(self.k, -self.coefficients, self.error)
-
-    def __sub__(self, other: Any) -> "TaylorModel":
-        return self.__add__(-other)
-
-    def __rsub__(self, other: Any) -> "TaylorModel":
-        return (-self).__add__(other)
-
-    def __pow__(self, power: int) -> "TaylorModel":
-        if power not in (2, 3):
-            raise DataError(f"a Taylor model to the power {power}: 2 and 3 are known")
-        return self * self if power == 2 else self * self * self
-
-    __radd__ = __add__
-    __rmul__ = __mul__
-
-    def sin(self) -> "TaylorModel":
-        """Its sine; np.sin calls this."""
-        c = float(self.coefficients[0])
-        return self._composed([sin(c), cos(c), -sin(c) / 2, -cos(c) / 6], abs(sin(c)), 1 / 24)
-
-    def cos(self) -> "TaylorModel":
-        """Its cosine; np.cos calls this."""
-        c = float(self.coefficients[0])
-        return self._composed([cos(c), -sin(c), -cos(c) / 2, sin(c) / 6], abs(cos(c)), 1 / 24)
-
-    def reciprocal(self) -> "TaylorModel":
-        """One over it. Raises DataError if it may be zero on the box."""
-        c = float(self.coefficients[0])
-        least = (abs(c) - (self.size - abs(c)) * SUMMED) / SUMMED
-        if least <= 0:
-            raise DataError(f"division by a value that may be zero in the box around {c:.3g}")
-        series = [1 / c, -1 / c**2, 1 / c**3, -1 / c**4]
-        return self._composed(series, inf, 0.0, fourth=1 / least**5)
-
-    def _composed(
-        self, series: list[float], value: float, weight: float, *, fourth: float | None = None
-    ) -> "TaylorModel":
-        """Σ series_i δ^i, δ = self - c, and what is left: its fourth power times `fourth`, which
-
-        for sin and cos is weight·min(1, value + |δ|), the largest fourth derivative over 4!.
-        """
-        delta = self - float(self.coefficients[0])
-        b = delta.size
-        left = (weight * min(1.0, value + b) if fourth is None else fourth) * b**4
-        result = delta * series[3] + series[2]
-        for term in (series[1], series[0]):
-            result = result * delta + term
-        lost = ROUNDING * sum(abs(term) * b**i for i, term in enumerate(series))
-        return TaylorModel(self.k, result.coefficients, (result.error + left + lost) * SUMMED)
-
-    def _scaled(self, factor: float, exact: bool) -> "TaylorModel":
-        scaled = factor * self.coefficients
-        lost = 0.0 if exact else ROUNDING * float(np.abs(scaled).sum())
-        return self._made(scaled, abs(factor) * self.error, lost)
-
-    def _made(self, coefficients: FloatArray, error: float, lost: float) -> "TaylorModel":
-        total = error + float(lost)
-        return TaylorModel(self.k, coefficients, total * SUMMED)
+    def on(self, low: FloatArray, high: FloatArray, times: tuple[float, float]) -> "Cubic":
+        """The cubics on the box low ≤ (x, u) ≤ high, (n + m,), and the times; DataError if none."""
+        bottom = np.concatenate([[times[0]], low, self.uncertain[:, 0]])
+        top = np.concatenate([[times[1]], high, self.uncertain[:, 1]])
+        centre, radius = _centred(bottom, top)
+        z = [TaylorModel.variable(j, c, r) for j, (c, r) in
+             enumerate(zip(centre.tolist(), radius.tolist(), strict=True))]  # fmt: skip
+        rows = self.called(z) if self.inexact else []
+        chosen = {i: _Row.of(rows[i], self) for i in self.inexact}
+        return Cubic(self, centre, radius, chosen)
 
 
-def expand(
-    rate: Callable[..., Any], centre: ArrayLike, radius: ArrayLike, *, states: int
-) -> tuple[tuple[Polynomial, ...], FloatArray]:
-    """Cubics in x0.., u0.. and (n,) bounds of |rate - cubic| wherever |(x, u) - centre| ≤ radius.
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """Σ coefficients·Π d_j and a bound of the rest. places: (M, 3) those j, -1 for none."""
 
-    rate: rate(x, u) with +, -, ·, /, np.sin and np.cos only. centre, radius: (n + m,); the centre
-    is rounded to multiples of 2^-12 by the caller. Raises DataError if rate divides by what may be
-    zero there, ShapeError if it does not return n rates.
-    """
-    centre, radius = (np.asarray(part, dtype=np.float64) for part in (centre, radius))
-    k = len(centre)
-    z = np.empty(k, dtype=object)
-    z[:] = [TaylorModel.variable(k, j, centre[j], radius[j]) for j in range(k)]
-    rows = list(rate(z[:states], z[states:]))
-    if len(rows) != states:
-        raise ShapeError(f"the rate has {len(rows)} entries for {states} states")
-    names = variable_names(states, k - states, 0)
-    done = [_in_states(row, k, centre, radius, names) for row in rows]
-    return tuple(p for p, _ in done), np.array([bound for _, bound in done])
+    monomials: tuple[tuple[int, ...], ...]
+    coefficients: FloatArray
+    bound: float
+    places: IntArray
+
+    @classmethod
+    def of(cls, row: Any, rates: Rates) -> "_Row":
+        """Products of w with anything else go to the bound, if too many corners would decide."""
+        if not isinstance(row, TaylorModel):
+            return cls(((),), np.array([float(row)]), 0.0, np.full((1, 3), -1))
+        first = 1 + rates.n + rates.m
+        products = len(rates.uncertain) + len(rates.inexact) <= MAX_PRODUCTS
+        kept, values, bound = [], [], row.error
+        for key, value in zip(row.keys.tolist(), row.coefficients.tolist(), strict=True):
+            used = variables_of(key)
+            uncertain = sum(j >= first for j in used)
+            if uncertain > 1 or (uncertain and len(used) > 1 and not products):
+                bound = nextafter(bound + abs(value), inf)
+            else:
+                kept.append(used)
+                values.append(value)
+        places = np.array([(*used, -1, -1, -1)[:3] for used in kept])
+        return cls(tuple(kept), np.array(values), bound, places)
+
+
+@dataclass(frozen=True, eq=False)
+class Cubic:
+    """What `rates` are on one box, z = centre + radius·d: exact rates, and rows with bounds."""
+
+    rates: Rates
+    centre: FloatArray
+    radius: FloatArray
+    rows: dict[int, _Row]
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(n,) of what the cubics leave out; 0 for exact rates."""
+        return np.array(
+            [self.rows[i].bound if i in self.rows else 0.0 for i in range(self.rates.n)]
+        )
+
+    def __call__(self, t: float, X: FloatArray, U: FloatArray, w: FloatArray) -> FloatArray:
+        """ẋ (N, n) of the cubics at X (N, n) and U (N, m), with w (n_w + remainders,)."""
+        rates, given = self.rates, len(self.rates.uncertain)
+        z = np.hstack([np.full((len(X), 1), t), X, U, np.broadcast_to(w[:given], (len(X), given))])
+        result = np.empty((len(X), rates.n))
+        for i, p in enumerate(rates.exact):
+            if p is not None:
+                result[:, i] = p.rounded()(z)
+        if not self.rows:
+            return result
+        d = np.divide(z - self.centre, self.radius, out=np.zeros_like(z), where=self.radius > 0)
+        stack = np.hstack([d, np.ones((len(X), 1))])
+        for place, (i, row) in enumerate(self.rows.items()):
+            products = stack[:, row.places[:, 0]]
+            for j in (1, 2):
+                products = products * stack[:, row.places[:, j]]
+            result[:, i] = products @ row.coefficients + row.bound * w[given + place]
+        return result
+
+    def pushes(self) -> FloatArray:
+        """(n, n_w + remainders) what each w adds to ẋ, where it does nothing else."""
+        rates, given = self.rates, len(self.rates.uncertain)
+        first = 1 + rates.n + rates.m
+        result = np.zeros((rates.n, given + len(self.rows)))
+        for i, p in enumerate(rates.exact):
+            for exponent, c in () if p is None else p.terms():
+                for j in np.flatnonzero(exponent[first:]).tolist():
+                    result[i, j] = float(c)
+        for place, (i, row) in enumerate(self.rows.items()):
+            result[i, given + place] = row.bound
+            for used, c in zip(row.monomials, row.coefficients.tolist(), strict=True):
+                if used and used[0] >= first:
+                    result[i, used[0] - first] = c / float(self.radius[used[0]])
+        return result
+
+    def nonlinear_states(self) -> tuple[int, ...]:
+        """What `VectorField.nonlinear_states` is, whatever coefficients vanish on this box."""
+        n, last = self.rates.n, 1 + self.rates.n + self.rates.m
+        rows = [
+            [j for j in used if 0 < j < last]
+            for row in self.rows.values()
+            for used in row.monomials
+        ]
+        for p in self.rates.exact:
+            exponents = [] if p is None else p.exponents[:, 1:last].tolist()
+            rows += [[1 + j for j, e in enumerate(row) for _ in range(e)] for row in exponents]
+        high = [row for row in rows if len(row) > 1]
+        if any(sum(j > n for j in row) > 1 for row in high):
+            return tuple(range(n))
+        return tuple(sorted({j - 1 for row in high for j in row if j <= n}))
+
+    def equations(self) -> tuple[tuple[Polynomial, ...], FloatArray]:
+        """(n) polynomials in t, x, u, w with exact coefficients, and bounds (n,) of the rest."""
+        rates = self.rates
+        names = ("t", *variable_names(rates.n, rates.m, len(rates.uncertain)))
+        found, bounds = [], np.zeros(rates.n)
+        for i, p in enumerate(rates.exact):
+            if p is None:
+                p, bounds[i] = self._in_states(self.rows[i], names)
+            found.append(p)
+        return tuple(found), bounds
+
+    def box(self) -> tuple[FloatArray, FloatArray]:
+        """(n + m,) low and high of (x, u), rounded inward."""
+        chosen = slice(1, 1 + self.rates.n + self.rates.m)
+        centre, radius = self.centre[chosen], self.radius[chosen]
+        return np.nextafter(centre - radius, np.inf), np.nextafter(centre + radius, -np.inf)
+
+    def _in_states(self, row: _Row, names: tuple[str, ...]) -> tuple[Polynomial, float]:
+        left = Fraction(row.bound)
+        size = float(np.abs(row.coefficients).sum()) + row.bound
+        centre = [Fraction(c) for c in self.centre.tolist()]
+        total: dict[tuple[int, ...], Fraction] = {}
+        for used, value in zip(row.monomials, row.coefficients.tolist(), strict=True):
+            if abs(value) <= NEGLIGIBLE * size:
+                left += abs(Fraction(value))
+                continue
+            scale = Fraction(1)
+            for j in used:
+                scale *= Fraction(float(self.radius[j]))
+            rounded = Fraction(float(Fraction(value) / scale))
+            left += abs(rounded * scale - Fraction(value))
+            parts = {(0,) * len(names): rounded}
+            for j in used:  # times z_j - centre_j
+                product: dict[tuple[int, ...], Fraction] = {}
+                for exponent, c in parts.items():
+                    higher = (*exponent[:j], exponent[j] + 1, *exponent[j + 1 :])
+                    product[higher] = product.get(higher, Fraction(0)) + c
+                    if centre[j]:
+                        product[exponent] = product.get(exponent, Fraction(0)) - c * centre[j]
+                parts = product
+            for exponent, c in parts.items():
+                total[exponent] = total.get(exponent, Fraction(0)) + c
+        coefficients = np.empty(len(total), dtype=object)
+        coefficients[:] = list(total.values())
+        exponents = np.array(list(total), dtype=np.int64).reshape(-1, len(names))
+        return Polynomial(exponents, coefficients, names), nextafter(float(left), inf)
 
 
 def taylor_field(
-    rate: Callable[..., Any], t: ArrayLike, x: ArrayLike, u: ArrayLike, *, radius: ArrayLike
+    rate: Callable[..., Any],
+    t: ArrayLike,
+    x: ArrayLike,
+    u: ArrayLike,
+    *,
+    radius: ArrayLike,
+    uncertain: ArrayLike | None = None,
 ) -> VectorField:
-    """rate(x, u) as a cubic per interval of a motion, and what it leaves out as bounded w.
+    """rate(t, x, u, w) as a cubic per interval of a motion, and what it leaves out as bounded w.
 
-    t: (K,) s; x: (K, n), u: (K, m) the motion there. radius: (n + m,) how far (x, u) may be from
-    the motion's range on an interval: `valid` states those boxes, so a funnel is proved to stay in
-    them. Every state whose rate is not an exact cubic has a w in [-1, 1], scaled to its bound.
+    rate: of any of these arguments, named so. t: (K,) s; x: (K, n), u: (K, m) the motion there.
+    radius: (n + m,), or (K-1, n + m), how far (x, u) may be from the motion's range on an interval:
+    `valid` states those boxes, so a funnel is proved to stay in them. uncertain: rows (low, high)
+    of the entries of w. Every state whose rate is not a cubic as it stands has a w in [-1, 1] more,
+    scaled to its bound. Raises DataError, naming what is supported, if rate cannot be expanded.
     """
     t, x, u = (np.asarray(part, dtype=np.float64) for part in (t, x, u))
-    n, m = x.shape[1], u.shape[1]
+    if t.ndim != 1 or x.ndim != 2 or u.ndim != 2 or not len(t) == len(x) == len(u) >= 2:
+        raise ShapeError(
+            f"a motion should be t (K,), x (K, n) and u (K, m), is {t.shape}, {x.shape}, {u.shape}"
+        )
     z = np.hstack([x, u])
-    centres = np.round((z[:-1] + z[1:]) / 2 / GRID) * GRID
-    radii = np.asarray(radius, dtype=np.float64) + np.abs(np.diff(z, axis=0)) / 2 + GRID
-    expanded = [expand(rate, c, r, states=n) for c, r in zip(centres, radii, strict=True)]
-    bounds = np.array([bound for _, bound in expanded])
-    rows = np.flatnonzero(bounds.any(axis=0)).tolist()
-    names = ("t", *variable_names(n, m, len(rows)))
-    pieces = []
-    for cubics, bound in expanded:
-        equations = [p.over(names) for p in cubics]
+    radius = np.asarray(radius, dtype=np.float64)
+    if radius.shape not in (z.shape[1:], (len(z) - 1, z.shape[1])):
+        raise ShapeError(f"radius should have {z.shape[1]} entries, has shape {radius.shape}")
+    if not (radius >= 0).all():
+        raise DataError(f"radius should be how far (x, u) may be, 0 or more; it is {radius}")
+    rates = Rates.of(rate, x.shape[1], u.shape[1], uncertain)
+    low, high = np.minimum(z[:-1], z[1:]) - radius, np.maximum(z[:-1], z[1:]) + radius
+    spans = zip(low, high, t[:-1].tolist(), t[1:].tolist(), strict=True)
+    return field_of([rates.on(a, b, (start, end)) for a, b, start, end in spans], t)
+
+
+def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
+    """The vector field of one `Cubic` per interval between the times t (K,)."""
+    rates = cubics[0].rates
+    n, m, given, rows = rates.n, rates.m, rates.uncertain, rates.inexact
+    names = ("t", *variable_names(n, m, len(given) + len(rows)))
+    pieces: list[tuple[Polynomial, ...]] = []
+    valid = []
+    for span, cubic in enumerate(cubics):
+        found, bounds = cubic.equations()
+        equations = [p.over(names) for p in found]
         for place, i in enumerate(rows):
             unit = np.zeros((1, len(names)), dtype=np.int64)
-            unit[0, 1 + n + m + place] = 1
-            equations[i] = equations[i] + Polynomial(unit, np.array([bound[i]]), names).exact()
+            unit[0, 1 + n + m + len(given) + place] = 1
+            equations[i] = equations[i] + Polynomial(unit, np.array([bounds[i]]), names).exact()
         pieces.append(tuple(equations))
-    valid = [
-        (j, nextafter(centre[j] - reach[j], inf), nextafter(centre[j] + reach[j], -inf), span)
-        for span, (centre, reach) in enumerate(zip(centres, radii, strict=True))
-        for j in range(n + m)
-    ]
+        low, high = cubic.box()
+        valid += [(j, float(low[j]), float(high[j]), span) for j in rates.expanded]
+    uncertain = np.vstack([given, np.tile([-1.0, 1.0], (len(rows), 1))])
+    if not rows:
+        return VectorField((pieces[0],), n, m, uncertain=uncertain)
     return VectorField(
-        tuple(pieces), n, m, t[1:-1], np.tile([-1.0, 1.0], (len(rows), 1)), np.array(valid),
-        EXPANSION if rows else "",
-    )  # fmt: skip
+        tuple(pieces), n, m, t[1:-1], uncertain, np.array(valid).reshape(-1, 4), EXPANSION
+    )
 
 
-def _in_states(
-    row: Any, k: int, centre: FloatArray, radius: FloatArray, names: tuple[str, ...]
-) -> tuple[Polynomial, float]:
-    """The model's polynomial in (x, u) with exact coefficients, and the bound of the rest."""
-    if not isinstance(row, TaylorModel):
-        return Polynomial(np.zeros((1, k), int), np.array([float(row)]), names).exact(), 0.0
-    exponents, left = _exponents(k), Fraction(row.error)
-    total = Polynomial(np.zeros((0, k), int), np.zeros(0), names).exact()
-    shifted = [
-        Polynomial(np.vstack([np.eye(k, dtype=int)[j], np.zeros(k, int)]),
-                   np.array([1.0, -centre[j]]), names).exact()
-        for j in range(k)
-    ]  # fmt: skip
-    for exponent, value in zip(exponents.tolist(), row.coefficients.tolist(), strict=True):
-        if abs(value) <= NEGLIGIBLE * row.size:
-            left += abs(Fraction(value))
-            continue
-        scale = Fraction(1)
-        for r, e in zip(radius.tolist(), exponent, strict=True):
-            scale *= Fraction(r) ** e
-        rounded = Fraction(float(Fraction(value) / scale))
-        left += abs(rounded * scale - Fraction(value))
-        term = Polynomial(np.zeros((1, k), int), np.array([float(rounded)]), names).exact()
-        for j in np.repeat(np.arange(k), exponent).tolist():
-            term = term * shifted[j]
-        total = total + term
-    return total, nextafter(float(left), inf) if left else 0.0
+def _centred(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres of few bits and radii that cover [low, high]."""
+    half = np.maximum((high - low) / 2, 1e-12)
+    grid = np.exp2(np.floor(np.log2(half)) - CENTRE_BITS)
+    centre = np.round((low + high) / 2 / grid) * grid
+    radius = np.maximum(np.maximum(high - centre, centre - low), half) * (1 + 2.0**-40)
+    return centre, np.where(high > low, radius, np.where(centre == low, 0.0, radius))
 
 
-@lru_cache(maxsize=16)
-def _exponents(k: int) -> IntArray:
-    return monomials(k, range(DEGREE + 1))
+class _Symbol:
+    """A polynomial, or something that is none; and the entries of z that it depends on."""
+
+    __slots__ = ("p", "uses")
+
+    def __init__(self, p: Polynomial | None, uses: frozenset[int]) -> None:
+        self.p, self.uses = p, uses
+
+    @classmethod
+    def made(cls, value: Any) -> "_Symbol":
+        if isinstance(value, _Symbol):
+            return value
+        return cls(as_polynomial(value).exact(), frozenset())
+
+    def cubic(self, names: tuple[str, ...], first: int) -> Polynomial | None:
+        """The polynomial if it can stand in a vector field as it is; first: the place of w0."""
+        if self.p is None:
+            return None
+        p = self.p.over(names)
+        e = p.exponents
+        small = (e[:, 1:first].sum(axis=1) <= DEGREE).all() and (e[:, first:] <= 1).all()
+        return p if small and p.degree <= MAX_TOTAL_DEGREE else None
+
+    def _with(self, other: Any, name: str) -> Any:
+        if isinstance(other, np.ndarray) and other.ndim:
+            return NotImplemented
+        other = _Symbol.made(other)
+        uses, p = self.uses | other.uses, None
+        if self.p is not None and other.p is not None:
+            try:
+                p = getattr(self.p, name)(other.p)
+            except NotPolynomial:
+                p = None
+        if p is not None and p.degree > MAX_TOTAL_DEGREE:
+            p = None
+        return _Symbol(p, uses)
+
+    def _power(self, power: Any) -> "_Symbol":
+        try:
+            p = (
+                None
+                if self.p is None or self.p.degree * power > MAX_TOTAL_DEGREE
+                else self.p**power
+            )
+        except NotPolynomial:
+            p = None
+        return _Symbol(p, self.uses)
+
+    def _unknown(self, *others: Any) -> "_Symbol":
+        uses = self.uses.union(*(o.uses for o in others if isinstance(o, _Symbol)))
+        return _Symbol(None, uses)
+
+    def _refused(self, *_: Any) -> Any:
+        raise TypeError("a comparison: which branch holds is not known on a whole box")
+
+    __pow__ = _power
+    __eq__ = __ne__ = __lt__ = __le__ = __gt__ = __ge__ = __bool__ = _refused
+    __hash__ = None  # type: ignore[assignment]
+    __abs__ = sqrt = sin = cos = tan = exp = log = tanh = arctan = arctan2 = fabs = _unknown
+    absolute = _unknown
+
+    def square(self) -> "_Symbol":
+        return self._power(2)
+
+    def __neg__(self) -> "_Symbol":
+        return _Symbol(None if self.p is None else -self.p, self.uses)
+
+    def __pos__(self) -> "_Symbol":
+        return self
 
 
-@lru_cache(maxsize=64)
-def _place_of_unit(k: int, j: int) -> int:
-    return int(np.flatnonzero(monomials(k, [1])[:, j])[0])
-
-
-@lru_cache(maxsize=16)
-def _products(k: int) -> tuple[IntArray, Any]:
-    """(M, M) the monomial of each product, and which of them have degree 3 at most."""
-    rows = _exponents(k)
-    sums = rows[:, None] + rows[None]
-    kept = sums.sum(axis=-1) <= DEGREE
-    places = {row.tobytes(): i for i, row in enumerate(rows)}
-    table = np.zeros(kept.shape, dtype=np.int64)
-    table[kept] = [places[row.tobytes()] for row in sums[kept]]
-    return table, kept
-
-
-def _is_power_of_two(value: float) -> bool:
-    """True if a product with it, or its inverse, is exact; or if it is zero."""
-    return abs(frexp(value)[0]) in (0.0, 0.5)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating))
+for _name in ("add", "radd", "sub", "rsub", "mul", "rmul", "truediv", "rtruediv"):
+    setattr(_Symbol, f"__{_name}__",
+            lambda self, other, _name=f"__{_name}__": self._with(other, _name))  # fmt: skip

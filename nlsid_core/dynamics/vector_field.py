@@ -17,8 +17,8 @@ from nlsid_core.polynomial import Polynomial, trace
 from nlsid_core.polynomial.maps import coefficient_table
 
 FORMAT = "nlsid/vector_field"
-MANY_PUSHES = 3
-MAX_UNCERTAIN = 10  # their box has 2^10 vertices, each checked
+MANY_PUSHES, FEW_STATES = 3, 4  # with few of both, corners are exact and cheap enough
+MAX_UNCERTAIN = 32  # of which more than 10 have to be pushes: their box has too many vertices
 MAX_VARIABLES = 200
 MAX_SENTENCE = 200  # characters
 ARGUMENTS = ("t", "x", "u", "w")
@@ -141,6 +141,12 @@ class VectorField:
         return cls(pieces, n, m, uncertain=bounds, valid=within, expansion=expansion)
 
     @property
+    def depends_on_time(self) -> bool:
+        """True if t occurs, or equations change at some time."""
+        used = any(p.exponents[:, 0].any() for piece in self.pieces for p in piece)
+        return used or len(self.breaks) > 0
+
+    @property
     def degree(self) -> int:
         """Largest total degree in x and u."""
         columns = slice(1, 1 + self.n + self.m)
@@ -159,6 +165,11 @@ class VectorField:
         """
         if len(self.uncertain) and not self.is_pushed:
             return tuple(range(self.n))
+        return self.curved_states
+
+    @property
+    def curved_states(self) -> tuple[int, ...]:
+        """`nonlinear_states` where w is not taken at its corners."""
         found: set[int] = set()
         for equations in self.pieces:
             for p in equations:
@@ -175,9 +186,14 @@ class VectorField:
 
         Then 2|x̄'Pg|r ≤ r(κ(x̄'Pg)² + 1/κ) bounds what each does, and no corner is needed.
         """
-        return len(self.uncertain) >= MANY_PUSHES and all(
-            self.pushes(span) is not None for span in range(len(self.pieces))
-        )
+        many = MANY_PUSHES if self.n <= FEW_STATES else 1
+        return len(self.uncertain) >= many and self.only_pushes
+
+    @property
+    def only_pushes(self) -> bool:
+        """True if there is a w and it does nothing but add constants to ẋ."""
+        spans = range(len(self.pieces))
+        return len(self.uncertain) > 0 and all(self.pushes(span) is not None for span in spans)
 
     def pushes(self, span: int) -> FloatArray | None:
         """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""

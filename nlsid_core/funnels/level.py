@@ -5,9 +5,9 @@ v = (s - centre)/scale, or the change of s since the last sample over scale, s t
 inputs; no inputs: s = 1. Source: docs/certificate_tube.md, "A level that follows the commands".
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -128,14 +128,15 @@ class LevelMeter:
 
     def update(self, u: Sequence[float]) -> list[float]:
         """g of every row at the next sample, whose inputs are u."""
-        products = [math.prod([u[i] for i in term[0]]) for term in self._terms]
-        before = self._before or products
-        columns = zip(self._terms, products, before, strict=True)
-        values = [
-            (s - (earlier if change else centre)) / scale
-            for (_, change, centre, scale, _), s, earlier in columns
-        ]
-        columns_G = zip(self._terms, self._G, values, strict=True)
-        self._G = [term[4] * G + v * v for term, G, v in columns_G]
+        G, before, products = self._G, self._before, []
+        for i, (factors, change, centre, scale, fading) in enumerate(self._terms):
+            s = 1.0
+            for j in factors:
+                s *= u[j]
+            products.append(s)
+            if change:
+                centre = s if before is None else before[i]
+            v = (s - centre) / scale
+            G[i] = fading * G[i] + v * v
         self._before = products
-        return [sum([w * G for w, G in zip(row, self._G, strict=True)]) for row in self._weights]
+        return [sum(map(mul, row, G)) for row in self._weights]

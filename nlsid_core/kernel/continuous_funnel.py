@@ -30,7 +30,7 @@ from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 
-MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 10, 3
+MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
 PIECE = 10_000  # of the work that a claim may take: what a piece costs at the least
@@ -397,8 +397,8 @@ def _decide_pieces(
     """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
     kappa = None
     if "kappa" in stated:
-        kappa = stated["kappa"].array(len(field.box))
-        if any(k <= 0 for k in kappa):
+        kappa = stated["kappa"].array(len(spans), len(field.box))
+        if any(k <= 0 for row in kappa for k in row):
             raise Rejected("kappa should be positive")
         if len(_pushing(field)) < len(field.box):
             raise Rejected("w does more than add constants: kappa does not bound what it does")
@@ -420,7 +420,7 @@ def _decide_pieces(
             loops.clear()
             push = hold.push(k, corner)
             loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, push)
-            loops[key].grow(field, kappa, margin)
+            loops[key].grow(field, kappa[k] if kappa else [], margin)
         loop, piece = loops[key], pieces[i]
         c = loop.condition(multiplier, piece, stated, w)
         squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
@@ -577,7 +577,7 @@ class _Loop:
         """dx₀/ds."""
         return [self.in_time(_slope(p)) for p in zip(*self.funnel.x[self.k], strict=True)]
 
-    def grow(self, field: Field, kappa: list[Fraction] | None, margin: Fraction) -> None:
+    def grow(self, field: Field, kappa: Sequence[Fraction], margin: Fraction) -> None:
         """`rest` and, by monomials in w, `growth`: all of c(s, x̄) but its multipliers."""
         ring, k, h, x = self.ring, self.k, self.h, self.ring.variables
         bend = [
@@ -589,7 +589,7 @@ class _Loop:
         rest = rise - margin * h * self.rho - ring.form(bend, x)
         rest += 2 * ring.dot(self._motion(), self.Px)
         self.growth = _along(ring, self.equations, self.Px, self.forms, 2 * h)
-        for j, (bound, (low, high)) in enumerate(zip(kappa or [], field.box, strict=False)):
+        for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=False)):
             unit = tuple(int(i == j) for i in range(len(field.box)))
             along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
             half = (high - low) / 2

@@ -11,6 +11,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.monotone import NEWTON_STEPS, RESIDUAL
+from nlsid_core.polynomial.products import Products
 
 Monomial = list[tuple[int, int]]  # (variable, power) of each variable that occurs
 
@@ -37,13 +38,7 @@ class SingleStep:
             self._table[place, power * n_v : (power + 1) * n_v] += values
         for place, values in zip(places[len(of) :], shift.coefficients, strict=True):
             self._table[place, self._split :] += values
-        # Each monomial as a product of entries of (x, w, 1), all of the same number of factors.
-        variables = known.shape[1]
-        factors = [[j for j, e in enumerate(row) for _ in range(e)] for row in known.tolist()]
-        depth = max(1, *map(len, factors))
-        filled = [row + [variables] * (depth - len(row)) for row in factors]
-        self._factors = list(np.array(filled).T)
-        self._size = variables + 1
+        self._products, self._size = Products(known), known.shape[1] + 1
         self._monomials: list[Monomial] = [
             [(j, e) for j, e in enumerate(row) if e] for row in powers.tolist()
         ]
@@ -54,10 +49,7 @@ class SingleStep:
         n, n_v = x.shape[1], self._unknowns
         known = np.ones((len(x), self._size))
         known[:, :n], known[:, n : self._size - 1] = x, w
-        values = known[:, self._factors[0]]
-        for factor in self._factors[1:]:
-            values = values * known[:, factor]
-        found = values @ self._table
+        found = self._products(known) @ self._table
         after = np.empty_like(x)
         after[:, n_v:] = found[:, self._split :]
         equations, starts = found[:, : self._split].tolist(), x[:, :n_v].tolist()

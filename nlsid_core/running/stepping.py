@@ -25,6 +25,7 @@ from nlsid_core.models import (
 from nlsid_core.models.implicit_step import SingleStep
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.signal import Signal
+from nlsid_core.polynomial.products import Products
 
 Advance = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -100,13 +101,32 @@ class _Linear:
 
 
 class _StateAffine:
-    """ȳ = gains(w) x + forcing(w), x the lagged ȳ."""
+    """G_0(w) ȳ = -(G_1(w) ȳ(t-1) + … + p(w)), x the lagged ȳ."""
 
     def __init__(self, model: StateAffineModel) -> None:
         self._model = model
-        p = len(model.y)
+        p = self._p = len(model.y)
         self.order, self.lags = len(model) * p, len(model)
         self.delays = len(model)
+        self._low, self._high = model.u_range.T
+        self._rows = np.array([self.delays - d for _, d in model.window], dtype=np.intp)
+        self._columns = np.array([i for i, _ in model.window], dtype=np.intp)
+        # All polynomials on common monomials: [G_0 G_1 … G_n p] row by row of the equation.
+        parts = [*model.G, model.p]
+        exponents, places = np.unique(
+            np.vstack([part.exponents for part in parts]), axis=0, return_inverse=True
+        )
+        self._products = Products(exponents)
+        table = np.zeros((len(exponents), p, (len(model) + 1) * p + 1))
+        first, place = 0, places.ravel().tolist()
+        for k, part in enumerate(parts):
+            values = part.coefficients.reshape(len(part.exponents), p, -1)
+            for row in values:
+                table[place[first], :, k * p : k * p + values.shape[2]] += row
+                first += 1
+        self._table = table.reshape(len(exponents), -1)
+        self._point = np.ones((1, len(model.window) + 1))
+        self._refuses = model.on_out_of_range == "refuse"
 
     def begin(self, y: FloatArray, _u: FloatArray) -> FloatArray:
         model, n = self._model, self.lags
@@ -114,9 +134,15 @@ class _StateAffine:
         return np.asarray(newest[::-1].ravel())
 
     def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        model = self._model
-        gains, forcing = model.explicit(model.windows(np.array(past))[-1])
-        after = x @ gains.T + forcing
+        model, p = self._model, self._p
+        u = np.array(past)
+        if self._refuses:
+            model.windows(u)
+        scaled = (np.minimum(np.maximum(u, self._low), self._high) - model.u_offset) / model.u_scale
+        self._point[0, :-1] = scaled[self._rows, self._columns]
+        found = (self._products(self._point) @ self._table).reshape(p, -1)
+        right = x @ found[:, p:-1].T + found[:, -1]
+        after = right / -found[0, 0] if p == 1 else np.linalg.solve(found[:, :p], -right.T).T
         return after * model.y_scale + model.y_offset, _shifted(after, x)
 
 

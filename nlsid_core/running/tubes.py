@@ -29,7 +29,7 @@ from nlsid_core.running.stepping import Stepper
 TREND = 10  # samples over which the margin's fall is taken
 FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later: clocks drift
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
-TINY = float(np.finfo(float).tiny)  # of a level that no command opens
+TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
 
 
@@ -256,12 +256,9 @@ class TubeRun:
 
     def _followed(self) -> tuple[FloatArray, FloatArray]:
         """Levels (tubes,) and half-widths (tubes, p) at this sample."""
-        level, widths = self._level.copy(), self._widths.copy()
-        for j, g in self._g.items():
-            if j < len(level):
-                level[j] *= g[0]
-                widths[j] *= math.sqrt(g[0])
-        return np.maximum(level, TINY), np.maximum(widths, TINY)
+        room = np.array([max(self._g[j][0], TINY) if j in self._g else 1.0
+                         for j in range(len(self._tubes))])  # fmt: skip
+        return self._level * room, self._widths * np.sqrt(room)[:, None]
 
     def _response(self, i: int, away: list[float]) -> tuple[float, str]:
         """The most of what is assumed of funnel i's output error that is used, and of which."""
@@ -271,7 +268,7 @@ class TubeRun:
         used, worst = 0.0, 0
         g = self._g.get(len(self._tubes) + i)
         for j, (error, width) in enumerate(zip(away, response.half_widths.tolist(), strict=True)):
-            bound = max(width * (1.0 if g is None else math.sqrt(g[j])), TINY) * (1.0 - ROUNDING)
+            bound = width * (1.0 if g is None else math.sqrt(max(g[j], TINY))) * (1.0 - ROUNDING)
             part = abs(error) / bound
             if not part <= used:
                 used, worst = part, j

@@ -59,8 +59,8 @@ def test_arguments_fill_parameters_names_and_remappings_and_conditions_choose_no
     assert flags(within["tracking_controller"], "-p")["highest"] == "0.4"
     renamed = flags(within["funnel_monitor"], "-r")
     assert renamed["__ns"] == "/a"
-    assert renamed["/odom"] == "/a/odom"
-    assert renamed["/cmd_vel"] == "/cmd_vel"
+    assert renamed["odom"] == "/a/odom"
+    assert renamed["cmd_vel"] == "cmd_vel"
 
 
 @pytest.mark.parametrize(

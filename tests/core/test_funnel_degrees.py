@@ -38,7 +38,7 @@ def moving(field: VectorField, knots: int = 9) -> Nominal:
 def test_dynamics_of_degree_five_are_proved_and_no_start_leaves(n: int, tmp_path: Path) -> None:
     field = quintic(n)
     assert field.degree == 5
-    design = design_funnel(field, moving(field), goal=8 * np.eye(n))
+    design = design_funnel(field, moving(field), goal=8 * np.eye(n), Q=np.eye(n), R=np.eye(field.m))
     assert check(design.save(tmp_path)[-1]).margin > 0
     rng = np.random.default_rng(2)
     parts = (field, design.policy, design.funnel)

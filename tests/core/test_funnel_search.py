@@ -26,7 +26,8 @@ from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.proofs import Verdict, check
 
 GOAL = 20 * np.eye(2)
-DEFAULTS: Any = {"policy": None, "Q": None, "R": None, "gain": "constant"}
+WEIGHTS: Any = {"Q": np.eye(2), "R": np.eye(1)}
+DEFAULTS: Any = {"policy": None, "gain": "constant"} | WEIGHTS
 
 
 def hanging(knots: int = 9) -> tuple[VectorField, Nominal]:
@@ -125,7 +126,7 @@ def test_a_first_rho_that_cannot_start_is_refused(
     rho: FloatArray, error: type[Exception], reason: str
 ) -> None:
     with pytest.raises(error, match=reason):
-        design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL), rho=rho)
+        design_by_alternation(ContinuousTracking(*hanging(), goal=GOAL, **WEIGHTS), rho=rho)
 
 
 @pytest.mark.parametrize("option", ["shape", "objective", "gain"])

@@ -238,7 +238,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     field = VectorField.from_function(pair, 2, 2)
     found = design_funnel(
         field, still(field, 9, 0.4), goal=4 * np.eye(2),
-        limits=[[0, -0.9, 0.9], [1, -0.6, 0.8]],
+        limits=[[0, -0.9, 0.9], [1, -0.6, 0.8]], Q=np.eye(2), R=np.eye(2),
     )  # fmt: skip
     assert len(np.unique(found.found.proved.pieces.mode, axis=0)) == 9
     edge = found.funnel.outline(0.0, (0, 1))

@@ -10,9 +10,9 @@ from benchmarks.known_problems import encloses, run
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, design_funnel, nominal_through
 from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
-from nlsid_core.dynamics import VectorField
-from nlsid_core.dynamics.taylor import expand, taylor_field
-from nlsid_core.errors import CertificateRejected, DataError, ShapeError
+from nlsid_core.dynamics import Rates, VectorField, solve, taylor_field
+from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeError
+from nlsid_core.polynomial import Polynomial
 from nlsid_core.proofs import check
 from tests.funnel_files import saved, write
 
@@ -22,19 +22,41 @@ def swinging(x: Any, u: Any) -> list[Any]:
     return [x[1], -9.81 * np.sin(x[0]) + u[0] / (2 + np.cos(x[0])) - x[1] * x[1] / 10]
 
 
+def expanded(
+    function: Any, centre: Any, radius: Any, *, states: int, uncertain: Any = None
+) -> tuple[list[Polynomial], FloatArray]:
+    """Cubics in t, x, u, w on a box of (x, u), from t = 0 to 0.1, and the bounds of the rest."""
+    centre, radius = np.asarray(centre, float), np.asarray(radius, float)
+    rates = Rates.of(function, states, len(centre) - states, uncertain)
+    found, bounds = rates.on(centre - radius, centre + radius, (0.0, 0.1)).equations()
+    return list(found), bounds
+
+
+def left_over(
+    function: Any, cubics: list[Polynomial], box: FloatArray, states: int, inputs: int
+) -> FloatArray:
+    """(n,) the most that the cubics leave out, at random points and corners of box (k, 2)."""
+    rng = np.random.default_rng(0)
+    shares = np.vstack([rng.uniform(0, 1, (3000, len(box))), rng.integers(0, 2, (200, len(box)))])
+    points = box[:, 0] + shares * (box[:, 1] - box[:, 0])
+    rates = Rates(function, states, inputs, np.zeros((len(box) - 1 - states - inputs, 2)), (), ())
+    end = 1 + states + inputs
+    true = [rates(p[0], p[1 : 1 + states], p[1 + states : end], p[end:])[0] for p in points]
+    return np.asarray(
+        np.abs(np.array(true) - np.stack([c.rounded()(points) for c in cubics], axis=1)).max(axis=0)
+    )
+
+
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (2.5, -3.0, 4.0), (-1.25, 0.5, -2.0)])
 @pytest.mark.parametrize("size", [0.01, 0.3, 1.0])
 def test_the_remainder_is_never_more_than_its_bound_and_in_small_boxes_not_much_less(
     centre: tuple[float, ...], size: float
 ) -> None:
     radius = size * np.array([1.0, 2.0, 3.0])
-    cubics, bounds = expand(swinging, np.array(centre), radius, states=2)
-    rng = np.random.default_rng(0)
-    corners = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
-    points = np.array(centre) + radius * np.vstack([rng.uniform(-1, 1, (4000, 3)), corners])
-    true = np.stack(swinging(points[:, :2].T, points[:, 2:].T), axis=1)
-    left = np.abs(true - np.stack([p.rounded()(points) for p in cubics], axis=1)).max(axis=0)
-    rounding = 1e-13 * np.abs(true).max()  # of this test's own evaluation
+    cubics, bounds = expanded(swinging, centre, radius, states=2)
+    box = np.stack([np.array(centre) - radius, np.array(centre) + radius], axis=1)
+    left = left_over(swinging, cubics, np.vstack([[0.0, 0.1], box]), 2, 1)
+    rounding = 1e-13 * (1 + np.abs(centre).max()) * 10
     assert (left <= bounds + rounding).all()
     assert bounds[0] == 0
     if size < 1:  # in a wide box a division's series leaves much more than it has to
@@ -43,26 +65,93 @@ def test_the_remainder_is_never_more_than_its_bound_and_in_small_boxes_not_much_
 
 def test_one_over_something_that_may_be_zero_is_refused() -> None:
     with pytest.raises(DataError, match="may be zero in the box"):
-        expand(lambda x, u: [u[0] / x[0]], [0.5, 0.0], [0.5, 1.0], states=1)
-    with pytest.raises(ShapeError, match="1 entries for 2 states"):
-        expand(lambda x, u: [x[0] + u[0]], [0.5, 0.0, 0.0], [0.5, 1.0, 1.0], states=2)
+        expanded(lambda x, u: [u[0] / x[0]], [0.5, 0.0], [0.5, 1.0], states=1)
+    with pytest.raises(ShapeError, match="1 rates for 2 states"):
+        expanded(lambda x, u: [x[0] + u[0]], [0.5, 0.0, 0.0], [0.5, 1.0, 1.0], states=2)
+
+
+EVERYTHING: dict[str, Any] = {
+    "numbers": lambda x, u: [3 - x[0] / 3 + u[0] ** 2 + np.sin(x[0]) * 0],
+    "division": lambda x, u: [1 / (4 - x[0]) - u[0] / -(3 + x[0])],
+    "powers": lambda x, u: [-(x[0] ** 3) * u[0] + x[0] ** 7 - (2 + x[0]) ** -2],
+    "roots": lambda x, u: [np.sqrt(2 + x[0] * u[0]) + (3 + u[0]) ** 0.5 + (3 + x[0]) ** -0.5],
+    "tan": lambda x, u: [np.tan(x[0] / 2) - np.tan(3 + u[0] / 4)],
+    "exp": lambda x, u: [np.exp(-x[0] * u[0]) + np.log(2 + x[0])],
+    "tanh": lambda x, u: [np.tanh(3 * x[0]) - np.arctan(u[0] + 2 * x[0])],
+    "arctan2": lambda x, u: [np.arctan2(x[0] + 1, u[0] - 1.5) + np.arctan2(u[0] - 3, x[0] / 4)],
+    "abs": lambda x, u: [abs(u[0]) + np.abs(x[0]) - abs(x[0] - u[0] - 5)],
+    "solve": lambda x, u: [solve([[0.2 * x[0], 2 + u[0]], [3, x[0]]], [np.cos(x[0]), u[0]])[0]],
+    "arrays": lambda x, u: [np.cross([x[0], u[0], 1.0], [np.sin(x[0]), 2, x[0] * u[0]])[2]],
+}
+
+
+@pytest.mark.parametrize("name", EVERYTHING)
+@pytest.mark.parametrize("size", [0.05, 0.5])
+def test_every_operation_encloses(name: str, size: float) -> None:
+    centre, radius = np.array([1.0, -0.5]), size * np.array([1.0, 1.5])
+    cubics, bounds = expanded(EVERYTHING[name], centre, radius, states=1)
+    box = np.array([[0.0, 0.1], *np.stack([centre - radius, centre + radius], axis=1)])
+    left = left_over(EVERYTHING[name], cubics, box, 1, 1)
+    assert left[0] <= bounds[0] + 1e-13
+    if size < 0.1:
+        assert bounds[0] < 0.02
+
+
+def test_time_and_disturbances_are_expanded_too() -> None:
+    def blown(t: Any, x: Any, u: Any, w: Any) -> Any:
+        return [x[1] + w[0], np.sin(x[0] + 3 * t) + 0.3 * w[1] + w[0] * np.cos(x[0]) + u[0]]
+
+    centre, radius, w = np.array([0.4, 0.1, 0.0]), np.full(3, 0.2), [[-0.1, 0.3], [-1.0, 1.0]]
+    cubics, bounds = expanded(blown, centre, radius, states=2, uncertain=w)
+    box = np.array([[0.0, 0.1], *np.stack([centre - radius, centre + radius], axis=1), *w])
+    assert (left_over(blown, cubics, box, 2, 1) <= bounds + 1e-13).all()
+    assert bounds[0] == 0
+    assert 0 < bounds[1] < 0.01
+    t = np.linspace(0, 1, 5)
+    field = taylor_field(
+        blown, t, np.zeros((5, 2)), np.zeros((5, 1)), radius=[1, 1, 1], uncertain=w
+    )
+    assert field.uncertain.tolist() == [[-0.1, 0.3], [-1.0, 1.0], [-1.0, 1.0]]
+
+
+def test_many_inexact_rates_are_pushes_and_exact_ones_have_none() -> None:
+    n = 14
+    t, x = np.linspace(0, 1, 3), np.zeros((3, n))
+    field = taylor_field(
+        lambda x: [*np.sin(x[: n - 2]), x[0] / 3 + 0.1 * x[1] + 0.2 * x[1], x[3] ** 3],
+        t, x, np.zeros((3, 0)), radius=np.full(n, 0.1),
+    )  # fmt: skip
+    assert len(field.uncertain) == n - 2
+    assert field.is_pushed
 
 
 @pytest.mark.parametrize(
-    ("rate", "true"),
+    ("function", "said"),
     [
-        (lambda x, u: [3 - x[0] / 3 + u[0] ** 2], lambda x, u: 3 - x / 3 + u**2),
-        (lambda x, u: [1 / (4 - x[0]) - u[0]], lambda x, u: 1 / (4 - x) - u),
-        (lambda x, u: [-(x[0] ** 3) * u[0]], lambda x, u: -(x**3) * u),
-        (lambda x, u: [2.5 + 0 * (x[0] - u[0])], lambda x, u: 2.5 + 0 * x * u),
+        (lambda x: [np.arcsin(x[0])], "arcsin.*known are .*np.arctan2.*dynamics.solve"),
+        (lambda x, u: [x[0] if x[0] > 0 else u[0]], "comparison: which branch"),
+        (lambda x, u: [np.linalg.solve([[x[0]]], [u[0]])[0]], "known are"),
+        (lambda x: [np.sin(x[0]) ** 0.3], "power 0.3: whole numbers"),
+        (lambda x, u: [np.arctan2(x[0] - 1, u[0])], "zero in the box"),
+        (lambda x: [np.log(x[0] - 1)], "logarithm of a value that may not be positive"),
+        (lambda x: [np.tan(x[0] + 0.57)], "may be at a pole"),
+        (lambda x, v: [x[0] + v], "function of some of t, x, u, w"),
+        (lambda x, w: [x[0] + w[0]], "give its bounds as `uncertain`"),
     ],
 )
-def test_every_operation_encloses(rate: Any, true: Any) -> None:
-    centre, radius = np.array([1.0, -0.5]), np.array([0.5, 0.75])
-    (cubic,), bounds = expand(rate, centre, radius, states=1)
-    points = centre + radius * np.random.default_rng(1).uniform(-1, 1, (2000, 2))
-    left = np.abs(true(points[:, 0], points[:, 1]) - cubic.rounded()(points))
-    assert (left <= bounds[0] + 1e-14).all()
+def test_what_is_not_supported_says_what_is(function: Any, said: str) -> None:
+    with pytest.raises(NlsidError, match=said):
+        expanded(function, [1.0, -0.5], [0.5, 0.75], states=1)
+
+
+def test_a_radius_that_makes_no_sense_is_refused() -> None:
+    t, x, u = np.linspace(0, 1, 3), np.zeros((3, 2)), np.zeros((3, 1))
+    with pytest.raises(DataError, match=r"how far .* may be, 0 or more"):
+        taylor_field(swinging, t, x, u, radius=[-0.1, 1, 1])
+    with pytest.raises(ShapeError, match="radius should have 3 entries"):
+        taylor_field(swinging, t, x, u, radius=[0.1, 1])
+    with pytest.raises(ShapeError, match="a motion should be"):
+        taylor_field(swinging, t, x, u[:, 0], radius=[0.1, 1, 1])
 
 
 # -- funnels -----------------------------------------------------------------------------------
@@ -92,7 +181,7 @@ def test_a_funnel_of_taylor_models_holds_for_the_true_dynamics(
     design: FunnelDesign, tmp_path: Path
 ) -> None:
     verdict = check(design.save(tmp_path)[-1])
-    assert "keeps x0 in [-0.4003, 0.4003]" in verdict.statement
+    assert "keeps x0 in [-0.4001, 0.4001]" in verdict.statement
     assert any("computed by: cubic Taylor models" in text for text in verdict.assumptions)
     assert any("w0 in [-1, 1]" in text for text in verdict.assumptions)
     truth, rng = TrueDynamics(swinging_truth), np.random.default_rng(3)

@@ -185,7 +185,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
     with pytest.raises(CertificateRejected, match="leaves where its dynamics are valid"):
         check(write(forged, tmp_path))
     forged = saved(design, tmp_path)
-    forged["funnel.proof.json"]["proof"]["kappa"][1] = -1.0
+    forged["funnel.proof.json"]["proof"]["kappa"][1][1] = -1.0
     with pytest.raises(CertificateRejected, match="kappa should be positive"):
         check(write(forged, tmp_path))
 

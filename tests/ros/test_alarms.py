@@ -9,8 +9,12 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.monitoring.announcement import Run
+from nlsid_core import files
+from nlsid_ros import qos
 from tests.ros.processes import (
     node_here,
     process,
@@ -19,7 +23,7 @@ from tests.ros.processes import (
     stop,
     use_domain_of_this_run,
 )
-from tests.ros.robot import GOOD, MONITOR, Robot
+from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
 
@@ -100,6 +104,49 @@ def test_an_alarm_calls_the_services_it_was_given_once(
         robot.spin_until(lambda: len(called) == 2)
         robot.drive([13, 14, 15], speed=1e3)
         assert sorted(called) == ["/halt", "/keep"]
+        stop(monitor)
+
+
+def test_every_alarm_calls_not_the_first_one_only(
+    monkeypatch: pytest.MonkeyPatch, funnel: Path
+) -> None:
+    """After a restart, and when a run is announced before anybody looked at the alarm."""
+    use_domain_of_this_run(monkeypatch)
+    called: list[str] = []
+
+    def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        called.append("/halt")
+        response.success = True
+        return response
+
+    settings = {"nominal": "profile", "controller": "controller", "stop_service": "/halt"}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, allow_old_stamps=True, **settings) as monitor,
+    ):
+        node.create_service(Trigger, "/halt", serve)
+        announce = node.create_publisher(String, "/controller/run", qos.DOCUMENT)
+        robot = Robot(node, spin_until, funnel.parent)
+        robot.ready()
+        spin_until(lambda: announce.get_subscription_count() == 1)
+
+        def leave(run: int) -> None:
+            """A run that is announced, begins inside and leaves."""
+            start_ns = 10**18 + 100 * run * PERIOD_NS
+            begun = Run(start_ns, robot.bundle.digest).document()
+            announce.publish(String(data=files.encode(begun).decode()))
+            robot.drive([100 * run + k for k in range(-6, 6)])
+            robot.drive([100 * run + k for k in (6, 7, 8)], speed=1e3)
+
+        leave(1)
+        spin_until(lambda: robot.has_said("outside"))
+        spin_until(lambda: len(called) == 1)
+        robot.restart()
+        leave(2)
+        spin_until(lambda: robot.has_said("outside"))
+        spin_until(lambda: len(called) == 2)
+        leave(3)  # nobody has restarted the monitor: it calls because a run begins
+        spin_until(lambda: len(called) >= 3)
         stop(monitor)
 
 

@@ -1,5 +1,6 @@
 """What a controller is told wrongly, or no longer told: it says what, and comes to rest."""
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -12,8 +13,10 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from bags.designs.documents import MODEL, load_model
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
@@ -51,8 +54,19 @@ class Driven(Robot):
         response: Trigger.Response = answer.result()
         return response
 
-    def feed(self, samples: int, *, ahead: float = 0.0, frame: str = "") -> list[int]:
-        """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first."""
+    def watch(self) -> None:
+        """Stand in for the monitor that is required."""
+        self.margin = self.node.create_publisher(JointState, "/funnel_monitor/margin", qos.STREAM)
+        self.spin_until(lambda: self.margin.get_subscription_count() == 1)
+        self.spin_until(lambda: self.call("start").success)
+
+    def feed(
+        self, samples: int, *, ahead: float = 0.0, frame: str = "", margin_at: float | None = None
+    ) -> list[int]:
+        """Responses at rest in real time; their stamps (ns), `ahead` s of now at the first.
+
+        margin_at: a monitor's verdict comes with each, stamped so many s from it.
+        """
         first = time.time_ns() + round(ahead * 1e9)
         began = time.monotonic()
         stamps = [first + k * PERIOD_NS for k in range(samples)]
@@ -61,6 +75,11 @@ class Driven(Robot):
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             message.header.frame_id = frame
             self.odom.publish(message)
+            if margin_at is not None:
+                said = JointState(name=["margin", "assumption"], position=[0.5, math.nan])
+                of_ns = stamp_ns + round(margin_at * 1e9)
+                said.header.stamp.sec, said.header.stamp.nanosec = divmod(of_ns, 10**9)
+                self.margin.publish(said)
             due = began + (k + 1) * PERIOD_NS * 1e-9
             self.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
         return stamps
@@ -120,6 +139,55 @@ def test_a_slow_stop_rate_does_not_keep_it_moving(stack: ExitStack, funnel: Path
     robot.spin_until(lambda: robot.has_said("idle; stopped: asked to", NAME))
     assert time.monotonic() - asked < 5.0
     robot.spin_until(lambda: robot.commands[max(robot.commands)] == 0.1)
+
+
+@pytest.mark.parametrize(
+    ("frame", "ahead", "because"),
+    [("map", 0.0, "the response is in frame 'map'"), ("odom", -3600.0, "a response is stamped")],
+)
+def test_the_first_response_is_held_to_the_same_rules_and_moves_nothing(
+    stack: ExitStack, funnel: Path, frame: str, ahead: float, because: str
+) -> None:
+    robot = Driven(stack, funnel, response_frame="odom")
+    assert robot.call("start").success
+    robot.feed(1, frame=frame, ahead=ahead)
+    robot.expect_stop(because)
+    assert set(robot.commands.values()) <= {0.0}
+
+
+def test_limits_beyond_the_fitted_range_do_not_let_it_command_more(
+    stack: ExitStack, funnel: Path
+) -> None:
+    """A car that stands still while the plan goes on asks for more and more."""
+    model = load_model(funnel.with_name(MODEL))
+    lowest, highest = model.u_range
+    robot = Driven(stack, funnel, highest=10.0, lowest=-10.0)
+    assert robot.call("start").success
+    robot.feed(100)
+    robot.spin_until(lambda: max(robot.commands.values()) >= highest)
+    assert max(robot.commands.values()) == highest == pytest.approx(0.4)
+    assert min(robot.commands.values()) >= lowest
+
+
+@pytest.mark.parametrize("margin_at", [-3600.0, -5.0, 3600.0])
+def test_a_verdict_that_is_not_of_this_run_and_of_now_is_none(
+    stack: ExitStack, funnel: Path, margin_at: float
+) -> None:
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE, stop_within=0.1)
+    robot.watch()
+    robot.feed(80, margin_at=margin_at)
+    robot.expect_stop("funnel_monitor has judged nothing for 1 s")
+
+
+def test_with_fresh_verdicts_it_tracks_to_the_end_of_the_plan(
+    stack: ExitStack, funnel: Path
+) -> None:
+    """What the test above needs: the same, but each verdict is of its sample."""
+    robot = Driven(stack, funnel, require_monitor=True, monitor_patience=LATE)
+    robot.watch()
+    robot.feed(140, margin_at=0.0)
+    robot.spin_until(lambda: robot.has_said("idle; stopped: the p", NAME))
+    assert not robot.has_said("has judged nothing", NAME)
 
 
 def test_without_the_monitor_it_requires_it_neither_starts_nor_goes_on(

@@ -9,14 +9,21 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rcl_interfaces.msg import Parameter, ParameterType
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
 
 from bags.chain.shipped import config_file
 from bags.recordings.bag import Bag
 from bags.samples import f1tenth
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import (
+    node_here,
+    process,
+    ros_test,
+    set_parameter,
+    stop,
+    use_domain_of_this_run,
+)
 
 pytestmark = ros_test
 
@@ -126,12 +133,15 @@ def test_a_manager_takes_over_a_node_that_started_itself_and_wrong_requests_do_n
 def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_runs(
     name: str, tmp_path: Path
 ) -> None:
-    settings = NODES[name] | {"autostart": False}
+    settings = settings_of(name, tmp_path) | {"autostart": False}
     with (
         node_here("test_manager") as (node, spin_until),
         process(f"nlsid_ros.{name}", **settings, __ns="/robot") as running,
     ):
         full = f"/robot/{name}"
+        configure = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+        done = call(node, spin_until, ChangeState, f"{full}/change_state", configure)
+        assert done.success  # type: ignore[attr-defined]
         listed = call(
             node, spin_until, ListParameters, f"{full}/list_parameters", ListParameters.Request()
         )
@@ -143,21 +153,48 @@ def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_run
         assert len(names) >= 4
         ask = DescribeParameters.Request(names=names)
         described = call(node, spin_until, DescribeParameters, f"{full}/describe_parameters", ask)
-        for each in described.descriptors:  # type: ignore[attr-defined]
+        now = call(
+            node,
+            spin_until,
+            GetParameters,
+            f"{full}/get_parameters",
+            GetParameters.Request(names=names),
+        )
+        for each, value in zip(described.descriptors, now.values, strict=True):  # type: ignore[attr-defined]
             assert each.description, each.name
-            assert each.read_only, each.name
             if each.type == ParameterType.PARAMETER_DOUBLE:
                 assert len(each.floating_point_range) == 1, each.name
             if each.type == ParameterType.PARAMETER_INTEGER:
                 assert len(each.integer_range) == 1, each.name
-            value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="other")
             change = SetParameters.Request(parameters=[Parameter(name=each.name, value=value)])
             answer = call(node, spin_until, SetParameters, f"{full}/set_parameters", change)
             [result] = answer.results  # type: ignore[attr-defined]
             assert not result.successful
-            assert each.name in result.reason
+            assert result.reason == f"{each.name}: read when the node is configured"
         stop(running)
     assert not list(tmp_path.iterdir())
+
+
+def test_parameters_are_read_when_the_node_is_configured() -> None:
+    """It starts though they make no sense yet; what is set before it is configured counts."""
+    name = "tracking_controller"
+    configure, cleanup = Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_CLEANUP
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}", autostart=False) as running,
+    ):
+        unconfigured = State.PRIMARY_STATE_UNCONFIGURED
+        assert asked(name, configure, node, spin_until) == (False, unconfigured)
+        assert set_parameter(node, spin_until, name, "highest", 0.4) == ""
+        assert set_parameter(node, spin_until, name, "response_type", "sensor_msgs/msg/Imu") == ""
+        assert asked(name, configure, node, spin_until) == (True, State.PRIMARY_STATE_INACTIVE)
+        refused = set_parameter(node, spin_until, name, "response_type", "nav_msgs/msg/Odometry")
+        assert refused == "response_type: read when the node is configured"
+        assert "no room between" in set_parameter(node, spin_until, name, "highest", 0.0)
+        assert asked(name, cleanup, node, spin_until) == (True, unconfigured)
+        assert set_parameter(node, spin_until, name, "highest", 0.0) == ""
+        assert asked(name, configure, node, spin_until) == (False, unconfigured)
+        assert "no room between lowest and highest" in stop(running)
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
             JointTrajectory, "/funnel_publisher/nominal", pictures.append, qos.DOCUMENT
         )
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        spin_until(lambda: len(funnels) == 1 and len(pictures) == 2)
+        spin_until(lambda: len(funnels) == 1 and len({type(each) for each in pictures}) == 2)
         lengths = {
             len(each.markers[-1].points) if isinstance(each, MarkerArray) else len(each.points)  # type: ignore[attr-defined]
             for each in pictures

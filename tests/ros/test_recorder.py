@@ -15,6 +15,7 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -258,3 +259,37 @@ def test_patterns_pauses_and_snapshots(tmp_path: Path) -> None:
     assert [m[8:].rstrip(b"\0") for m in messages_on(snapshot, "/robot/a")] == [
         b"before", b"while paused", b"after",
     ]  # fmt: skip
+
+
+def test_in_simulated_time_log_times_are_the_simulations(tmp_path: Path) -> None:
+    """The simulation runs at a tenth of real time and starts at 100 s."""
+    bag, sent = tmp_path / "run", 0
+    with (
+        node_here("test_simulator") as (node, spin_until),
+        process(RECORDER, bag=bag, topics="[/joints]", use_sim_time=True) as recorder,
+    ):
+        clock = node.create_publisher(Clock, "/clock", qos.STREAM)
+        joints = node.create_publisher(JointState, "/joints", qos.STREAM)
+        spin_until(lambda: clock.get_subscription_count() == 1)
+        spin_until(lambda: joints.get_subscription_count() == 1)
+        began = time.monotonic()
+        while (t := time.monotonic() - began) < 3.0:
+            now_ns = 100 * 10**9 + round(t * 1e8)
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+            clock.publish(message)
+            if t > 1.0:
+                state = JointState()
+                state.header.stamp = message.clock
+                joints.publish(state)
+                sent += 1
+            due = time.monotonic() + 0.01
+            spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
+        stop(recorder)
+    with Bag(bag) as source:
+        heard = [(m.log_time_ns, header_stamp_ns(m.data)) for m in source.messages(["/joints"])]
+    assert len(heard) == sent
+    assert all(100.05 < log_ns / 1e9 < 100.5 for log_ns, _ in heard)
+    late = sorted(abs(log_ns - stamp_ns) for log_ns, stamp_ns in heard)
+    assert late[len(late) // 2] < 20e6, "half of them within 0.2 s of real time"
+    assert len({log_ns for log_ns, _ in heard}) > sent // 2, "not one time for each look"

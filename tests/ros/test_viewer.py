@@ -54,10 +54,11 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
     use_domain_of_this_run(monkeypatch)
     port = free_port()
     names = {"__ns": "/robot1"}
+    shared = {"/robot1/odom": "/odom", "/robot1/cmd_vel": "/cmd_vel"}
     signals = {"allow_old_stamps": True, "source": "/funnel_publisher", "stale_after": 5.0}
     with (
         node_here("test_robot") as (node, spin_until),
-        process(MONITOR, **signals, **names) as monitor,
+        process(MONITOR, **signals, **names, **shared) as monitor,
         process("nlsid_ros.viewer", page=True, port=port, **names) as viewer,
     ):
         robot = Robot(node, spin_until, funnel.parent)

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 from pathlib import Path
 from signal import SIGINT, SIGKILL, SIGTERM, Signals
 
@@ -62,11 +63,16 @@ class Operator:
 
     def call(self, service: str) -> None:
         """Call a std_srvs/Trigger that succeeds."""
+        assert self.asks(service) == ""
+
+    def asks(self, service: str) -> str:
+        """Call a std_srvs/Trigger; why it did not succeed, empty if it did."""
         client = self.node.create_client(Trigger, service)
         self.spin_until(client.service_is_ready)
         answer = client.call_async(Trigger.Request())
         self.spin_until(answer.done)
-        assert answer.result().success, answer.result().message
+        self.node.destroy_client(client)
+        return "" if answer.result().success else str(answer.result().message)
 
     def waits(self, seconds: float) -> None:
         """Let time pass."""
@@ -201,8 +207,6 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
     def robot(name: str, push: float) -> list[str]:
         return [
             f"namespace:=/{name}",
-            f"odom:=/{name}/odom",
-            f"cmd_vel:=/{name}/cmd_vel",
             f"funnel:={funnel}",
             f"model:={funnel.with_name(documents.MODEL)}",
             "plant:=true",
@@ -238,6 +242,49 @@ def test_two_robots_in_two_namespaces_one_pushed_out_of_its_funnel_and_one_not(
     assert not operator.has_said("gentle/funnel_monitor", "violated")
     assert {"/gentle/odom", "/hard/odom", "/diagnostics"} <= names
     assert not {"/odom", "/cmd_vel"} & names, "nothing is outside the namespaces"
+
+
+def test_all_nodes_in_one_process_hold_the_loop_while_a_proof_is_decided(
+    operator: Operator, funnel: Path, tmp_path: Path
+) -> None:
+    """Every sample is judged and has its command: nobody starves. Then a push, and an alarm."""
+    for file in funnel.parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    given = [
+        f"funnel:={tmp_path / funnel.name}",
+        f"model:={funnel.with_name(documents.MODEL)}",
+        "plant:=true",
+        "highest:=0.4",
+        "push:=0.6",
+        *PATIENT,
+    ]
+    margins: dict[int, float] = {}
+
+    def judge(message: JointState) -> None:
+        margins[stamp_ns_of(message)] = message.position[message.name.index("margin")]
+
+    def inside() -> list[int]:
+        return sorted(stamp_ns for stamp_ns, margin in margins.items() if margin >= 0.0)
+
+    operator.node.create_subscription(JointState, "/funnel_monitor/margin", judge, qos.STREAM)
+    with live("closed_loop", *given, "--one-process"):
+        operator.hears("tracking_controller", "idle")
+        operator.hears("funnel_monitor", "waiting for the controller")
+        operator.call("/tracking_controller/start")
+        operator.hears("funnel_monitor", "inside")
+        operator.said.clear()
+        proof = tmp_path / documents.FUNNEL_PROOF
+        proof.write_text(proof.read_text().replace('"proof":', " " * 10**6 + '"proof":'))
+        operator.hears("tracking_controller", "idle; stopped: the p")
+        stamps = inside()
+        assert len(stamps) == 117
+        assert {round((b - a) / 25e6) for a, b in pairwise(stamps)} == {1}
+        operator.call("/funnel_monitor/restart")
+        operator.spin_until(lambda: operator.asks("/tracking_controller/start") == "")
+        operator.spin_until(lambda: len(inside()) > 140)
+        operator.call("/plant/push")
+        operator.hears("funnel_monitor", "outside the tube")
+        operator.hears("tracking_controller", "idle; stopped: ")
 
 
 def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(

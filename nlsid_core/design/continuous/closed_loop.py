@@ -35,7 +35,7 @@ class Pieces:
 
     T: (B, n, n), x̄ = Tz. mu: (B, 2, M) multiplier at both ends, in the monomials of degree 0 up to
     2 less than twice the basis'. gram: (B, 2, k, k) Gram matrices in v there, as first found.
-    kappa: (n_w,) powers of two; then what w adds to ẋ is bounded with them and `vertex` is 0.
+    kappa: (intervals, n_w); then what w adds to ẋ is bounded with them and `vertex` is 0.
     mode: (B, L) of the policy's modes. tau: (B, 2, L, n+1, n+1) S ⪰ 0 at both ends, y'Sy with
     y = (1, z) the multiplier of what holds in that mode. push: (B, m) that the input is off.
     stated: (B,) how a proof writes mu and tau, see `witnesses.rounded`.
@@ -240,13 +240,13 @@ class _Loop:
             return []
         h = np.diff(self.funnel.t)[self.pieces.interval][:, None, None]
         terms = []
-        for j, (scale, radius) in enumerate(
-            zip(kappa.tolist(), (np.ptp(self.field.uncertain, axis=1) / 2).tolist(), strict=True)
-        ):
+        scales = kappa[self.pieces.interval][:, :, None, None]
+        for j, radius in enumerate((np.ptp(self.field.uncertain, axis=1) / 2).tolist()):
+            scale = scales[:, j]
             along: Graded = {1: np.einsum("bkij,i->bkj", PT, pushes[:, j])}
             square = multiply(along, along, self.field.n)
             total = add({q: scale * part for q, part in square.items()},
-                        {0: np.full((1, 1, 1), 1 / scale)})  # fmt: skip
+                        {0: 1 / scale})  # fmt: skip
             terms.append({q: radius * h * part for q, part in total.items()})
         return terms
 

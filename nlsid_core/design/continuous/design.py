@@ -5,12 +5,14 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.expansion import sweep_expanded
 from nlsid_core.design.continuous.held import Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
@@ -19,6 +21,7 @@ from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
 from nlsid_core.design.continuous.sweep import Ends, Progress, sweep_rho
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics.taylor import field_of
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
@@ -68,6 +71,7 @@ def design_funnel(
     R: ArrayLike | None = None,
     gain: str = "constant",
     limits: ArrayLike | None = None,
+    uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
     executor: Executor | None = None,
@@ -81,7 +85,7 @@ def design_funnel(
     started = time.perf_counter()
     setting = prepare(
         dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
-        hold=hold, error=error,
+        uncertain=uncertain, hold=hold, error=error,
     )  # fmt: skip
     if shape == "P":
         refuse_shape(setting.steps)
@@ -94,11 +98,14 @@ def design_funnel(
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
         started = time.perf_counter()
-        funnel, proved, steps_taken = enlarge_shape(
-            setting.steps, setting.policy, funnel, margin=margin, objective=objective,
-            executor=executor, progress=progress,
-        )  # fmt: skip
-        history += steps_taken
+        try:
+            funnel, proved, steps_taken = enlarge_shape(
+                setting.steps, setting.policy, funnel, margin=margin, objective=objective,
+                executor=executor, progress=progress,
+            )  # fmt: skip
+            history += steps_taken
+        except Infeasible as refusal:  # what is proved already stays
+            history.append((f"shape rho kept: {refusal}", funnel.volume_integral()))
         seconds["P"] = time.perf_counter() - started
     return decided(setting, funnel, proved, history=history, seconds=seconds)
 
@@ -179,13 +186,22 @@ def _found(
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
     """
     steps, policy, P = setting.steps, setting.policy, setting.P
-    if setting.hold is None:
-        return setting, *_swept(setting, validity_caps(steps.field, policy, P), progress)
-    free = _free(setting, progress)
-    periods = setting.hold.tried()
+    if setting.expansion is not None:
+        search = partial(_expanded, setting, progress)
+        first = proved_for(setting, setting.rho_final, search)
+        if setting.hold is None:
+            return first
+        setting, free = replace(first[0], expansion=None), first[1].rho
+    elif setting.hold is None:
+        return _swept(setting, validity_caps(steps.field, policy, P), progress)
+    else:
+        free = _free(setting, progress)
+    hold = setting.hold
+    assert hold is not None
+    periods = hold.tried()
     for period in periods:
         try:
-            found = _held(setting, replace(setting.hold, period=period), free, progress)
+            found = _held(setting, replace(hold, period=period), free, progress)
         except Infeasible:
             if period == periods[-1]:
                 raise
@@ -193,7 +209,7 @@ def _found(
         break
     if len(periods) > 1:  # between what was proved and what was not
         with suppress(Infeasible):
-            longer = replace(setting.hold, period=period * 2**0.5)
+            longer = replace(hold, period=period * 2**0.5)
             found = _held(setting, longer, free, progress)
     return found
 
@@ -205,14 +221,16 @@ def _held(
     steps, policy, P = setting.steps, setting.policy, setting.P
     for scale in SCALES:
         outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
-        held = LSteps(steps.field, policy, widths=np.zeros((len(P) - 1, steps.field.m)))
-        held.bound_pushes(P[-1])
+        held = LSteps(
+            steps.field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+            widths=np.zeros((len(P) - 1, steps.field.m)),
+        )  # fmt: skip
         rates, widths = fastest(held, policy, outer, hold)
         held.widths = widths
         setting = replace(setting, steps=held, hold=hold, rates=rates)
         try:
             caps = validity_caps(steps.field, policy, P, widths)
-            return setting, *_swept(setting, np.minimum(caps, outer.rho), progress)
+            return _swept(setting, np.minimum(caps, outer.rho), progress)
         except (Infeasible, DataError) as error:
             refusal = error
     k, i = np.unravel_index(np.argmax(widths), widths.shape)
@@ -236,7 +254,7 @@ def _free(setting: Setting, progress: Progress | None) -> FloatArray:
     caps = validity_caps(steps.field, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
     rho, _ = sweep_rho(
-        steps, sections(steps.field, policy, P), margin=setting.margin(rho_final),
+        steps, sections(steps, policy, P), margin=setting.margin(rho_final),
         rho_final=rho_final, caps=caps, progress=progress,
     )  # fmt: skip
     return rho
@@ -244,36 +262,52 @@ def _free(setting: Setting, progress: Progress | None) -> FloatArray:
 
 def _swept(
     setting: Setting, caps: FloatArray, progress: Progress | None
-) -> tuple[ContinuousFunnel, Proved, float]:
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
     steps, policy, P = setting.steps, setting.policy, setting.P
-    pairs = sections(steps.field, policy, P)
+    pairs = sections(steps, policy, P)
     rho_final = min(setting.rho_final, float(caps[-1]))
 
-    def search(margin: float) -> tuple[FloatArray, list[Ends] | None]:
-        return sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
-                         progress=progress)  # fmt: skip
+    def search(margin: float) -> tuple[Setting, FloatArray, list[Ends] | None]:
+        found = sweep_rho(steps, pairs, margin=margin, rho_final=rho_final, caps=caps,
+                          progress=progress)  # fmt: skip
+        return setting, *found
 
     return proved_for(setting, rho_final, search)
+
+
+def _expanded(
+    setting: Setting, progress: Progress | None, margin: float
+) -> tuple[Setting, FloatArray, list[Ends] | None]:
+    """The sweep that expands the dynamics around what it finds; the setting has their field."""
+    assert setting.expansion is not None
+    steps, policy = setting.steps, setting.policy
+    found = sweep_expanded(setting.expansion, steps, policy, setting.P, margin=margin,
+                           rho_final=setting.rho_final, progress=progress)  # fmt: skip
+    field = field_of(found.cubics, policy.t)
+    policy = replace(policy, vector_field=files.digest(field.document()))
+    proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed)
+    proving.kappa = steps.kappa
+    return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 
 
 def proved_for(
     setting: Setting,
     rho_final: float,
-    search: Callable[[float], tuple[FloatArray, list[Ends] | None]],
-) -> tuple[ContinuousFunnel, Proved, float]:
+    search: Callable[[float], tuple[Setting, FloatArray, list[Ends] | None]],
+) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
-    steps, policy = setting.steps, setting.policy
-    digest = files.digest(policy.document())
     margin = setting.margin(rho_final)
     proved: Proved | None = None
     for _ in range(RETRIES):
-        rho, ends = search(margin)
+        setting, rho, ends = search(margin)
+        steps, policy = setting.steps, setting.policy
+        digest = files.digest(policy.document())
         funnel = ContinuousFunnel(policy.x, setting.P, rho, policy.vector_field, digest)
         refuse_unmonitorable(funnel)
         proved = prove_pieces(steps, policy, funnel, ends)
         if not proved.unproved:
-            return funnel, proved, margin
+            return setting, funnel, proved, margin
         margin *= GROWTH
     assert proved is not None
     raise Infeasible(

@@ -270,7 +270,7 @@ def _shown(
         if key not in frames:
             s, k = Part(*key).ends()[end], key[0]
             rho = (1 - s) * funnel.rho[k] + s * funnel.rho[k + 1]
-            frames[key] = np.sqrt(rho) * section_at(steps.field, policy, funnel.P, k, s).base
+            frames[key] = np.sqrt(rho) * section_at(steps, policy, funnel.P, k, s).base
         T[b] = frames[key]
     framed = replace(batch, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)),
                      taken=np.zeros_like(batch.taken))  # fmt: skip

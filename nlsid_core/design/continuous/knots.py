@@ -35,7 +35,7 @@ class KnotForms:
         n, v = funnel.n, len(steps.vertices)
         self.n, self.vertices = n, v
         self.basis: IntArray = np.vstack([monomials_of(n, q) for q in range(3)])
-        nonlinear = steps.field.nonlinear_states
+        nonlinear = steps.nonlinear
         self.frames = [
             np.sqrt(rho) * coordinates(P, nonlinear)
             for P, rho in zip(funnel.P, funnel.rho, strict=True)

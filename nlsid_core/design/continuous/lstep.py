@@ -14,11 +14,14 @@ from nlsid_core.design.continuous.line import LineProgram
 from nlsid_core.design.continuous.modes import multipliers
 from nlsid_core.dynamics import VectorField
 from nlsid_core.dynamics.piecewise import bernstein
+from nlsid_core.dynamics.taylor import Cubic
 from nlsid_core.errors import DataError
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.sos.sphere import SphereProgram, SphereSolution
 
 MAX_DEGREE = 5  # of f: then Ẇ has degree 6, as much as the checker's squares
+NO_PUSH = 1e-12  # of |x̄'Pg|: less moves nothing, and κ stays finite
+FINENESS = 64.0  # of κ's digits: few, for the kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +30,7 @@ class Section:
 
     t: s. x, x_rate: (n,) nominal. u: (m,). K: (m, n). P, P_rate: (n, n). base: (n, n), with
     x̄ = √ρ·base·z.
-    span: which of the field's pieces holds. interval: between which knots it is.
+    interval: between knots; span: which of the field's pieces holds.
     """
 
     t: float
@@ -43,7 +46,7 @@ class Section:
 
 
 def section_at(
-    field: VectorField, policy: ContinuousPolicy, P: FloatArray, k: int, s: float
+    steps: "LSteps", policy: ContinuousPolicy, P: FloatArray, k: int, s: float
 ) -> Section:
     """The instant s in [0, 1] of interval k, seen from inside it; P (K, n, n) is linear there."""
     t = policy.t
@@ -58,18 +61,18 @@ def section_at(
         K=bernstein(policy.K.control[k], s),
         P=here,
         P_rate=(P[k + 1] - P[k]) / h,
-        base=coordinates(here, field.nonlinear_states),
-        span=field.span(float(t[k])),
+        base=coordinates(here, steps.nonlinear),
+        span=steps.field.span(float(t[k])),
         interval=k,
     )
 
 
 def sections(
-    field: VectorField, policy: ContinuousPolicy, P: FloatArray, *, count: int = 2
+    steps: "LSteps", policy: ContinuousPolicy, P: FloatArray, *, count: int = 2
 ) -> list[list[Section]]:
     """`count` equally spaced instants of every interval, its ends included, seen from inside it."""
     return [
-        [section_at(field, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
+        [section_at(steps, policy, P, k, float(s)) for s in np.linspace(0, 1, count)]
         for k in range(len(policy.t) - 1)
     ]
 
@@ -100,6 +103,10 @@ class LSteps:
     A case is a vertex of w at a corner of δ in a mode of the policy: every vertex at the first
     corner in the first mode comes first. limits and modes: of the policy, if its inputs are
     clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
+    nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
+    w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
+    field's `is_pushed`). kappa: (intervals, n_w), if it is. local: what the dynamics are on an
+    interval, where a search expands them anew; else they are the field.
     """
 
     def __init__(
@@ -107,32 +114,58 @@ class LSteps:
         field: VectorField,
         policy: ContinuousPolicy | None = None,
         *,
+        nonlinear: tuple[int, ...] | None = None,
+        pushed: bool | None = None,
         tolerance: float = 1e-5,
         widths: FloatArray | None = None,
     ) -> None:
         refuse_degree(field)
         self.field = field
+        self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
+        taken = field.curved_states if self.pushed else field.nonlinear_states
+        self.nonlinear = taken if nonlinear is None else nonlinear
+        self.local: dict[int, Cubic] = {}
         self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
         self.widths = widths
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
-        self.program = sphere_program(field, reduced=len(self.limits) == 0 and widths is None)
+        reduced = len(self.limits) == 0 and widths is None
+        self.program = sphere_program(field, self.nonlinear, reduced=reduced)
         self.kappa: FloatArray | None = None
-        self.vertices = field.vertices()
         self.solved = 0
+        if self.pushed and policy is not None:
+            self.kappa = np.ones((len(policy.t) - 1, len(field.uncertain)))
+            self.vertices = field.uncertain.mean(axis=1)[None]
+        else:
+            self.vertices = field.vertices()
 
-    def bound_pushes(self, P: FloatArray) -> None:
-        """If w only pushes, bound what it does on ellipsoids like {x̄'Px̄ ≤ 1}, not at corners.
+    def pushes(self, section: Section) -> FloatArray:
+        """(n, n_w) what each w adds to ẋ there; only where w does nothing else."""
+        if section.interval in self.local:
+            return self.local[section.interval].pushes()
+        found = self.field.pushes(section.span)
+        assert found is not None  # asked only where `is_pushed`
+        return found
+
+    def bound_pushes(self, section: Section, rho: float) -> None:
+        """If w only pushes: κ of the section's interval, for what w does where W = ρ.
 
         κ near 1/max|x̄'Pg| makes the bound tight where the push hurts most.
         """
-        pushes = self.field.pushes(0)
-        if self.field.is_pushed and pushes is not None:
-            largest = np.sqrt(np.einsum("ij,ik,kj->j", pushes, P, pushes))
-            self.kappa = np.exp2(np.round(-np.log2(largest)))
-            self.vertices = self.field.uncertain.mean(axis=1)[None]
+        if self.kappa is None:
+            return
+        G = self.pushes(section)
+        largest = np.sqrt(rho * np.einsum("ij,ik,kj->j", G, section.P, G))
+        digits, power = np.frexp(1 / np.maximum(largest, NO_PUSH))
+        self.kappa[section.interval] = np.ldexp(np.round(digits * FINENESS) / FINENESS, power)
+
+    def rate(self, section: Section, X: FloatArray, U: FloatArray, w: FloatArray) -> FloatArray:
+        """ẋ (N, n) at states X and inputs U on the section's interval."""
+        if section.interval in self.local:
+            return self.local[section.interval](section.t, X, U, w)
+        return self.field(section.t, X, U, w, span=section.span)
 
     @property
     def cases(self) -> int:
@@ -156,15 +189,20 @@ class LSteps:
         if self.widths is not None:
             u = u + self.corners[corner] * self.widths[section.interval]
         w = self.vertices[vertex]
-        rate = self.field(section.t, section.x + x_bar, u, w, span=section.span) - section.x_rate
+        rate = self.rate(section, section.x + x_bar, u, w) - section.x_rate
         W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
-        pushes = self.field.pushes(section.span)
-        if self.kappa is not None and pushes is not None:
-            radius = np.ptp(self.field.uncertain, axis=1) / 2
-            along = x_bar @ section.P @ pushes
-            W_rate += (self.kappa * along**2 + 1 / self.kappa) @ radius
+        if self.kappa is not None:
+            W_rate += self.from_pushes(section, x_bar).sum(axis=1)
         return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+
+    def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
+        """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""
+        assert self.kappa is not None
+        kappa = self.kappa[section.interval]
+        along = x_bar @ section.P @ self.pushes(section)
+        radius = np.ptp(self.field.uncertain, axis=1) / 2
+        return np.asarray((kappa * along**2 + 1 / kappa) * radius)
 
     def _from_defect(self, section: Section, rho: float) -> FloatArray:
         """What the nominal's defect adds to -Ẇ/ρ along z that enter linearly, of degree 1.
@@ -174,7 +212,8 @@ class LSteps:
         linear = [j for j in range(self.program.n) if j not in self.program.chosen]
         if not linear:
             return np.zeros(len(self.program.points))
-        rate = self.field(section.t, section.x[None], section.u[None], span=section.span)[0]
+        centre = self.field.uncertain.mean(axis=1)
+        rate = self.rate(section, section.x[None], section.u[None], centre)[0]
         slope = -2 * section.base.T @ section.P @ (rate - section.x_rate) / np.sqrt(rho)
         return np.asarray(self.program.points[:, linear] @ slope[linear])
 
@@ -206,10 +245,18 @@ class LSteps:
             self.solved += 1
         return found
 
-    def predicted(self, section: Section, rho: float, duals: list[SphereSolution]) -> float:
+    def predicted(
+        self,
+        section: Section,
+        rho: float,
+        duals: list[SphereSolution],
+        *,
+        saturated: bool = True,
+    ) -> float:
         """An upper bound of φ at another ρ or section, from dual solutions: no program solved.
 
-        With limits it is an estimate: the multipliers of the mode stay what they are.
+        With limits it is an estimate: the multipliers of the mode stay what they are. saturated:
+        False leaves out the modes at a limit, for which that estimate may be far too low.
         """
         bounds = []
         y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
@@ -217,18 +264,22 @@ class LSteps:
             g = self.values(section, rho, case)
             if len(self.limits):
                 q = self.in_mode(section, rho, case)
+                if not saturated and self.split(case)[-1].any():
+                    continue
                 g = g - np.einsum("ln,na,lab,nb->n", q, y, d.tau, y)
             bounds.append(float(g @ d.y))
         return min(bounds)
 
 
-def sphere_program(field: VectorField, *, reduced: bool = True) -> SphereProgram | LineProgram:
+def sphere_program(
+    field: VectorField, nonlinear: tuple[int, ...] | None = None, *, reduced: bool = True
+) -> SphereProgram | LineProgram:
     """The program for this field: squares of half the degree of Ẇ.
 
     Up to degree 3, nonlinear states come last, and degree 2 only where they occur. reduced: False
     keeps every product, for multipliers in all states.
     """
-    n, count = field.n, len(field.nonlinear_states)
+    n, count = field.n, len(field.nonlinear_states if nonlinear is None else nonlinear)
     half = max(2, (field.degree + 2) // 2)
     if n == 1:
         return LineProgram(half=half)

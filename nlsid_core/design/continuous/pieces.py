@@ -109,7 +109,7 @@ def _solved(
     for s in part.ends():
         rho = float((1 - s) * funnel.rho[k] + s * funnel.rho[k + 1])
         if (k, s) not in known:
-            section = section_at(steps.field, policy, funnel.P, k, s)
+            section = section_at(steps, policy, funnel.P, k, s)
             try:
                 known[k, s] = steps.solve(section, rho)
             except SolverError:
@@ -131,7 +131,7 @@ def _pieces(
     n, program = funnel.n, steps.program
     basis = proof_basis(program)
     full = monomials(n, Pieces.multiplier_degrees(basis))
-    linear = [j for j in range(n) if j not in steps.field.nonlinear_states]
+    linear = [j for j in range(n) if j not in steps.nonlinear]
     order = linear + [j for j in range(n) if j not in linear]
     both: dict[str, list[FloatArray]] = {"mu": [], "gram": [], "tau": []}
     for end in (0, 1):
@@ -140,7 +140,7 @@ def _pieces(
             s = part.ends()[end]
             i = part.interval
             rho_here = float((1 - s) * funnel.rho[i] + s * funnel.rho[i + 1])
-            section = section_at(steps.field, policy, funnel.P, i, s)
+            section = section_at(steps, policy, funnel.P, i, s)
             T += [np.sqrt(rho_here) * section.base] * steps.cases
             rho += [rho_here] * steps.cases
             rows += known[i, s]

@@ -12,19 +12,30 @@ from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
-from nlsid_core.design.continuous.lstep import LSteps, refuse_degree, section_at
+from nlsid_core.design.continuous.lstep import (
+    MAX_DEGREE,
+    LSteps,
+    Section,
+    refuse_degree,
+    section_at,
+)
 from nlsid_core.design.continuous.pieces import affine
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
-from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.dynamics import Nominal, Rates, VectorField
+from nlsid_core.dynamics.taylor_model import DEGREE
+from nlsid_core.dynamics.vector_field import FEW_STATES
+from nlsid_core.errors import DataError, Infeasible, NotPolynomial
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
+TIME_CONSTANT = 1 / 8  # of the motion's length, in which the default feedback returns
 DECAY = 3.0  # c of the thesis's first guess for the satellite
+ASYMMETRY = 1e-9  # of a goal's matrix, relative: what rounding leaves of a product
 DEFECT = 1e-3  # of the largest |ẋ₀|: more is not this system's motion
 
 
@@ -46,6 +57,7 @@ class Goal:
 class Setting:
     """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it.
 
+    expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for.
     """
@@ -55,6 +67,7 @@ class Setting:
     P: FloatArray
     rho_final: float
     goal: Goal
+    expansion: Expansion | None = None
     hold: Hold | None = None
     rates: FloatArray | None = None
 
@@ -76,7 +89,12 @@ class Setting:
 
     def margin(self, rho: float) -> float:
         """What a search leaves at first of the rate at which V changes at the end, in 1/s."""
-        end = section_at(self.steps.field, self.policy, self.P, len(self.policy.t) - 2, 1.0)
+        last = len(self.policy.t) - 2
+        end = section_at(self.steps, self.policy, self.P, last, 1.0)
+        if self.expansion is not None:
+            cubic = self.expansion.around(self.policy, self.P, last, (rho, rho))
+            self.steps.local[last] = cubic
+        self.steps.bound_pushes(end, rho)
         return MARGIN * float(np.abs(self.steps.values(end, rho, 0)).mean())
 
 
@@ -90,32 +108,87 @@ def prepare(
     R: ArrayLike | None,
     gain: str,
     limits: ArrayLike | None = None,
+    uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
-    field = dynamics if isinstance(dynamics, VectorField) else VectorField.from_function(
-        dynamics, *sizes
-    )  # fmt: skip
-    refuse_nominal(field, nominal)
-    Q = definite(np.eye(field.n) if Q is None else Q, field.n, "Q", strict=False)
-    R = definite(np.eye(field.m) if R is None else R, field.m, "R", strict=True)
+    field, expansion = _dynamics(dynamics, nominal, sizes, uncertain)
+    refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
     wanted = _wanted_goal(goal, nominal, field.n)
+    weights = default_weights(field, nominal, wanted)
+    Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
+    R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
     held = Hold.of(hold, error, field.n)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
-        policy = replace(policy, limits=np.asarray(limits, dtype=np.float64))
+        policy = replace(policy, limits=limits_of(limits, field.m))
     refuse_saturated(policy)
-    steps = LSteps(field, policy)
+    pushed = field.only_pushes and (field.is_pushed or expansion is not None)
+    nonlinear = None
+    if expansion is not None and (pushed or not len(field.uncertain)):
+        nonlinear = expansion.nonlinear_states()
+    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
     if held is not None:
         held.refuse(field, policy)
-    steps.bound_pushes(S[-1])
-    rho_final, target = _final(steps, policy, S, wanted)
-    return Setting(steps, policy, S, rho_final, target, held)
+    rho_final, target = _final(steps, policy, S, wanted, expansion)
+    return Setting(steps, policy, S, rho_final, target, expansion, held)
+
+
+def default_weights(
+    field: VectorField, nominal: Nominal, goal: Goal | None
+) -> tuple[FloatArray, FloatArray]:
+    """Q (n, n) and R (m, m) on the scale of the goal: identities without one.
+
+    Q = P/τ, and R_j = τ |B_j|²_P: a state that an input drives directly then returns with time
+    constant τ, a share of the motion's length, at a cost-to-go like the goal's.
+    """
+    if goal is None:
+        return np.eye(field.n), np.eye(field.m)
+    t, x, u = nominal.t, nominal.x.ends(), nominal.u.ends()
+    tau = TIME_CONSTANT * float(t[-1] - t[0])
+    B = np.array([field.jacobians(float(s), x[k], u[k])[1] for k, s in enumerate(t)])
+    effect = np.einsum("kij,il,klj->kj", B, goal.P, B).mean(axis=0)
+    effect = np.where(effect > 0, effect, np.max(effect, initial=0.0) or 1.0)
+    return goal.P / tau, np.diag(tau * effect)
+
+
+def limits_of(limits: ArrayLike, m: int) -> FloatArray:
+    """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too."""
+    rows = np.asarray(limits, dtype=np.float64)
+    if rows.shape == (m, 2):
+        return np.column_stack([np.arange(m), rows])
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise DataError(
+            f"limits should be rows (input, low, high), or one pair (low, high) for each of {m} "
+            f"inputs; they have shape {rows.shape}"
+        )
+    return rows
+
+
+def _dynamics(
+    dynamics: VectorField | Callable[..., Any],
+    nominal: Nominal,
+    sizes: tuple[int, int],
+    uncertain: ArrayLike | None,
+) -> tuple[VectorField, Expansion | None]:
+    """The field; or, where it is no polynomial of a degree that fits, its linearisation."""
+    if isinstance(dynamics, VectorField):
+        if uncertain is not None:
+            raise DataError("a vector field states its own bounds of w: leave out `uncertain`")
+        return dynamics, None
+    try:
+        field = VectorField.from_function(dynamics, *sizes, uncertain=uncertain)
+        if field.degree <= (MAX_DEGREE if field.n <= FEW_STATES else DEGREE):
+            return field, None
+    except NotPolynomial:
+        pass
+    expansion = Expansion(Rates.of(dynamics, *sizes, uncertain), nominal)
+    return expansion.linear(), expansion
 
 
 def refuse_first(setting: Setting, rho: FloatArray) -> None:
@@ -132,7 +205,7 @@ def refuse_first(setting: Setting, rho: FloatArray) -> None:
         )
 
 
-def refuse_nominal(field: VectorField, nominal: Nominal) -> None:
+def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
     """Raise unless the nominal fits the dynamics' sizes and obeys them well enough."""
     sizes = (nominal.x.control.shape[2], nominal.u.control.shape[2])
     if sizes != (field.n, field.m):
@@ -166,12 +239,23 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
     if goal is None or isinstance(goal, Goal):
         wanted = goal
     else:
-        wanted = Goal(nominal.x.ends()[-1], np.asarray(goal, dtype=np.float64))
+        P = np.asarray(goal, dtype=np.float64)
+        if P.shape == (n,):
+            if not (np.isfinite(P).all() and (P > 0).all()):
+                raise DataError(f"the goal's half-widths should be positive numbers, are {P}")
+            P = np.diag(P**-2.0)
+        wanted = Goal(nominal.x.ends()[-1], P)
     if wanted is not None:
         if wanted.P.shape != (n, n) or wanted.centre.shape != (n,):
-            raise DataError(f"the goal should be an ellipsoid in {n} states")
-        if not (wanted.P == wanted.P.T).all() or np.linalg.eigvalsh(wanted.P)[0] <= 0:
+            raise DataError(
+                f"the goal should be {n} half-widths, or an ellipsoid's ({n}, {n}) matrix; its "
+                f"shape is {wanted.P.shape}"
+            )
+        P = (wanted.P + wanted.P.T) / 2
+        skew = np.abs(wanted.P - P).max(initial=0.0)
+        if not skew <= ASYMMETRY * np.abs(P).max() or np.linalg.eigvalsh(P)[0] <= 0:
             raise DataError("the goal's matrix should be symmetric positive definite")
+        wanted = Goal(wanted.centre, P)
         d = nominal.x.ends()[-1] - wanted.centre
         if d @ wanted.P @ d >= 1:
             raise DataError(
@@ -213,17 +297,40 @@ def _tracking(
     return Tracking(policy, lyapunov(field, policy, Q=Q, P_final=final))
 
 
+def _kept(
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    S: FloatArray,
+    section: Section,
+    rho: float,
+    expansion: Expansion | None,
+) -> bool:
+    """True if V falls on the whole boundary at one instant."""
+    if expansion is not None:
+        try:
+            around = expansion.around(policy, S, section.interval, (rho, rho))
+        except DataError:  # the box is too wide to expand anything
+            return False
+        steps.local[section.interval] = around
+    steps.bound_pushes(section, rho)
+    return min(s.m for s in steps.solve(section, rho)) > 0
+
+
 def _final(
-    steps: LSteps, policy: ContinuousPolicy, S: FloatArray, goal: Goal | None
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    S: FloatArray,
+    goal: Goal | None,
+    expansion: Expansion | None,
 ) -> tuple[float, Goal]:
     """ρ(t_f) and the goal: the largest level inside a given goal, or one the end itself keeps."""
     end = policy.x.ends()[-1]
     if goal is None:
-        section = section_at(steps.field, policy, S, len(S) - 2, 1.0)
+        section = section_at(steps, policy, S, len(S) - 2, 1.0)
         low, high = 0.0, np.inf
         rho = 1.0
         for _ in range(24):
-            kept = min(s.m for s in steps.solve(section, rho)) > 0
+            kept = _kept(steps, policy, S, section, rho, expansion)
             low, high = (rho, high) if kept else (low, rho)
             rho = 4 * low if np.isinf(high) else (high / 4 if low == 0 else (low + high) / 2)
             if low and high / low < 1.05:

@@ -62,7 +62,7 @@ def enlarge_shape(
     scaled copies of the ellipsoids it starts from. Raises Infeasible if none could be proved.
     """
     margin *= SHAPE_MARGIN
-    rho, _ = sweep_rho(steps, sections(steps.field, policy, funnel.P), margin=ROOM * margin,
+    rho, _ = sweep_rho(steps, sections(steps, policy, funnel.P), margin=ROOM * margin,
                        rho_final=float(funnel.rho[-1]))  # fmt: skip
     P = funnel.P / rho[:, None, None]
     present = replace(funnel, P=(P + P.transpose(0, 2, 1)) / 2, rho=np.ones(len(rho)))
@@ -102,7 +102,7 @@ def solve_ends(
 
 
 def _ends_of(steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, k: int) -> Ends:
-    start, end = (section_at(steps.field, policy, funnel.P, k, float(s)) for s in (0, 1))
+    start, end = (section_at(steps, policy, funnel.P, k, float(s)) for s in (0, 1))
     first = steps.solve(start, float(funnel.rho[k]))
     return Ends(first, steps.solve(end, float(funnel.rho[k + 1]), first))
 
@@ -149,7 +149,7 @@ def _holds(
     """True if every L-step at the knots of a funnel with ρ = 1 leaves the margin."""
     for k in range(len(funnel.t) - 1):
         for end in (0, 1):
-            section = section_at(steps.field, policy, funnel.P, k, float(end))
+            section = section_at(steps, policy, funnel.P, k, float(end))
             if min(s.m for s in steps.solve(section, float(funnel.rho[k + end]))) < margin:
                 return False
     return True

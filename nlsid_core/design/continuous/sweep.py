@@ -52,6 +52,7 @@ def sweep_rho(
     for k in range(len(instants) - 1, -1, -1):
         start, *between, end = instants[k]
         h = end.t - start.t
+        steps.bound_pushes(end, rho[k + 1])
         at_end = steps.solve(end, rho[k + 1], duals)
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))

@@ -16,6 +16,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.dynamics import (
     Nominal,
     PiecewisePolynomial,
+    Rates,
     VectorField,
     constant_on,
     cubic_through,
@@ -105,7 +106,7 @@ def lyapunov(
 
 
 def integrate_nominal(
-    field: VectorField,
+    field: VectorField | Callable[..., Any],
     u: Callable[[float], ArrayLike] | PiecewisePolynomial,
     *,
     t: ArrayLike,
@@ -114,17 +115,22 @@ def integrate_nominal(
 ) -> Nominal:
     """The motion with input u(t) from `start` at t[0], or back from `final` at t[-1], as cubics.
 
-    t: (K,) knots in s. Raises DataError unless one end is given and the knots increase.
+    field: or a function of some of t, x, u, named so. t: (K,) knots in s. Raises DataError unless
+    one end is given and the knots increase.
     """
     t = np.asarray(t, dtype=np.float64)
+    if t.ndim != 1 or len(t) < 2 or not (np.diff(t) > 0).all():
+        raise DataError("t should be two or more times that increase")
     if (start is None) == (final is None):
         raise DataError("give the state at the start or at the end, not both")
     given = np.asarray(start if final is None else final, dtype=np.float64)
+    m = u.control.shape[2] if isinstance(u, PiecewisePolynomial) else np.size(u(float(t[0])))
+    rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     inputs = u if isinstance(u, PiecewisePolynomial) else _cubic_input(u, t)
     values = inputs.ends()
     span, order = ((t[0], t[-1]), t) if final is None else ((t[-1], t[0]), t[::-1])
     solved = solve_ivp(
-        lambda s, x: field(s, x[None], inputs(s)[None])[0],
+        lambda s, x: rates(s, x[None], inputs(s)[None])[0],
         span,
         given,
         t_eval=order,
@@ -135,8 +141,8 @@ def integrate_nominal(
     if not solved.success or solved.y.shape[1] != len(t):
         raise SolverError(f"the nominal cannot be integrated: {solved.message}")
     x = solved.y.T if final is None else solved.y.T[::-1]
-    rates = np.array([field(s, x[k][None], values[k][None])[0] for k, s in enumerate(t)])
-    return Nominal(cubic_through(t, x, rates), inputs)
+    slopes = np.array([rates(s, x[k][None], values[k][None])[0] for k, s in enumerate(t)])
+    return Nominal(cubic_through(t, x, slopes), inputs)
 
 
 def nominal_through(t: ArrayLike, x: ArrayLike, u: ArrayLike, field: VectorField) -> Nominal:
@@ -155,7 +161,9 @@ def _cubic_input(u: Callable[[float], ArrayLike], t: FloatArray) -> PiecewisePol
     to_values = np.array([[(1 - s) ** 3, 3 * s * (1 - s) ** 2, 3 * s**2 * (1 - s), s**3]
                           for s in share])  # fmt: skip
     for start, end in itertools.pairwise(t):
-        values = np.array([np.asarray(u(float(start + s * (end - start))), float) for s in share])
+        values = np.array(
+            [np.ravel(np.asarray(u(float(start + s * (end - start))), float)) for s in share]
+        )
         pieces.append(np.linalg.solve(to_values, values))
     control = np.array(pieces)
     control[1:, 0] = control[:-1, -1]

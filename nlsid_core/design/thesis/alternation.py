@@ -16,7 +16,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design.continuous.design import FunnelDesign, decided, proved_for
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.continuous.setting import prepare, refuse_first
+from nlsid_core.design.continuous.setting import Setting, prepare, refuse_first
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
 from nlsid_core.design.continuous.vstep import largest_level
@@ -54,11 +54,11 @@ def design_by_alternation(
         start = ContinuousFunnel(policy.x, setting.P, first, policy.vector_field, "")
         refuse_start(start, solve_ends(steps, policy, start, executor=executor))
 
-    def search(margin: float) -> tuple[FloatArray, None]:
+    def search(margin: float) -> tuple[Setting, FloatArray, None]:
         found = alternate_rho(steps, policy, start, margin=margin, executor=executor)
-        return found.funnel.rho, None
+        return setting, found.funnel.rho, None
 
-    funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
+    _, funnel, proved, _ = proved_for(setting, float(start.rho[-1]), search)
     seconds = {"rho": time.perf_counter() - started}
     history = [("rho", funnel.volume_integral())]
     return decided(setting, funnel, proved, history=history, seconds=seconds)

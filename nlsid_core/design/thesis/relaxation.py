@@ -54,7 +54,7 @@ def sample_funnel(
         raise DataError(f"{samples} samples an interval: its two ends are the least")
     setting = prepare(dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain)
     steps, policy = setting.steps, setting.policy
-    instants = sections(steps.field, policy, setting.P, count=samples)
+    instants = sections(steps, policy, setting.P, count=samples)
     margin = setting.margin(setting.rho_final)
     rho, _ = sweep_rho(
         steps, instants, margin=margin, rho_final=setting.rho_final, progress=progress

@@ -221,7 +221,7 @@ class Oracle:
         for row, shift, start, end in zip(self.proof["multiplier"], *lists, strict=True):
             mu += Fraction(2) ** shift * (start + (end - start) * sigma) * power(row, e)
         pushed = Fraction(0)
-        for j, kappa in enumerate(numbers(self.proof.get("kappa", []))):
+        for j, kappa in enumerate(numbers(self.proof["kappa"][k]) if "kappa" in self.proof else []):
             low, high = numbers(self.field["uncertain"][j])
             one = [Fraction(int(i == j)) for i in range(len(w))]
             zero = [Fraction(0)] * len(w)

@@ -100,7 +100,7 @@ def random_claim(rng: np.random.Generator) -> Files:
     if limited:
         proof["sides"] = first
     if pushed:
-        proof["kappa"] = rng.uniform(0.5, 2, n_w).tolist()
+        proof["kappa"] = rng.uniform(0.5, 2, (intervals, n_w)).tolist()
     modes = list(product((-1, 0, 1), repeat=limited))
     claimed = random_hold(rng, files=(field, policy), proof=proof)
     held = 2**m if claimed else 1
@@ -484,7 +484,7 @@ HOSTILE: list[tuple[str, Callable[[Files], None], str]] = [
     ("basis without 1", member("basis", [[1], [2], [3]]), "no product of the basis could"),
     ("monomials twice", member("multiplier.0", [1]), "distinct"),
     ("unknown", member("note", "all is well"), "unknown member 'note'"),
-    ("kappa without pushes", member("kappa", [1.0]), "vertex 1.*: none"),
+    ("kappa without pushes", member("kappa", [[1.0]] * 4), "vertex 1.*: none"),
     ("exponent 5000", exponent(5000), "degree at most 7"),
     ("exponent -1", exponent(-1), "an exponent is negative"),
 ]

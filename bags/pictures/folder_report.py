@@ -1,0 +1,170 @@
+"""`nlsid report`: one page of a whole design folder, whatever its kind, to read, send and print.
+
+The page stands alone: no script, no link outside, pictures inside. Proofs are decided again while
+it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder's report is in it.
+"""
+
+import base64
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+
+from bags.designs import documents
+from bags.monitoring.replay import Replay
+from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE
+from nlsid_core import files, kernel
+from nlsid_core.errors import DocumentError
+
+# Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+PRINT = """
+nav a { margin-right: 1rem } figure { margin: 1rem 0 } figure img { max-width: 100% }
+section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
+@media print { nav { display: none } h2 { break-after: avoid } figure, table { break-inside: avoid }
+  body { max-width: none; margin: 0 } }
+"""
+PICTURES = {
+    documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
+    documents.COMPARISON_PLOT: "Classes and methods on the same test trials",
+    documents.FREE_RUN_PLOT: "The model in free run",
+    documents.MOTION_PLOT: "The motion that the policy tracks",
+    documents.FUNNEL_PLOT: "The funnel",
+    documents.CATCHING_PLOT: "What the funnel can catch",
+    documents.MARGIN_PLOT: "Recordings held against the funnel, when they were last replayed",
+}
+REJECTED = "REJECTED"
+LARGEST_PICTURE = 20 * 2**20  # bytes
+
+
+def write_folder_report(
+    folder: Path, out: Path, *, replays: Sequence[Replay] = (), drawn: str = ""
+) -> None:
+    """Write the page of a design folder.
+
+    replays: bags held against its funnel, `drawn` their picture as <svg> or empty. Raises
+    DocumentError if the folder has neither a proof nor a report.
+    """
+    files.write_atomically(out, folder_page(folder, replays=replays, drawn=drawn).encode())
+
+
+def folder_page(folder: Path, *, replays: Sequence[Replay] = (), drawn: str = "") -> str:
+    """The whole page as text."""
+    proofs = sorted(folder.glob("*.proof.json"))
+    decided = "".join(_proof(path) for path in proofs)
+    model = _model_chapter(folder / documents.REPORT)
+    if model and REJECTED in decided:
+        model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
+    if not proofs and not model:
+        raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
+    in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
+    chapters = {
+        "proofs": ("What is proved", decided),
+        "model": ("The model", model),
+        "pictures": ("Pictures", _pictures(folder, without=in_model)),
+        "replays": ("Recordings held against the funnel", _replays(replays, drawn)),
+        "files": ("Files", _files(folder)),
+    }
+    present = {key: found for key, found in chapters.items() if found[1]}
+    links = "".join(f'<a href="#{key}">{title}</a>' for key, (title, _) in present.items())
+    body = "".join(
+        f'<section id="{key}"><h2>{title}</h2>{text}</section>'
+        for key, (title, text) in present.items()
+    )
+    name = escape(folder.resolve().name)
+    return f"""<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>{name}: design</title>
+<meta http-equiv="Content-Security-Policy" content="{POLICY}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>{STYLE}{PRINT}</style>
+<h1>{name}</h1>
+<nav>{links}</nav>
+{body}
+<p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
+</html>
+"""
+
+
+def _proof(path: Path) -> str:
+    """A certificate, decided now."""
+    name = escape(path.name)
+    try:
+        verdict = kernel.check(path)
+    except (kernel.Rejected, OSError) as refusal:
+        return f'<h3>{name}</h3><p class="not">{REJECTED}: {escape(str(refusal))}</p>'
+    said, *assuming = str(verdict).split("\n")
+    assumptions = "".join(f"<li>{escape(line.strip())}</li>" for line in assuming)
+    digests = "".join(
+        f"<tr><td>{escape(role)}</td><td><code>{escape(digest)}</code></td></tr>"
+        for role, digest in verdict.digests.items()
+    )
+    return (
+        f'<h3>{name}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
+        f'<table class="left"><tbody>{digests}</tbody></table>'
+    )
+
+
+def _model_chapter(report: Path) -> str:
+    """What `nlsid identify` and `nlsid funnel` have written, or nothing."""
+    if not report.is_file():
+        return ""
+    text = report.read_text(encoding="utf-8", errors="replace")
+    _, begins, rest = text.partition(MODEL_BEGINS)
+    chapter, ends, _ = rest.partition(MODEL_ENDS)
+    if not (begins and ends):
+        return ""
+    chapter = chapter.replace("<h2>", "<h3>").replace("</h2>", "</h3>")
+    return f'<p class="note">As it was written when model and funnel were made.</p>{chapter}'
+
+
+def _pictures(folder: Path, *, without: set[str]) -> str:
+    figures = []
+    for name, caption in PICTURES.items():
+        path = folder / name
+        if name in without or not path.is_file() or path.stat().st_size > LARGEST_PICTURE:
+            continue
+        content = path.read_bytes()
+        if content.startswith(b"\x89PNG"):
+            data = base64.b64encode(content).decode()
+            figures.append(
+                f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+                f"<figcaption>{caption}</figcaption></figure>"
+            )
+    return "".join(figures)
+
+
+def _replays(replays: Sequence[Replay], drawn: str) -> str:
+    if not replays:
+        return ""
+    rows = "".join(_replay(replay) for replay in replays)
+    head = "".join(
+        f"<th>{name}</th>"
+        for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
+    )
+    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
+<p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: of what is assumed,
+at the last judged sample.</p>{drawn}"""
+
+
+def _replay(replay: Replay) -> str:
+    tag = "proved" if replay.verdict == "inside" else "not"
+    worst = replay.worst
+    said = escape(f"{replay.verdict}: {replay.reason}" if replay.reason else replay.verdict)
+    cells = ["-", "-", "-"]
+    if worst is not None:
+        cells = [f"{worst.margin:.3f}", f"{worst.t:.3f} s", f"{100 * replay.assumption:.0f} %"]
+    cells.append(f"{replay.judged_span:.1f} of {replay.span:.1f} s")
+    return (
+        f'<tr><td>{escape(replay.name)}</td><td class="{tag}">{said}</td>'
+        + "".join(f"<td>{cell}</td>" for cell in cells)
+        + "</tr>"
+    )
+
+
+def _files(folder: Path) -> str:
+    rows = "".join(
+        f"<tr><td>{escape(path.name)}</td><td>{path.stat().st_size} B</td></tr>"
+        for path in sorted(folder.iterdir())
+        if path.is_file()
+    )
+    return f"<table><tbody>{rows}</tbody></table>"

@@ -1,0 +1,302 @@
+"""Eleven problems written as a user writes them from the docs: default settings, no tuning.
+
+    python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N]
+
+Each function is all that a user writes. A refusal is reported, not hidden. Starts on the boundary
+at t0 and at a later knot follow the true equations; w is at random corners of its box.
+"""
+
+import argparse
+import ast
+import inspect
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import describe
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    design,
+    integrate_nominal,
+    plan_motion,
+)
+from nlsid_core.design.thesis.soundness import simulate_boundary
+from nlsid_core.dynamics import Rates, solve
+from nlsid_core.errors import NlsidError
+from nlsid_core.proofs import check
+
+Written = tuple[Callable[..., Any], FunnelDesign]
+SUBSTEPS = 10
+
+
+def car() -> Written:
+    """A lane change at 8 m/s; the input is the curvature's rate, limited."""
+
+    def rate(x: Any, u: Any) -> Any:  # along, across in m, heading in rad, curvature in 1/m
+        return [8 * np.cos(x[2]), 8 * np.sin(x[2]), 8 * x[3], u[0]]
+
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[31.5, 3, 0, 0], seconds=4, m=1)
+    goal = [1.0, 0.5, 0.1, 0.05]
+    return rate, design(ContinuousTracking(rate, motion, goal=goal, limits=[[-0.3, 0.3]]))
+
+
+def bicycle() -> Written:
+    """A lane change at 10 m/s; the steering follows its command with a lag of 0.2 s."""
+
+    def rate(x: Any, u: Any) -> Any:  # across in m, heading and steering in rad
+        return [10 * np.sin(x[1]), 10 / 2.7 * np.tan(x[2]), (u[0] - x[2]) / 0.2]
+
+    motion = plan_motion(rate, start=[0, 0, 0], end=[3, 0, 0], seconds=3, m=1)
+    return rate, design(ContinuousTracking(rate, motion, goal=[0.3, 0.06, 0.06]))
+
+
+def rocket() -> Written:
+    """A planar rocket that descends 20 m and lands upright; thrust and gimbal angle."""
+
+    def rate(x: Any, u: Any) -> Any:  # position in m, tilt in rad, their rates
+        side, up = u[0] * np.sin(x[2] + u[1]), u[0] * np.cos(x[2] + u[1])
+        return [x[3], x[4], x[5], side, up - 9.81, -1.5 * u[0] * np.sin(u[1])]
+
+    start, end = [4, 20, 0, 0, -5, 0], [0, 0, 0, 0, 0, 0]
+    motion = plan_motion(rate, start=start, end=end, seconds=5, u=[9.81, 0])
+    goal = [0.5, 0.5, 0.1, 0.5, 0.5, 0.3]
+    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+
+
+def acrobot() -> Written:
+    """Swing and catch: torque at the elbow only, from hanging to upright."""
+
+    def rate(x: Any, u: Any) -> Any:  # angles from hanging in rad, their rates
+        c, s = np.cos(x[1]), np.sin(x[1])
+        M = [[1.7 + c, 0.35 + 0.5 * c], [0.35 + 0.5 * c, 0.35]]
+        g1 = 9.81 * (1.5 * np.sin(x[0]) + 0.5 * np.sin(x[0] + x[1]))
+        turn = 0.5 * s * (2 * x[2] * x[3] + x[3] ** 2)
+        b = [turn - g1, u[0] - 0.5 * s * x[2] ** 2 - 9.81 * 0.5 * np.sin(x[0] + x[1])]
+        a = solve(M, b)
+        return [x[2], x[3], a[0], a[1]]
+
+    motion = plan_motion(rate, start=[0, 0, 0, 0], end=[np.pi, 0, 0, 0], seconds=4, m=1)
+    return rate, design(ContinuousTracking(rate, motion, goal=[0.1, 0.1, 0.3, 0.3]))
+
+
+def dubins(wind: float) -> Written:
+    """An airplane at 10 m/s in wind that blows from anywhere; turn and climb rates."""
+
+    def rate(x: Any, u: Any, w: Any) -> Any:  # position in m, heading and path angle in rad
+        level = 10 * np.cos(x[4])
+        return [level * np.cos(x[3]) + w[0], level * np.sin(x[3]) + w[1],
+                10 * np.sin(x[4]) + w[2], u[0], u[1]]  # fmt: skip
+
+    def still(x: Any, u: Any) -> Any:
+        return rate(x, u, np.zeros(3))
+
+    start, end = [0, 0, 0, 0, 0], [35, 15, 3, np.pi / 4, 0]
+    motion = plan_motion(still, start=start, end=end, seconds=4, m=2)
+    box = wind * np.array([[-1, 1], [-1, 1], [-1, 1]])
+    return rate, design(ContinuousTracking(rate, motion, goal=[4, 3, 3, 0.3, 0.3], uncertain=box))
+
+
+def satellite() -> Written:
+    """A turn about all axes; inertia diag(1, 2, 4), modified Rodrigues parameters."""
+
+    def rate(x: Any, u: Any) -> Any:  # attitude, body rates in rad/s
+        s, w = x[:3], x[3:]
+        inner, square = s[0] * w[0] + s[1] * w[1] + s[2] * w[2], s[0] ** 2 + s[1] ** 2 + s[2] ** 2
+        turned = ((1 - square) * w + 2 * np.cross(s, w) + 2 * inner * s) / 4
+        gyro = [-2 * w[1] * w[2], 3 * w[0] * w[2], -w[0] * w[1]]
+        return [*turned, gyro[0] + u[0], (gyro[1] + u[1]) / 2, (gyro[2] + u[2]) / 4]
+
+    start, end = [0.3, -0.2, 0.2, 0, 0, 0], np.zeros(6)
+    motion = plan_motion(rate, start=start, end=end, seconds=5, m=3)
+    return rate, design(ContinuousTracking(rate, motion, goal=[0.2, 0.2, 0.2, 0.2, 0.2, 0.2]))
+
+
+def van_der_pol() -> Written:
+    """The oscillator run backward in time, without an input, from the origin's region."""
+
+    def rate(x: Any) -> Any:
+        return [-x[1], x[0] + (x[0] ** 2 - 1) * x[1]]
+
+    times = np.linspace(0, 4, 31)
+    motion = integrate_nominal(rate, lambda _: np.zeros(0), t=times, start=[0, 0])
+    return rate, design(ContinuousTracking(rate, motion, goal=[0.5, 0.5]))
+
+
+def flexible_arm() -> Written:
+    """Two links in a plane with elastic joints: motor torques, links beyond springs."""
+
+    def rate(x: Any, u: Any) -> Any:  # link and motor angles in rad, their rates
+        c, s = np.cos(x[1]), np.sin(x[1])
+        M = [[1.6 + 0.8 * c, 0.5 + 0.4 * c], [0.5 + 0.4 * c, 0.5]]
+        spring = 50 * (x[2:4] - x[:2]) + 2 * (x[6:] - x[4:6])
+        bend = 0.4 * s * np.array([-x[5] * (2 * x[4] + x[5]), x[4] ** 2])
+        a = solve(M, spring - bend)
+        return [*x[4:], *a, *((u - spring) / 0.3)]
+
+    start, end = np.zeros(8), [1, 0.8, 1, 0.8, 0, 0, 0, 0]
+    motion = plan_motion(rate, start=start, end=end, seconds=2, m=2)
+    goal = [0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 0.5, 0.5]
+    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+
+
+def quadrotor_9() -> Written:
+    """A quadrotor whose autopilot follows roll, pitch and thrust commands with a lag."""
+
+    def rate(x: Any, u: Any) -> Any:  # position, velocity, roll, pitch in rad, thrust in m/s²
+        roll, pitch, thrust = x[6], x[7], x[8]
+        push = [thrust * np.sin(pitch) * np.cos(roll), -thrust * np.sin(roll)]
+        lift = thrust * np.cos(pitch) * np.cos(roll) - 9.81
+        return [*x[3:6], *push, lift, *((u - x[6:]) / 0.15)]
+
+    start, end = np.zeros(9), np.zeros(9)
+    end[:3], start[8], end[8] = [2, 1, 0.5], 9.81, 9.81
+    motion = plan_motion(rate, start=start, end=end, seconds=3, u=[0, 0, 9.81])
+    goal = [0.2, 0.2, 0.2, 0.4, 0.4, 0.4, 0.2, 0.2, 1.0]
+    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+
+
+def quadrotor_16() -> Written:
+    """A quadrotor with four motors that follow their commands with a lag."""
+
+    def rate(x: Any, u: Any) -> Any:  # position, velocity, Euler angles, body rates, motors
+        (f, p, y), (a, b, c), T = x[6:9], x[9:12], x[12:]
+        sf, cf, sp, cp = np.sin(f), np.cos(f), np.sin(p), np.cos(p)
+        sy, cy, thrust = np.sin(y), np.cos(y), T[0] + T[1] + T[2] + T[3]
+        push = [thrust * (cf * sp * cy + sf * sy), thrust * (cf * sp * sy - sf * cy)]
+        angles = [a + (b * sf + c * cf) * sp / cp, b * cf - c * sf, (b * sf + c * cf) / cp]
+        turn = [8 * (T[1] - T[3]) - 0.7 * b * c, 8 * (T[2] - T[0]) + 0.7 * a * c]
+        lift, spin = thrust * cf * cp - 9.81, T[0] - T[1] + T[2] - T[3]
+        return [*x[3:6], *push, lift, *angles, *turn, spin, *((u - T) / 0.05)]
+
+    start, end, hover = np.zeros(16), np.zeros(16), 9.81 / 4
+    end[:3], start[12:], end[12:] = [1, 1, 0.5], hover, hover
+    motion = plan_motion(rate, start=start, end=end, seconds=3, u=[hover] * 4, knots=25)
+    goal = [0.2] * 3 + [0.4] * 3 + [0.2] * 3 + [1.0] * 3 + [1.0] * 4
+    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+
+
+PROBLEMS: dict[str, Callable[[], Written]] = {
+    "car": car,
+    "bicycle": bicycle,
+    "rocket": rocket,
+    "acrobot": acrobot,
+    "dubins_0.15": lambda: dubins(0.15),
+    "dubins_0.5": lambda: dubins(0.5),
+    "satellite": satellite,
+    "van_der_pol": van_der_pol,
+    "flexible_arm": flexible_arm,
+    "quadrotor_9": quadrotor_9,
+    "quadrotor_16": quadrotor_16,
+}
+
+
+class Truth:
+    """The equations as they are written, for simulations."""
+
+    def __init__(self, function: Callable[..., Any], found: FunnelDesign, given: int) -> None:
+        self.rates = Rates(function, found.model.n, found.model.m, np.zeros((given, 2)), (), ())
+        self.uncertain = found.model.uncertain[:given]
+
+    def span(self, t: float) -> int:
+        """There is one set of equations."""
+        del t
+        return 0
+
+    def __call__(
+        self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None
+    ) -> FloatArray:
+        """ẋ (N, n)."""
+        del span
+        return self.rates(t, X, U, W)
+
+
+def lines_of(problem: Callable[..., Any]) -> int:
+    """How many lines a user writes: the function's statements, without its docstring."""
+    name = problem.__name__ if problem.__name__ != "<lambda>" else "dubins"
+    source = inspect.getsource(globals()[name])
+    body = ast.parse(source).body[0]
+    assert isinstance(body, ast.FunctionDef)
+    first = body.body[1].lineno
+    return sum(bool(line.strip()) for line in source.splitlines()[first - 1 :])
+
+
+def run(name: str, starts: int) -> dict[str, Any]:
+    """What became of one problem at the first try."""
+    used = time.process_time()
+    try:
+        function, found = PROBLEMS[name]()
+    except NlsidError as refusal:
+        return {
+            "proved": False,
+            "seconds": time.process_time() - used,
+            "said": str(refusal),
+            "lines": lines_of(PROBLEMS[name]),
+        }
+    seconds = time.process_time() - used
+    with tempfile.TemporaryDirectory() as folder:
+        used = time.process_time()
+        verdict = check(found.save(folder)[-1])
+        check_seconds = time.process_time() - used
+    given = 3 if name.startswith("dubins") else 0
+    truth, rng = Truth(function, found, given), np.random.default_rng(5)
+    later = len(found.funnel.t) // 2
+    runs = [
+        simulate_boundary(truth, found.policy, found.funnel, starts=count, rng=rng, knot=knot,
+                          substeps=SUBSTEPS)
+        for knot, count in ((0, starts), (later, starts // 4))
+    ]  # fmt: skip
+    t = found.funnel.t
+    return {
+        "proved": True,
+        "seconds": seconds,
+        "check_seconds": check_seconds,
+        "states": found.funnel.n,
+        "knots": len(t),
+        "pieces": len(found.found.proved.pieces),
+        "margin": float(verdict.margin),
+        "half_widths": found.funnel.widths(float(t[0])).tolist(),
+        "half_widths_in_the_middle": found.funnel.widths(float(t[later])).tolist(),
+        "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
+        "starts": sum(r.starts for r in runs),
+        "left": sum(r.violations for r in runs),
+        "max_v": max(r.max_v for r in runs),
+        "lines": lines_of(PROBLEMS[name]),
+    }
+
+
+def main() -> None:
+    """Print what became of each, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--only", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
+    parser.add_argument("--starts", type=int, default=4000)
+    arguments = parser.parse_args()
+    print(describe())
+    results = {}
+    for name in arguments.only:
+        results[name] = run(name, arguments.starts)
+        print(f"\n{name}")
+        for key, value in results[name].items():
+            if isinstance(value, list):
+                value = ", ".join(f"{entry:.3g}" for entry in value)
+            print(f"{key:26} {value:.5g}" if isinstance(value, float) else f"{key:26} {value}")
+    whole = {
+        "proved_first_try": sum(found["proved"] for found in results.values()),
+        "of": len(results),
+        "left": sum(found.get("left", 0) for found in results.values()),
+        "most_lines": max(found["lines"] for found in results.values()),
+        "most_seconds": max(found["seconds"] for found in results.values()),
+    }
+    print(f"\n{whole}")
+    if arguments.json:
+        print(json.dumps(whole | results))
+
+
+if __name__ == "__main__":
+    main()

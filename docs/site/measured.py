@@ -1,0 +1,72 @@
+"""The page of all benchmarks, from the files that `make benchmarks` writes."""
+
+import ast
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+LONGEST = 48  # characters of one value
+DEPTH = 3  # of keys in keys
+
+
+def page(results: Path, benchmarks: Path) -> str:
+    """Markdown: a table of all files in `results`, and a section for each.
+
+    benchmarks: the folder of the modules, whose docstrings say what is measured beside what.
+    """
+    files = [(path.stem, json.loads(path.read_text())) for path in sorted(results.glob("*.json"))]
+    lines = [
+        "# Benchmarks",
+        "",
+        "Every figure is measured beside its peer in one run, one thread, and is written by",
+        "`make benchmarks` with its date, machine and commit; what was published elsewhere is in",
+        "each description. Times of one run vary by some tens of percent. Words are in the",
+        "[glossary](glossary.md).",
+        "",
+    ]
+    if not files:
+        return "\n".join([*lines, "No results lie in benchmarks/results of this checkout.", ""])
+    lines += ["| benchmark | measured | took | commit | peers |", "|---|---|---|---|---|"]
+    for name, found in files:
+        lines.append(
+            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | "
+            f"{found['seconds']:g} s | {found['commit'][:8]} | {_peers(found['result'])} |"
+        )
+    for name, found in files:
+        module = str(found["command"][2]).removeprefix("benchmarks.")
+        title, rest = _docstring(benchmarks / f"{module}.py")
+        lines += ["", f"({name.replace('_', '-')})=", f"## {name}", "", title, ""]
+        if rest:
+            lines += ["```text", rest, "```", ""]
+        command = " ".join(str(word) for word in found["command"])
+        lines += [f"`{command}` on {found['machine']}:", "", "| key | value |", "|---|---|"]
+        lines += [f"| {key} | {value} |" for key, value in _flat(found["result"], "", DEPTH)]
+    return "\n".join([*lines, ""])
+
+
+def _docstring(module: Path) -> tuple[str, str]:
+    text = ast.get_docstring(ast.parse(module.read_text())) or ""
+    title, _, rest = text.partition("\n")
+    return title, rest.strip()
+
+
+def _peers(result: Any) -> str:
+    peers = result.get("peers", {}) if isinstance(result, dict) else {}
+    return ", ".join(f"{name} {version}" for name, version in peers.items())
+
+
+def _flat(value: Any, key: str, depth: int) -> Iterator[tuple[str, str]]:
+    if isinstance(value, dict) and depth:
+        for name, inner in value.items():
+            yield from _flat(inner, f"{key}.{name}" if key else str(name), depth - 1)
+    else:
+        yield key.replace("|", "\\|") or "result", _shown(value)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    text = value if isinstance(value, str) else json.dumps(value)
+    text = text.replace("|", "\\|").replace("\n", " ")
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 4]} ..."

@@ -1,0 +1,221 @@
+"""Dynamics that are not polynomial, expanded anew on each interval around what the funnel needs.
+
+The box on which a Taylor model is bounded has to hold the funnel, and what the model leaves out
+makes the funnel smaller: so the sweep chooses ρ and the box of every interval together.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.diagnosis import Diagnosis, diagnosed
+from nlsid_core.design.continuous.lstep import LSteps, Section, section_at
+from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends, Progress
+from nlsid_core.dynamics import Nominal
+from nlsid_core.dynamics.taylor import Cubic, Rates, field_of
+from nlsid_core.dynamics.vector_field import VectorField
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.policies.continuous import ContinuousPolicy
+
+ROOM = 1 + 1e-6  # of the box over the funnel: the checker decides in rationals
+NEAR = 1.01  # of the largest ρ: closer is not worth another expansion
+STEP = 1.3  # of ρ, while the largest is bracketed
+FALL = 0.98  # of ρ, squared at each further try
+MAX_TRIES = 10  # of exact L-steps a knot
+BACK, MAX_BACK = 0.8, 40  # of ρ, where the interval before cannot take it; how often
+LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """rates along `nominal`: expands them on any interval and any box around the motion."""
+
+    rates: Rates
+    nominal: Nominal
+
+    def on(self, k: int, reach: FloatArray, limits: FloatArray | None = None) -> Cubic:
+        """The cubics on interval k for (x, u) within reach (n + m,) of the motion's range."""
+        x, u = self.nominal.x.control[k], self.nominal.u.control[k]
+        low = np.concatenate([x.min(axis=0), u.min(axis=0)]) - reach
+        high = np.concatenate([x.max(axis=0), u.max(axis=0)]) + reach
+        for i, least, most in [] if limits is None else limits.tolist():
+            j = self.rates.n + int(i)
+            low[j], high[j] = max(low[j], least), min(high[j], most)
+        t = self.nominal.t
+        return self.rates.on(low, high, (float(t[k]), float(t[k + 1])))
+
+    def linear(self) -> VectorField:
+        """The field to linearise: expanded close to the motion."""
+        size = np.hstack([self.nominal.x.ends(), self.nominal.u.ends()])
+        reach = LINEAR * np.maximum(np.ptp(size, axis=0), LINEAR)
+        cubics = [self.on(k, reach) for k in range(len(self.nominal.t) - 1)]
+        return field_of(cubics, self.nominal.t)
+
+    def nonlinear_states(self) -> tuple[int, ...]:
+        """The states that enter nonlinearly on some interval."""
+        reach = np.full(self.rates.n + self.rates.m, LINEAR**2)
+        found = [set(self.on(k, reach).nonlinear_states()) for k in (0, len(self.nominal.t) - 2)]
+        return tuple(sorted(set.union(*found)))
+
+    def around(
+        self, policy: ContinuousPolicy, P: FloatArray, k: int, rho: tuple[float, float]
+    ) -> Cubic:
+        """The cubics on interval k on a box that holds the funnel with these ρ at its knots."""
+        reach = np.zeros(self.rates.n + self.rates.m)
+        for knot, level in zip((k, k + 1), rho, strict=True):
+            inverse = level * np.linalg.inv(P[knot])
+            states = np.diag(inverse)
+            gains = policy.K.control[k]
+            inputs = np.einsum("dij,jk,dik->di", gains, inverse, gains).max(axis=0, initial=0.0)
+            reach = np.maximum(reach, np.concatenate([states, inputs]))
+        return self.on(k, ROOM * np.sqrt(reach), policy.limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Swept:
+    """ρ (K,), the L-steps at the ends of every interval, and the cubics they were made with."""
+
+    rho: FloatArray
+    ends: list[Ends]
+    cubics: list[Cubic]
+
+
+def sweep_expanded(
+    expansion: Expansion,
+    steps: LSteps,
+    policy: ContinuousPolicy,
+    P: FloatArray,
+    *,
+    margin: float,
+    rho_final: float,
+    progress: Progress | None = None,
+) -> Swept:
+    """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
+
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the time and why.
+    """
+    K = len(P)
+    rho, caps = np.full(K, rho_final), np.full(K, np.inf)
+    ends: dict[int, Ends] = {}
+    k, back = K - 2, 0
+    while k >= 0:
+        pair = (section_at(steps, policy, P, k, 0.0), section_at(steps, policy, P, k, 1.0))
+        step = _Interval(expansion, steps, policy, P, k, pair, float(rho[k + 1]), margin)
+        ratio = rho[k + 1] / rho[k + 2] if k + 2 < K else 1.0
+        try:
+            rho[k], ends[k] = step.largest(ratio, ends.get(k + 1), float(caps[k]))
+        except Infeasible:
+            # What ρ_{k+1} leaves at the end of this interval may be too much for its feedback.
+            back += 1
+            if back > MAX_BACK:
+                raise
+            caps[k + 1] = BACK * rho[k + 1]
+            if k == K - 2:
+                rho[-1] = caps[-1]
+            else:
+                k += 1
+            continue
+        if progress is not None:
+            progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
+        k -= 1
+    return Swept(rho, [ends[k] for k in range(K - 1)], [steps.local[k] for k in range(K - 1)])
+
+
+@dataclass(eq=False)
+class _Interval:
+    expansion: Expansion
+    steps: LSteps
+    policy: ContinuousPolicy
+    P: FloatArray
+    k: int
+    pair: tuple[Section, Section]
+    after: float
+    margin: float
+
+    def expand(self, rho: float) -> bool:
+        """Take the cubics around the funnel with this ρ at the start; False if there are none."""
+        try:
+            cubic = self.expansion.around(self.policy, self.P, self.k, (rho, self.after))
+        except (DataError, OverflowError, ZeroDivisionError):
+            return False
+        self.steps.local[self.k] = cubic
+        self.steps.bound_pushes(self.pair[1], self.after)
+        return True
+
+    def slack(self, rho: float, at_start: float, at_end: float) -> float:
+        """What both ends leave of the margin, in 1/s, for φ there."""
+        h = self.pair[1].t - self.pair[0].t
+        growth = (self.after - rho) / h
+        return min(at_start + growth / rho, at_end + growth / self.after) - self.margin
+
+    def predicted(self, rho: float, known: Ends) -> float:
+        """An upper bound of the slack at ρ; no program solved. -inf if nothing can be expanded."""
+        if not self.expand(rho):
+            return -np.inf
+        start, end = self.pair
+        return self.slack(
+            rho,
+            self.steps.predicted(start, rho, known.start, saturated=False),
+            self.steps.predicted(end, self.after, known.end, saturated=False),
+        )
+
+    def solved(self, rho: float, known: Ends | None) -> tuple[float, Ends]:
+        """The slack at ρ, and the L-steps at both ends."""
+        start, end = self.pair
+        at_end = self.steps.solve(end, self.after, None if known is None else known.end)
+        at_start = self.steps.solve(start, rho, at_end if known is None else known.start)
+        left = self.slack(rho, min(s.m for s in at_start), min(s.m for s in at_end))
+        return left, Ends(at_start, at_end)
+
+    def largest(self, ratio: float, known: Ends | None, cap: float) -> tuple[float, Ends]:
+        """The largest ρ ≤ cap at the start, nearly, and its L-steps.
+
+        Where a bound from the last programs promises what the next do not keep, ρ falls anyway.
+        """
+        rho, most, fall = min(self.after * ratio, cap), cap, FALL
+        for _ in range(MAX_TRIES):
+            if known is not None:
+                rho = self.bracketed(min(rho, most), known, most)
+            if rho <= LOWEST * self.after:
+                break
+            if not self.expand(rho):
+                rho, most = rho / 2, rho / 2
+                continue
+            left, known = self.solved(rho, known)
+            if left >= -ACCEPT * self.margin:
+                return rho, known
+            most, fall = rho * fall, fall * fall
+            rho = most
+        raise Infeasible(str(self.diagnosis(known)))
+
+    def bracketed(self, rho: float, known: Ends, most: float) -> float:
+        """The largest ρ ≤ most, to 1 %, at which the bound leaves the margin; or 0."""
+        step = STEP
+        if self.predicted(rho, known) >= 0:
+            low = rho
+            while low < most:
+                rho = min(low * step, most)
+                if self.predicted(rho, known) < 0:
+                    break
+                low = rho
+            high = rho
+        else:
+            high, low = rho, rho / step
+            while self.predicted(low, known) < 0:
+                if low <= LOWEST * self.after:
+                    return 0.0
+                step = min(step * step, 10.0)
+                high, low = low, low / step
+        while high / low > NEAR:
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if self.predicted(middle, known) >= 0 else (low, middle)
+        return low
+
+    def diagnosis(self, known: Ends | None) -> Diagnosis:
+        """What takes the margin away at this interval, at the ρ where least is missing."""
+        levels = self.after * np.geomspace(1e-3, 2.0, 12)
+        values = [-np.inf if known is None else self.predicted(r, known) for r in levels.tolist()]
+        rho = float(levels[int(np.argmax(values))])
+        self.expand(rho)
+        return diagnosed(self.steps, self.pair, (rho, self.after))

@@ -1,0 +1,280 @@
+"""`plan_motion`: a motion between two states by direct collocation.
+
+Hermite and Simpson's collocation, solved by convex programs within a trust region, then by
+least-norm Newton steps until the cubics obey the dynamics.
+Source: Hargraves and Paris, "Direct trajectory optimization using nonlinear programming and
+collocation", 1987; Mao, Szmuk and Açıkmeşe, "Successive convexification", 2016.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from nlsid_core import conic
+from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.conic import Cone, ConeProgram
+from nlsid_core.design.continuous.setting import DEFECT, limits_of
+from nlsid_core.dynamics import Nominal, Rates, VectorField, cubic_through, linear_through
+from nlsid_core.errors import DataError, Infeasible, SolverError
+
+FIRST_KNOTS = 25
+MORE_KNOTS = 2.0  # at a time, where cubics between the knots miss the dynamics
+MAX_KNOTS = 200
+KEPT = 0.9  # of the limits: the rest is there to correct with
+GOOD = 0.5  # of the defect that a funnel accepts
+MAX_STEPS, NEWTON_STEPS = 60, 20
+TRUST, SMALLEST = 1.0, 1e-7  # of the sizes of states and inputs
+PRICE = 1e2  # of a defect, over what the inputs may cost
+SETTLED = 1e-10  # largest defect, relative to the states' sizes
+STALLED = 1e-5  # of the cost: less is not worth another program
+STEP = 1e-6  # of the sizes, for central differences: errors of 1e-10
+
+
+def plan_motion(
+    dynamics: VectorField | Callable[..., Any],
+    *,
+    start: ArrayLike,
+    end: ArrayLike,
+    seconds: float,
+    u: ArrayLike | None = None,
+    m: int | None = None,
+    limits: ArrayLike | None = None,
+    through: ArrayLike | None = None,
+    knots: int | None = None,
+) -> Nominal:
+    """The motion from `start` to `end` (n,) in `seconds` with small ∫|u(t) - u|² dt.
+
+    dynamics: of some of t, x, u, named so; w, of a field, in the centre of its box. u: (m,) the
+    input that costs nothing, and that the motion starts and ends with if it keeps both ends at
+    rest (None: zeros, for `m` inputs). limits: rows (input, low, high), or one pair an input, that
+    the motion keeps to nine tenths of. through: (P, n) states to guess the path by, equally spaced
+    in time (None: the straight line). knots: of the cubics (None: as many as they need).
+
+    Raises DataError on input that makes no sense, Infeasible if no motion was found.
+    """
+    ends = [np.asarray(part, dtype=np.float64) for part in (start, end)]
+    if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
+        raise DataError(
+            f"start and end should be states (n,), are {ends[0].shape}, {ends[1].shape}"
+        )
+    if not seconds > 0:
+        raise DataError(f"seconds should be above 0, is {seconds}")
+    if u is None and m is None and not isinstance(dynamics, VectorField):
+        raise DataError("give u, the input that costs nothing, or m, how many inputs there are")
+    count = dynamics.m if isinstance(dynamics, VectorField) else m
+    rest = np.zeros(count or 0) if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
+    n, m = len(ends[0]), len(rest)
+    rates = dynamics if isinstance(dynamics, VectorField) else Rates.numeric(dynamics, n, m)
+    box = np.tile([-np.inf, np.inf], (m, 1))
+    for i, low, high in [] if limits is None else limits_of(limits, m).tolist():
+        middle, half = (low + high) / 2, KEPT * (high - low) / 2
+        box[int(i)] = middle - half, middle + half
+    path = np.stack(ends) if through is None else np.asarray(through, dtype=np.float64)
+    size = FIRST_KNOTS if knots is None else knots
+    share = np.linspace(0, 1, len(path))
+    x = np.stack([np.interp(np.linspace(0, 1, size), share, column) for column in path.T], axis=1)
+    x[0], x[-1] = ends
+    z = np.hstack([x, np.tile(rest, (size, 1))])
+    while True:
+        mesh = _Mesh(rates, np.linspace(0.0, seconds, size), n, rest, box)
+        z = mesh.planned(z)
+        z = mesh.settled(z)
+        found = mesh.nominal(z)
+        gap, when, _ = found.defect(rates)
+        scale = float(np.abs(found.x.derivative().control).max())
+        if gap <= GOOD * DEFECT * scale or (knots is not None and gap <= DEFECT * scale):
+            return found
+        if knots is not None or size > MAX_KNOTS:
+            raise Infeasible(
+                f"the motion misses its dynamics by {gap:.3g} at {when:.4g} s between {size} "
+                "knots: take more knots, or more seconds"
+            )
+        wanted = size * (gap / (GOOD * DEFECT * scale)) ** (1 / 3)
+        size = int(np.clip(wanted, size + 4, MORE_KNOTS * size))
+        fine = np.linspace(0.0, seconds, size)
+        z = np.hstack([found.x(fine), found.u(fine)])
+        z[-1, :n] = ends[1]
+
+
+@dataclass(eq=False)
+class _Mesh:
+    """Collocation on times t (K,): z (K, n + m) holds x and u; x is fixed at both ends."""
+
+    rates: VectorField | Rates
+    t: FloatArray
+    n: int
+    rest: FloatArray
+    box: FloatArray
+
+    def nominal(self, z: FloatArray) -> Nominal:
+        """Cubics through the states with the rates there; inputs linear."""
+        x, u = z[:, : self.n], z[:, self.n :]
+        return Nominal(cubic_through(self.t, x, self.values(self.t, z)), linear_through(self.t, u))
+
+    def values(self, t: FloatArray, z: FloatArray) -> FloatArray:
+        """ẋ at times t and rows of z."""
+        rows = [self.rates(float(s), row[None, : self.n], row[None, self.n :])[0] for s, row in
+                zip(t, z, strict=True)] if self.alone else [
+                self.rates(float(self.t[0]), z[:, : self.n], z[:, self.n :])]  # fmt: skip
+        return np.asarray(np.vstack(rows))
+
+    @property
+    def alone(self) -> bool:
+        """True if the rates depend on t."""
+        return self.rates.depends_on_time
+
+    def sizes(self, z: FloatArray) -> FloatArray:
+        """(n + m,) what is a large change of each entry."""
+        spread = np.ptp(z, axis=0)
+        inputs = np.where(np.isfinite(self.box).all(axis=1), np.ptp(self.box, axis=1), np.inf)
+        spread[self.n :] = np.where(
+            np.isfinite(inputs), inputs / 2, np.maximum(np.abs(self.rest), 1)
+        )
+        return np.where(spread > 0, spread, 1.0)
+
+    def defects(self, z: FloatArray) -> FloatArray:
+        """(K-1, n) x₁ - x₀ - h/6 (f₀ + 4 f_middle + f₁), the middle on the cubic."""
+        return self._defects(z)[0]
+
+    def _defects(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        n, h = self.n, np.diff(self.t)[:, None]
+        f = self.values(self.t, z)
+        middle = (z[:-1] + z[1:]) / 2
+        middle[:, :n] += h / 8 * (f[:-1] - f[1:])
+        between = self.values((self.t[:-1] + self.t[1:]) / 2, middle)
+        gaps = z[1:, :n] - z[:-1, :n] - h / 6 * (f[:-1] + 4 * between + f[1:])
+        return gaps, f, middle
+
+    def slopes(self, z: FloatArray, sizes: FloatArray) -> sp.csr_matrix:
+        """The defects' Jacobian ((K-1)n, K(n + m)), by central differences of the rates."""
+        n, width, K = self.n, z.shape[1], len(z)
+        _, _, middle = self._defects(z)
+        at = self._differences(self.t, z, sizes)
+        between = self._differences((self.t[:-1] + self.t[1:]) / 2, middle, sizes)
+        blocks = sp.lil_matrix(((K - 1) * n, K * width))
+        unit = np.eye(n, width)
+        for k, h in enumerate(np.diff(self.t).tolist()):
+            for side, sign in ((0, -1.0), (1, 1.0)):
+                moved = np.eye(width) / 2
+                moved[:n] += -sign * h / 8 * at[k + side]
+                block = sign * unit - h / 6 * (at[k + side] + 4 * between[k] @ moved)
+                rows, columns = k * n, (k + side) * width
+                blocks[rows : rows + n, columns : columns + width] = block
+        return blocks.tocsr()
+
+    def _differences(self, t: FloatArray, z: FloatArray, sizes: FloatArray) -> FloatArray:
+        columns = []
+        for j, size in enumerate(sizes.tolist()):
+            moved = np.zeros(z.shape[1])
+            moved[j] = STEP * size
+            columns.append((self.values(t, z + moved) - self.values(t, z - moved)) / (2 * moved[j]))
+        return np.stack(columns, axis=2)
+
+    def planned(self, z: FloatArray) -> FloatArray:
+        """Convex programs within a trust region: inputs small, defects at a price."""
+        sizes = self.sizes(z)
+        states, trust = sizes[: self.n], TRUST
+        z = z.copy()
+        z[:, self.n :] = np.clip(z[:, self.n :], *self.box.T)
+
+        def merit(z: FloatArray) -> tuple[float, float]:
+            cost = np.mean(((z[:, self.n :] - self.rest) / sizes[self.n :]) ** 2)
+            with np.errstate(all="ignore"):
+                missed = np.abs(self.defects(z) / states).sum()
+            return float(cost + PRICE * missed), float(cost)
+
+        now, _ = merit(z)
+        for _ in range(MAX_STEPS):
+            try:
+                step, promised = self._step(z, sizes, trust)
+            except SolverError:
+                trust /= 4
+                if trust < SMALLEST:
+                    break
+                continue
+            after, _ = merit(z + step)
+            gained, expected = now - after, now - promised
+            if expected <= STALLED * max(now, 1e-9) and trust < TRUST:
+                break
+            if np.isfinite(after) and gained > 0.1 * expected:
+                z, now = z + step, after
+                trust = min(2 * trust, 8.0) if gained > 0.5 * expected else trust
+                if expected <= STALLED * max(now, 1e-9):
+                    break
+            else:
+                trust /= 4
+                if trust < SMALLEST:
+                    break
+        return z
+
+    def _step(self, z: FloatArray, sizes: FloatArray, trust: float) -> tuple[FloatArray, float]:
+        """The step (K, n + m) of one convex program, and the merit it promises."""
+        n, width, K = self.n, z.shape[1], len(z)
+        m, count = width - n, (K - 1) * n
+        scale = np.tile(1 / sizes[:n], K - 1)
+        J = sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, K))
+        d = self.defects(z).ravel() * scale
+        high, low = np.full((K, width), trust), np.full((K, width), -trust)
+        inputs = z[:, n:]
+        high[:, n:] = np.minimum(high[:, n:], (self.box[:, 1] - inputs) / sizes[n:])
+        low[:, n:] = np.maximum(low[:, n:], (self.box[:, 0] - inputs) / sizes[n:])
+        high[[0, -1], :n] = low[[0, -1], :n] = 0.0
+        weight = np.zeros((K, width))
+        weight[:, n:] = 2 / (K * m) if m else 0.0
+        gradient = np.zeros((K, width))
+        gradient[:, n:] = weight[:, n:] * (inputs - self.rest) / sizes[n:]
+        size, eye = K * width, sp.eye(K * width)
+        gap, none = sp.eye(count), sp.csr_matrix((size, count))
+        program = ConeProgram(
+            P=sp.block_diag([sp.diags(weight.ravel()), sp.csc_matrix((count, count))], "csc"),
+            q=np.concatenate([gradient.ravel(), np.full(count, PRICE)]),
+            A=sp.bmat([[J, -gap], [-J, -gap], [eye, none], [-eye, none]], "csc"),
+            b=np.concatenate([-d, d, high.ravel() + 1e-9, -low.ravel() + 1e-9]),
+            cones=(Cone("nonnegative", 2 * count + 2 * size),),
+        )
+        x = conic.solve(program).x
+        y = np.clip(x[:size].reshape(K, width), low, high)
+        cost = np.mean(((inputs - self.rest) / sizes[n:] + y[:, n:]) ** 2) if m else 0.0
+        missed = np.abs(J @ y.ravel() + d).sum()
+        return y * sizes, float(cost + PRICE * missed)
+
+    def settled(self, z: FloatArray) -> FloatArray:
+        """The nearest z that obeys the collocation, by least-norm Newton steps; else Infeasible."""
+        sizes, n = self.sizes(z), self.n
+        free = np.ones(z.shape, dtype=bool)
+        free[[0, -1], :n] = False
+        scale = np.tile(1 / sizes[:n], len(z) - 1)
+        for _ in range(NEWTON_STEPS):
+            d = self.defects(z).ravel() * scale
+            worst = float(np.abs(d).max(initial=0.0))
+            if worst <= SETTLED:
+                break
+            J = sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, len(z)))
+            J = J.tocsc()[:, np.flatnonzero(free.ravel())]
+            normal = (J @ J.T + 1e-13 * sp.eye(J.shape[0])).tocsc()
+            try:
+                step = J.T @ splu(normal).solve(d)
+            except RuntimeError as error:
+                raise SolverError(f"the motion's equations are singular: {error}") from error
+            moved = np.zeros(z.size)
+            moved[free.ravel()] = step
+            z = z - moved.reshape(z.shape) * sizes
+        if not worst <= 100 * SETTLED:
+            k, i = divmod(int(np.abs(d).argmax()), n)
+            raise Infeasible(
+                f"no motion was found: dx{i}/dt does not fit by {worst:.3g} of its size near "
+                f"{self.t[k]:.4g} s. Give more seconds, wider limits, or a path to guess by "
+                "(`through`)"
+            )
+        u, (low, high) = z[:, n:], self.box.T
+        reach = (high - low) * (1 / KEPT - 1) / 2
+        if (
+            (u > high + np.where(np.isfinite(reach), reach, 0))
+            | (u < low - np.where(np.isfinite(reach), reach, 0))
+        ).any():
+            raise Infeasible("the motion needs more than the limits: give more seconds")
+        return z

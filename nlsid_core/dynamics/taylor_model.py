@@ -1,0 +1,348 @@
+"""`TaylorModel`: a cubic on a box and a bound of what it leaves out, carried through arithmetic.
+
+For every d in [-1, 1]^k the value is within `error` of the cubic at d, rounding included.
+Source: Makino and Berz, "Taylor models and other validated functional inclusion methods", 2003.
+Assumes IEEE 754 double precision, and elementary functions right to a few units in the last place.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from math import atan, atan2, cos, exp, frexp, log, pi, sin, sqrt, tan, tanh
+from typing import Any
+
+import numpy as np
+
+from nlsid_core.arrays import BoolArray, FloatArray, IntArray
+from nlsid_core.errors import DataError
+
+DEGREE = 3  # what L-steps take
+BASE = 128  # of the digits that write a monomial: more than the variables of any box
+ROUNDING = 2.0**-50  # relative, of one operation on coefficients: 8 units, where 1 to 4 are made
+SUMMED = 1 + 2.0**-40  # covers the roundings of a sum of bounds
+MAX_POWER = 64
+CLEAR_OF_POLE = 1e-3  # rad; there the tangent is right to a SUMMED
+MOST_FOURTH = {"tanh": 0.171, "arctan": 0.195}  # of |f⁗|/4! anywhere: their maxima, rounded up
+
+
+@dataclass(frozen=True, eq=False)
+class TaylorModel:
+    """Σ coefficients·d^keys ± error. keys: (M,) increasing, the first is 0, the constant.
+
+    A key is three digits in BASE, the variables (1 is d_0) of a product, 0 for none, increasing.
+    """
+
+    keys: IntArray
+    coefficients: FloatArray
+    error: float
+
+    @classmethod
+    def variable(cls, j: int, centre: float, radius: float) -> "TaylorModel":
+        """centre + radius·d_j, exact."""
+        return cls(np.array([0, j + 1]), np.array([centre, radius]), 0.0)
+
+    @property
+    def centre(self) -> float:
+        """The cubic at d = 0."""
+        return float(self.coefficients[0])
+
+    @property
+    def size(self) -> float:
+        """A bound of its absolute value."""
+        return (float(np.abs(self.coefficients).sum()) + self.error) * SUMMED
+
+    def __add__(self, other: Any) -> "TaylorModel":
+        if not isinstance(other, TaylorModel):
+            number = _number(other)
+            if number is None:
+                return NotImplemented
+            shifted = self.coefficients.copy()
+            shifted[0] += number
+            lost = 0.0 if number == 0 else ROUNDING * abs(shifted[0])
+            return self._made(self.keys, shifted, self.error, lost)
+        keys, first, second = _union(self.keys.tobytes(), other.keys.tobytes())
+        total = np.zeros(len(keys))
+        total[first] = self.coefficients
+        total[second] += other.coefficients
+        lost = ROUNDING * float(np.abs(total).sum())
+        return self._made(keys, total, self.error + other.error, lost)
+
+    def __mul__(self, other: Any) -> "TaylorModel":
+        if not isinstance(other, TaylorModel):
+            number = _number(other)
+            if number is None:
+                return NotImplemented
+            return self._scaled(number, _is_power_of_two(number))
+        keys, home, kept = _products(self.keys.tobytes(), other.keys.tobytes())
+        outer = np.multiply.outer(self.coefficients, other.coefficients).ravel()
+        total = np.bincount(home, outer[kept], len(keys)).astype(np.float64)
+        size = np.abs(outer)
+        error = self.error * other.size + other.error * self.size
+        lost = len(keys) * ROUNDING * float(size.sum())
+        return self._made(keys, total, error + float(size[~kept].sum()), lost)
+
+    def __truediv__(self, other: Any) -> "TaylorModel":
+        if isinstance(other, TaylorModel):
+            return self * other.reciprocal()
+        number = _number(other)
+        if number is None:
+            return NotImplemented
+        return self._scaled(1 / number, _is_power_of_two(number))
+
+    def __rtruediv__(self, other: Any) -> "TaylorModel":
+        return self.reciprocal().__mul__(other)
+
+    def __neg__(self) -> "TaylorModel":
+        return TaylorModel(self.keys, -self.coefficients, self.error)
+
+    def __pos__(self) -> "TaylorModel":
+        return self
+
+    def __sub__(self, other: Any) -> "TaylorModel":
+        return self.__add__(-other)
+
+    def __rsub__(self, other: Any) -> "TaylorModel":
+        return (-self).__add__(other)
+
+    def __pow__(self, power: Any) -> "TaylorModel":
+        number = None if isinstance(power, TaylorModel) else _number(power)
+        if number in (0.5, -0.5):
+            root = self.sqrt()
+            return root if number == 0.5 else root.reciprocal()
+        if number is None or not number.is_integer() or abs(number) > MAX_POWER:
+            raise TypeError(f"power {power!r}: whole numbers up to {MAX_POWER} and 0.5 are known")
+        square, left = (self if number >= 0 else self.reciprocal()), int(abs(number))
+        result: TaylorModel | None = None
+        while left:
+            if left & 1:
+                result = square if result is None else result * square
+            left >>= 1
+            square = square * square if left else square
+        return self * 0.0 + 1.0 if result is None else result
+
+    __radd__ = __add__
+    __rmul__ = __mul__
+
+    def __eq__(self, other: object) -> bool:
+        raise TypeError("a comparison: which branch holds is not known on a whole box")
+
+    __lt__ = __le__ = __gt__ = __ge__ = __ne__ = __eq__
+    __hash__ = None  # type: ignore[assignment]
+
+    def __bool__(self) -> bool:
+        raise TypeError("a truth value: it is not known on a whole box")
+
+    # NumPy calls these by name on the entries of an object array: np.sin becomes .sin().
+
+    def sin(self) -> "TaylorModel":
+        """Its sine."""
+        c = self.centre
+        left = min(1.0, abs(sin(c)) + self._spread()) / 24
+        return self._composed([sin(c), cos(c), -sin(c) / 2, -cos(c) / 6], left)
+
+    def cos(self) -> "TaylorModel":
+        """Its cosine."""
+        c = self.centre
+        left = min(1.0, abs(cos(c)) + self._spread()) / 24
+        return self._composed([cos(c), -sin(c), -cos(c) / 2, sin(c) / 6], left)
+
+    def tan(self) -> "TaylorModel":
+        """Its tangent. Raises DataError if the box reaches a pole."""
+        c, b = self.centre, self._spread()
+        from_pole = pi / 2 - abs((c + pi / 2) % pi - pi / 2)
+        if b * SUMMED >= from_pole - CLEAR_OF_POLE:
+            raise DataError(f"the tangent of a value that may be at a pole, {c:.3g} ± {b:.3g}")
+        T, most = tan(c), tan(pi / 2 - from_pole + b) * SUMMED
+        one = 1 + T * T
+        fourth = most * (1 + most**2) * (2 + 3 * most**2) / 3
+        return self._composed([T, one, T * one, one * (1 + 3 * T * T) / 3], fourth * SUMMED)
+
+    def exp(self) -> "TaylorModel":
+        """Its exponential."""
+        c = self.centre
+        E = exp(c)
+        return self._composed([E, E, E / 2, E / 6], exp(c + self._spread()) * SUMMED / 24)
+
+    def log(self) -> "TaylorModel":
+        """Its natural logarithm. Raises DataError unless it is positive on the box."""
+        c, least = self.centre, self._least("the logarithm of")
+        return self._composed([log(c), 1 / c, -1 / (2 * c**2), 1 / (3 * c**3)], 1 / (4 * least**4))
+
+    def sqrt(self) -> "TaylorModel":
+        """Its root. Raises DataError unless it is positive on the box."""
+        c, least = self.centre, self._least("the root of")
+        r = sqrt(c)
+        series = [r, 1 / (2 * r), -1 / (8 * r * c), 1 / (16 * r * c * c)]
+        return self._composed(series, 5 / 128 / (sqrt(least) * least**3))
+
+    def tanh(self) -> "TaylorModel":
+        """Its hyperbolic tangent."""
+        T = tanh(self.centre)
+        one = 1 - T * T
+        series = [T, one, -T * one, -one * (1 - 3 * T * T) / 3]
+        return self._composed(series, MOST_FOURTH["tanh"], cancelled=1.0)
+
+    def arctan(self) -> "TaylorModel":
+        """Its arc tangent."""
+        c = self.centre
+        q = 1 + c * c
+        series = [atan(c), 1 / q, -c / q**2, (3 * c * c - 1) / (3 * q**3)]
+        return self._composed(series, MOST_FOURTH["arctan"], cancelled=1.0)
+
+    def arctan2(self, other: Any) -> "TaylorModel":
+        """The angle of (other, self). Raises DataError if the box reaches zero or the cut at π."""
+        x = other if isinstance(other, TaylorModel) else self * 0.0 + other
+        return _angle(self, x)
+
+    def __abs__(self) -> "TaylorModel":
+        c, b = self.centre, self._spread()
+        if abs(c) >= b:
+            return self if c >= 0 else -self
+        most = self.size  # |s| is between s²/most and s²/most + most/4
+        middle = self * self * (1 / most) + most / 8
+        return self._made(middle.keys, middle.coefficients, middle.error, most / 8 * SUMMED)
+
+    fabs = absolute = __abs__
+
+    def square(self) -> "TaylorModel":
+        """Its square."""
+        return self * self
+
+    def reciprocal(self) -> "TaylorModel":
+        """One over it. Raises DataError if it may be zero on the box."""
+        c = self.centre
+        if c < 0:
+            return -((-self).reciprocal())
+        least = self._least("division by", "may be zero")
+        return self._composed([1 / c, -1 / c**2, 1 / c**3, -1 / c**4], 1 / least**5)
+
+    def _least(self, what: str, otherwise: str = "may not be positive") -> float:
+        """A positive lower bound, or DataError."""
+        least = (self.centre - self._spread() * SUMMED) / SUMMED
+        if least <= 0:
+            raise DataError(f"{what} a value that {otherwise} in the box around {self.centre:.3g}")
+        return least
+
+    def _spread(self) -> float:
+        """A bound of how far from its centre it is."""
+        return (float(np.abs(self.coefficients[1:]).sum()) + self.error) * SUMMED
+
+    def _composed(
+        self, series: list[float], fourth: float, *, cancelled: float = 0.0
+    ) -> "TaylorModel":
+        """Σ series_i δ^i, δ = self - centre, and what is left: `fourth`·δ⁴ at most.
+
+        cancelled: the size of what a coefficient of the series is a difference of.
+        """
+        without = self.coefficients.copy()
+        without[0] = 0.0
+        delta = TaylorModel(self.keys, without, self.error)
+        b = delta.size
+        result = delta * series[3] + series[2]
+        for term in (series[1], series[0]):
+            result = result * delta + term
+        lost = ROUNDING * sum((abs(term) + cancelled) * b**i for i, term in enumerate(series))
+        error = (result.error + fourth * SUMMED * b**4 + lost) * SUMMED
+        return TaylorModel(result.keys, result.coefficients, error)
+
+    def _scaled(self, factor: float, exact: bool) -> "TaylorModel":
+        scaled = factor * self.coefficients
+        lost = 0.0 if exact else ROUNDING * float(np.abs(scaled).sum())
+        return self._made(self.keys, scaled, abs(factor) * self.error, lost)
+
+    def _made(
+        self, keys: IntArray, coefficients: FloatArray, error: float, lost: float
+    ) -> "TaylorModel":
+        return TaylorModel(keys, coefficients, (error + float(lost)) * SUMMED)
+
+
+def solve(A: Any, b: Any) -> Any:
+    """x with Ax = b by elimination: what dynamics with a mass matrix write for np.linalg.solve.
+
+    A: (n, n), b: (n,), of numbers, of arrays that hold one system per entry, or of Taylor models.
+    Returns an array (n,) of the same kind. Rows are exchanged where entries are not arrays.
+    """
+    rows = [[*row, right] for row, right in zip(A, b, strict=True)]
+    n = len(rows)
+    for j in range(n):
+        best = max(range(j, n), key=lambda i: (_magnitude(rows[i][j]), -i))
+        rows[j], rows[best] = rows[best], rows[j]
+        for i in range(j + 1, n):
+            factor = rows[i][j] / rows[j][j]
+            rows[i] = [p - factor * q for p, q in zip(rows[i], rows[j], strict=True)]
+    found: list[Any] = [0.0] * n
+    for j in reversed(range(n)):
+        rest = rows[j][n]
+        for i in range(j + 1, n):
+            rest = rest - rows[j][i] * found[i]
+        found[j] = rest / rows[j][j]
+    if any(isinstance(entry, (TaylorModel, np.ndarray)) or not _known(entry) for entry in found):
+        held = np.empty(n, dtype=object)
+        held[:] = found
+        return np.stack(found) if all(isinstance(e, np.ndarray) for e in found) else held
+    return np.array(found)
+
+
+def _known(entry: Any) -> bool:
+    return isinstance(entry, (int, float, complex, np.number))
+
+
+def _magnitude(entry: Any) -> float:
+    if isinstance(entry, TaylorModel):
+        return abs(entry.centre)
+    return float(abs(entry)) if _known(entry) else 1.0
+
+
+def _angle(y: TaylorModel, x: TaylorModel) -> TaylorModel:
+    """arctan2(y, x), turned by the angle of the centre so that the division's value is small."""
+    turn = atan2(y.centre, x.centre)
+    c, s = cos(turn), sin(turn)
+    ahead, aside = x * c + y * s, y * c - x * s
+    angle = (aside * ahead.reciprocal()).arctan() + turn
+    result = TaylorModel(angle.keys, angle.coefficients, (angle.error + 4 * ROUNDING) * SUMMED)
+    if abs(result.centre) + result._spread() >= pi:
+        raise DataError(f"arctan2 near its cut at ±pi, around {turn:.3g}: it jumps there")
+    return result
+
+
+def _digits(keys: IntArray) -> IntArray:
+    """(M, 3) the variables of each monomial, counted from 1; 0 for none."""
+    return np.stack([keys // BASE**2, keys // BASE % BASE, keys % BASE], axis=-1)
+
+
+def variables_of(key: int) -> tuple[int, ...]:
+    """The variables, counted from 0, of one monomial; twice where squared."""
+    return tuple(int(d) - 1 for d in _digits(np.array(key)) if d)
+
+
+@lru_cache(maxsize=4096)
+def _union(a: bytes, b: bytes) -> tuple[IntArray, IntArray, IntArray]:
+    first, second = np.frombuffer(a, dtype=np.int64), np.frombuffer(b, dtype=np.int64)
+    keys = np.union1d(first, second)
+    return keys, np.searchsorted(keys, first), np.searchsorted(keys, second)
+
+
+@lru_cache(maxsize=4096)
+def _products(a: bytes, b: bytes) -> tuple[IntArray, IntArray, BoolArray]:
+    """The keys of the products, where each kept one adds to, and which have degree 3 at most."""
+    first, second = (_digits(np.frombuffer(part, dtype=np.int64)) for part in (a, b))
+    both = np.concatenate(
+        np.broadcast_arrays(first[:, None, :], second[None, :, :]), axis=-1
+    ).reshape(-1, 6)
+    both = np.sort(both, axis=1)
+    kept = both[:, 2] == 0
+    written = both[kept, 3] * BASE**2 + both[kept, 4] * BASE + both[kept, 5]
+    keys, home = np.unique(written, return_inverse=True)
+    return keys, home.ravel(), kept
+
+
+def _number(value: Any) -> float | None:
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    if isinstance(value, (int, float, np.integer, np.floating)):
+        return float(value)
+    return None
+
+
+def _is_power_of_two(value: float) -> bool:
+    """True if a product with it, or its inverse, is exact; or if it is zero."""
+    return abs(frexp(value)[0]) in (0.0, 0.5)

@@ -1,0 +1,87 @@
+"""The page of a design folder says what the kernel decides now, and runs nothing."""
+
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.pictures.folder_report import folder_page
+from bags.samples import f1tenth
+from nlsid_core import kernel
+from nlsid_core.errors import DocumentError
+
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "f1tenth.yaml"
+
+
+def nlsid(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert done.exit_code in (0, 1), done.output
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report") / "car <1>"
+    nlsid("identify", *f1tenth(), "--config", CONFIG, "--out", folder)
+    nlsid("funnel", "--model", folder / documents.MODEL, "--config", CONFIG, "--out", folder)
+    return folder
+
+
+class Page(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for key, value in attrs if key in ("href", "src", "xlink:href")]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
+    bag = f1tenth()[4]
+    nlsid("report", design, bag, "--config", CONFIG)
+    page = Page((design / documents.DESIGN_REPORT).read_text())
+    for proof in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
+        assert str(kernel.check(design / proof)).split("\n")[0] in page.text
+    for chapter in ("What is proved", "How well it simulates", "what it can catch",
+                    "Recordings held against the funnel", bag.name, "car <1>"):  # fmt: skip
+        assert chapter in page.text
+    assert page.tags.count("svg") > 3
+    assert "script" not in page.tags
+    assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
+
+
+def test_a_forged_proof_is_rejected_on_the_page(design: Path) -> None:
+    proof = design / documents.FUNNEL_PROOF
+    content = proof.read_text()
+    try:
+        proof.write_text(re.sub(r"(sha256:)(.)", lambda m: m[1] + "01"[m[2] == "0"], content))
+        page = Page(folder_page(design)).text
+    finally:
+        proof.write_text(content)
+    assert "REJECTED" in page
+    assert "A proof of this folder does not hold now." in page
+
+
+def test_a_picture_that_is_none_is_left_out(design: Path) -> None:
+    picture = design / documents.FUNNEL_PLOT
+    picture.write_bytes(b"<script>alert(1)</script>")
+    try:
+        assert "alert" not in folder_page(design)
+    finally:
+        picture.unlink()
+
+
+def test_a_folder_without_a_design_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DocumentError, match=r"no proof and no report\.html"):
+        folder_page(tmp_path)

@@ -1,0 +1,449 @@
+(* A continuous funnel: what is decided about it, and why solutions then stay inside. *)
+From Coq Require Import ZArith Reals List Lra Lia.
+From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition.
+Import ListNotations.
+Open Scope R_scope.
+
+Section Funnel.
+Context {K : Ints}.
+
+(* The part [index, index + 1] / 2^depth of a segment, at a vertex of w and in a mode (by their
+   places in [vertices] and [modes]), with its multipliers and squares. *)
+Record piece := Piece {
+  depth : Z; index : Z; vertex : nat; mode : nat;
+  mu : list (Z * (I * I)); columns : list Z; gram_factors : squares;
+  tau : list (list Z * squares) }.
+Record witness := Witness {
+  margin : num; basis : list mono; multiplier : list mono; sides : list mono;
+  pieces : list (list piece) }.
+
+Definition num_eqb (a b : num) : bool :=
+  andb (Z.eqb (fst a) (fst b)) (Pos.eqb (snd a) (snd b)).
+Definition num_ltb (a b : num) : bool := (fst a * Zpos (snd b) <? fst b * Zpos (snd a))%Z.
+Fixpoint list_eqb {A : Type} (f : A -> A -> bool) (a b : list A) : bool :=
+  match a, b with
+  | [], [] => true
+  | x :: a', y :: b' => andb (f x y) (list_eqb f a' b')
+  | _, _ => false
+  end.
+Definition knot_eqb (a b : knot) : bool :=
+  andb (num_eqb (time a) (time b))
+    (andb (list_eqb (list_eqb num_eqb) (shape a) (shape b)) (num_eqb (level a) (level b))).
+
+(* mu, linear in s on the part *)
+Definition fmu (rows : list mono) (mu : list (Z * (I * I))) : F :=
+  let lowest := fold_right (fun e acc => Z.min (fst e) acc) 0%Z mu in
+  Frac (sorted badd (zip (fun m e =>
+          let c := itwo_to (fst e - lowest) in
+          (m, [imul c (fst (snd e)); imul c (snd (snd e))])) rows mu))
+    (itwo_to (- lowest)) 1.
+Fixpoint all_expanded (rows : list mono) (l : list (list Z * squares)) : option (list F) :=
+  match l with
+  | [] => Some []
+  | (c, sq) :: l' =>
+      match expanded rows c sq, all_expanded rows l' with
+      | Some f, Some fs => Some (f :: fs)
+      | _, _ => None
+      end
+  end.
+
+Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (p : piece)
+  : bool :=
+  match nth_error (vertices (box d)) (vertex p), nth_error (modes (limits d)) (mode p),
+    all_expanded (sides w) (tau p) with
+  | Some v, Some m, Some taus =>
+      let f := fmu (multiplier w) (mu p) in
+      andb (andb (0 <=? depth p)%Z (ipos (den f)))
+        (is_positive (basis w) products (columns p) (gram_factors p)
+          (fcondition (margin w) (limits d) m v g (depth p) (index p) f taus))
+  | _, _, _ => false
+  end.
+
+(* How far, in units of 2^-16, the pieces of a vertex and a mode cover [0, 1]. *)
+Fixpoint reached (v m : nat) (sofar : Z) (ps : list piece) : Z :=
+  match ps with
+  | [] => sofar
+  | p :: ps' =>
+      if andb (andb (Nat.eqb (vertex p) v) (Nat.eqb (mode p) m))
+           (andb (depth p <=? 16) (index p * 2 ^ (16 - depth p) <=? sofar))%Z
+      then reached v m (Z.max sofar ((index p + 1) * 2 ^ (16 - depth p))) ps'
+      else reached v m sofar ps'
+  end.
+Definition covered (d : problem) (ps : list piece) : bool :=
+  forallb (fun v => forallb (fun m => (2 ^ 16 <=? reached v m 0 ps)%Z)
+    (seq 0 (length (modes (limits d))))) (seq 0 (length (vertices (box d)))).
+
+Fixpoint triangle_ok {A : Type} (k : nat) (M : list (list A)) : bool :=
+  match k, M with
+  | O, [] => true
+  | S j, row :: M' => andb (Nat.eqb (length row) k) (triangle_ok j M')
+  | _, _ => false
+  end.
+Definition segment_ok (n : nat) (d : problem) (g : segment) : bool :=
+  let m := length (limits d) in
+  andb (andb (andb (Nat.eqb (length (nominal g)) n) (Nat.eqb (length (equations g)) n))
+    (andb (Nat.eqb (length (feed g)) m) (Nat.eqb (length (gains g)) m)))
+  (andb (andb (forallb (fun c => andb (Nat.ltb 0 (length c)) (Nat.leb (length c) 4)) (nominal g))
+      (andb (num_ltb (time (start g)) (time (stop g)))
+        (andb (triangle_ok n (shape (start g))) (triangle_ok n (shape (stop g))))))
+    (andb (andb (num_ltb (0%Z, xH) (level (start g))) (num_ltb (0%Z, xH) (level (stop g))))
+      (forallb (forallb (fun t => forallb (fun k => Nat.leb k 1) (skipn (1 + n + m) (fst t))))
+         (equations g)))).
+Definition last_of (c : list num) : num := last c (0%Z, xH).
+Definition first_of (c : list num) : num := hd (0%Z, xH) c.
+Fixpoint linked (gs : list segment) : bool :=
+  match gs with
+  | g :: ((g' :: _) as rest) =>
+      andb (andb (knot_eqb (stop g) (start g'))
+        (list_eqb num_eqb (map last_of (nominal g)) (map first_of (nominal g')))) (linked rest)
+  | _ => true
+  end.
+
+Definition check (d : problem) (w : witness) : bool :=
+  let n := match segments d with [] => O | g :: _ => length (nominal g) end in
+  let products := products (basis w) in
+  andb (andb (andb (num_ltb (0%Z, xH) (margin w)) (linked (segments d)))
+         (forallb (fun l => match l with Some (a, b) => num_ltb a b | None => true end) (limits d)))
+    (andb (Nat.eqb (length (pieces w)) (length (segments d)))
+      (forallb (fun e => andb (andb (segment_ok n d (fst e)) (covered d (snd e)))
+                          (forallb (piece_ok d w products (fst e)) (snd e)))
+        (combine (segments d) (pieces w)))).
+
+(* Why. *)
+Lemma num_eqb_eq a b : num_eqb a b = true -> a = b.
+Proof.
+  destruct a, b. unfold num_eqb; cbn. intros H. apply andb_prop in H as [H1 H2].
+  apply Z.eqb_eq in H1 as ->. apply Pos.eqb_eq in H2 as ->. reflexivity.
+Qed.
+Lemma list_eqb_eq {A} (f : A -> A -> bool) : (forall a b, f a b = true -> a = b) ->
+  forall a b, list_eqb f a b = true -> a = b.
+Proof.
+  intros H. induction a as [|x a IH]; intros [|y b]; cbn; try discriminate; auto.
+  intros E. apply andb_prop in E as [E1 E2]. f_equal; auto.
+Qed.
+Lemma knot_eqb_eq a b : knot_eqb a b = true -> a = b.
+Proof.
+  destruct a, b. unfold knot_eqb; cbn. intros H. apply andb_prop in H as [H1 H2].
+  apply andb_prop in H2 as [H2 H3]. apply num_eqb_eq in H1 as ->. apply num_eqb_eq in H3 as ->.
+  apply (list_eqb_eq _ (list_eqb_eq _ num_eqb_eq)) in H2 as ->. reflexivity.
+Qed.
+Lemma num_ltb_lt a b : num_ltb a b = true -> val a < val b.
+Proof.
+  destruct a as [p q], b as [p' q']. unfold num_ltb, val; cbn. intros H. apply Z.ltb_lt in H.
+  apply IZR_lt in H. rewrite !mult_IZR in H.
+  assert (0 < IZR (Zpos q)) by now apply IZR_lt. assert (0 < IZR (Zpos q')) by now apply IZR_lt.
+  apply (Rmult_lt_reg_r (IZR (Zpos q) * IZR (Zpos q'))). { now apply Rmult_lt_0_compat. }
+  replace (IZR p / _ * _) with (IZR p * IZR (Zpos q')) by (field; lra).
+  replace (IZR p' / _ * _) with (IZR p' * IZR (Zpos q)) by (field; lra). exact H.
+Qed.
+Lemma val_zero : val (0%Z, xH) = 0.
+Proof. unfold val; cbn. field. Qed.
+
+(* Some mode holds, in it the clipped input is the applied one, and its side is kept. *)
+Definition proper (l : option (num * num)) : Prop :=
+  match l with Some (a, b) => val a < val b | None => True end.
+Lemma mode_exists limits : Forall proper limits -> forall us, length us = length limits ->
+  exists m, In m (modes limits) /\ applied limits m us = zip clip limits us /\
+    Forall (fun q => 0 <= q) (held limits m us).
+Proof.
+  induction 1 as [|[[a b]|] l Hp Hl IH]; intros [|u us] H; try discriminate; cbn [modes].
+  - exists []. cbn; auto.
+  - injection H as H. destruct (IH us H) as [m [Hm [Ha Hh]]]. cbn in Hp.
+    destruct (Rlt_le_dec u (val a)) as [C|C]; [|destruct (Rlt_le_dec (val b) u) as [E|E]].
+    + exists (Low :: m). split. { apply in_or_app. left. now apply in_map. }
+      cbn. rewrite Ha, Rmin_right, Rmax_left by lra. split; auto. constructor; auto; lra.
+    + exists (High :: m). split. { rewrite app_assoc. apply in_or_app. right. now apply in_map. }
+      cbn. rewrite Ha, Rmin_left, Rmax_right by lra. split; auto. constructor; auto; lra.
+    + exists (Free :: m). split.
+      { apply in_or_app. right. apply in_or_app. left. now apply in_map. }
+      cbn. rewrite Ha, Rmin_right, Rmax_right by lra. split; auto. constructor; auto.
+      apply Rmult_le_pos; lra.
+  - injection H as H. destruct (IH us H) as [m [Hm [Ha Hh]]].
+    exists (Free :: m). split; [now apply in_map|]. cbn. now rewrite Ha.
+Qed.
+
+(* A function that is affine in each entry of w is below c on the box if it is at the vertices. *)
+Definition affine (G : list R -> R) : Prop := forall pre post a b l,
+  G (pre ++ ((1 - l) * a + l * b) :: post) =
+    (1 - l) * G (pre ++ a :: post) + l * G (pre ++ b :: post).
+Lemma below_on_box box : forall G c, affine G ->
+  (forall v, In v (vertices box) -> G (map val v) < c) ->
+  forall w, in_box w box -> G w < c.
+Proof.
+  induction box as [|[a b] box IH]; intros G c HG Hv w Hw;
+    inversion Hw as [|w0 ? w' ? H1 H2]; subst.
+  { exact (Hv [] (or_introl eq_refl)). }
+  cbn in H1.
+  assert (HG' : affine (fun w => G (w0 :: w))).
+  { intros pre post p q l. exact (HG (w0 :: pre) post p q l). }
+  apply (IH (fun w => G (w0 :: w)) c HG'); auto. intros v Hin.
+  pose proof (Hv (a :: v)) as Ha. pose proof (Hv (b :: v)) as Hb. cbn [map] in Ha, Hb.
+  specialize (Ha ltac:(cbn; apply in_or_app; left; now apply in_map)).
+  specialize (Hb ltac:(cbn; apply in_or_app; right; now apply in_map)).
+  destruct (Req_dec (val a) (val b)) as [E|E].
+  { replace w0 with (val a) by lra. exact Ha. }
+  set (l := (w0 - val a) / (val b - val a)).
+  assert (0 < val b - val a) by lra.
+  assert (Hl : 0 <= l <= 1).
+  { unfold l. split.
+    - apply Rmult_le_pos; [lra|]. left. now apply Rinv_0_lt_compat.
+    - apply (Rmult_le_reg_r (val b - val a)); auto.
+      unfold Rdiv. rewrite Rmult_assoc, Rinv_l; lra. }
+  pose proof (HG [] (map val v) (val a) (val b) l) as A. cbn [app] in A.
+  replace ((1 - l) * val a + l * val b) with w0 in A by (unfold l; field; lra).
+  cbn beta. rewrite A. set (ga := G (val a :: _)) in *. set (gb := G (val b :: _)) in *.
+  pose proof (Rmax_lub_lt _ _ _ Ha Hb). pose proof (Rmax_l ga gb). pose proof (Rmax_r ga gb).
+  assert ((1 - l) * ga <= (1 - l) * Rmax ga gb) by (apply Rmult_le_compat_l; lra).
+  assert (l * gb <= l * Rmax ga gb) by (apply Rmult_le_compat_l; lra). lra.
+Qed.
+
+(* The equations are affine in w, and so is the growth of W. *)
+Lemma power_split L : forall e (post : list R), exists c, forall y,
+  power e (L ++ y :: post) = c * y ^ (nth (length L) e O).
+Proof.
+  induction L as [|a L IH]; intros [|k e] post; cbn [app power length nth].
+  - exists 1. intros; cbn; ring.
+  - exists (power e post). intros; ring.
+  - exists 1. intros; cbn; ring.
+  - destruct (IH e post) as [c Hc]. exists (a ^ k * c). intros y'. rewrite Hc. ring.
+Qed.
+Definition linear_beyond (n : nat) (e : equation) : Prop :=
+  Forall (fun t => Forall (fun k => (k <= 1)%nat) (skipn n (fst t))) e.
+Lemma rate_affine n e L pre post a b l : linear_beyond n e -> length L = n ->
+  rate e (L ++ pre ++ ((1 - l) * a + l * b) :: post) =
+    (1 - l) * rate e (L ++ pre ++ a :: post) + l * rate e (L ++ pre ++ b :: post).
+Proof.
+  intros He HL. induction He as [|[k c] e Hk He IH]; cbn [rate]; [ring|]. rewrite IH.
+  rewrite !app_assoc. destruct (power_split (L ++ pre) k post) as [d Hd]. rewrite !Hd.
+  assert (Hn : (nth (length (L ++ pre)) k O <= 1)%nat).
+  { cbn [fst] in Hk. rewrite app_length, HL.
+    destruct (Nat.lt_ge_cases (n + length pre) (length k)) as [C|C].
+    - rewrite <- (firstn_skipn n k) at 1. rewrite app_nth2; rewrite firstn_length_le; try lia.
+      rewrite Forall_forall in Hk. apply Hk. apply nth_In. rewrite skipn_length. lia.
+    - rewrite nth_overflow by lia. lia. }
+  destruct (nth _ k O) as [|[|j]]; [| |lia]; cbn; ring.
+Qed.
+Lemma dot_affine y l : forall p q, length p = length q ->
+  dot y (zip (fun a b => (1 - l) * a + l * b) p q) = (1 - l) * dot y p + l * dot y q.
+Proof.
+  induction y as [|y0 y IH]; intros [|a p] [|b q] H; try discriminate; cbn; try ring.
+  rewrite IH by (now injection H). ring.
+Qed.
+Lemma form_affine M l : forall y p q, length p = length q ->
+  form M y (zip (fun a b => (1 - l) * a + l * b) p q) = (1 - l) * form M y p + l * form M y q.
+Proof.
+  induction M as [|[|m0 m] M IH]; intros [|y0 y] [|a p] [|b q] H; try discriminate; cbn; try ring.
+  rewrite IH, dot_affine by (now injection H). ring.
+Qed.
+Lemma growth_affine n g s x u : Forall (linear_beyond n) (equations g) ->
+  (1 + length (x ++ u))%nat = n -> affine (growth g s x u).
+Proof.
+  intros He Hn pre post a b l. unfold growth.
+  enough (E : form (P g s) (deviation g s x) (relative g s x u (pre ++ ((1 - l) * a + l * b) :: post))
+    = (1 - l) * form (P g s) (deviation g s x) (relative g s x u (pre ++ a :: post))
+      + l * form (P g s) (deviation g s x) (relative g s x u (pre ++ b :: post))).
+  { rewrite E. ring. }
+  rewrite <- form_affine.
+  - f_equal. unfold relative, field.
+    generalize (map (fun c => curve' (map val c) s) (nominal g)).
+    set (t := line s _ _). induction He as [|e es He Hes IH]; intros [|d ds]; cbn; auto.
+    f_equal; auto.
+    pose proof (rate_affine n e (t :: x ++ u) pre post a b l He ltac:(cbn; auto)) as A.
+    cbn [app] in A. rewrite <- !app_assoc in A. rewrite A. ring.
+  - unfold relative, field. generalize (map (fun c => curve' (map val c) s) (nominal g)).
+    clear. induction (equations g) as [|e es IH]; intros [|d ds]; cbn; auto.
+Qed.
+
+(* Pieces cover every place. *)
+Definition holds (p : piece) (s : R) : Prop :=
+  IZR (index p) <= s * IZR (2 ^ depth p) <= IZR (index p) + 1.
+Lemma reached_covers v m S : forall ps sofar, Forall (fun p => (0 <= depth p)%Z) ps ->
+  IZR sofar <= S <= IZR (reached v m sofar ps) -> (sofar < reached v m sofar ps)%Z ->
+  exists p, In p ps /\ vertex p = v /\ mode p = m /\ holds p (S / 65536).
+Proof.
+  induction ps as [|p ps IH]; intros sofar HD [H1 H2] Hlt; cbn [reached] in *; [lia|].
+  inversion HD as [|? ? Hd HD']; subst.
+  destruct (andb _ _) eqn:E.
+  - apply andb_prop in E as [E1 E2]. apply andb_prop in E1 as [Ev Em]. apply andb_prop in E2 as [E2 E3].
+    apply Nat.eqb_eq in Ev. apply Nat.eqb_eq in Em. apply Z.leb_le in E2, E3.
+    set (stop := ((index p + 1) * 2 ^ (16 - depth p))%Z) in *.
+    destruct (Rle_lt_dec S (IZR stop)) as [C|C].
+    + exists p. split; [now left|]. split; [auto|]. split; [auto|]. split.
+      * apply IZR_le in E3. rewrite mult_IZR in E3.
+        assert (T : IZR (2 ^ (16 - depth p)) * IZR (2 ^ depth p) = 65536).
+        { rewrite <- mult_IZR, <- Z.pow_add_r by lia.
+          replace (16 - depth p + depth p)%Z with 16%Z by lia. reflexivity. }
+        assert (0 < IZR (2 ^ (16 - depth p))) by (apply IZR_lt, Z.pow_pos_nonneg; lia).
+        apply (Rmult_le_reg_r (IZR (2 ^ (16 - depth p)))); auto.
+        replace (S / 65536 * IZR (2 ^ depth p) * IZR (2 ^ (16 - depth p))) with S; [lra|].
+        rewrite Rmult_assoc, (Rmult_comm (IZR (2 ^ depth p))), T. field.
+      * unfold stop in C. rewrite mult_IZR, plus_IZR in C.
+        assert (T : IZR (2 ^ (16 - depth p)) * IZR (2 ^ depth p) = 65536).
+        { rewrite <- mult_IZR, <- Z.pow_add_r by lia.
+          replace (16 - depth p + depth p)%Z with 16%Z by lia. reflexivity. }
+        assert (0 < IZR (2 ^ (16 - depth p))) by (apply IZR_lt, Z.pow_pos_nonneg; lia).
+        apply (Rmult_le_reg_r (IZR (2 ^ (16 - depth p)))); auto.
+        replace (S / 65536 * IZR (2 ^ depth p) * IZR (2 ^ (16 - depth p))) with S; [lra|].
+        rewrite Rmult_assoc, (Rmult_comm (IZR (2 ^ depth p))), T. field.
+    + destruct (Z.max_spec sofar stop) as [[X Y]|[X Y]]; rewrite Y in *.
+      * assert (Z : (stop < reached v m stop ps)%Z) by (apply lt_IZR; lra).
+        destruct (IH stop HD' ltac:(split; lra) Z) as [p' [Hin Hp]]. exists p'. split; [now right|auto].
+      * destruct (IH sofar HD' ltac:(split; lra) Hlt) as [p' [Hin Hp]]. exists p'. split; [now right|auto].
+  - destruct (IH sofar HD' ltac:(split; lra) Hlt) as [p' [Hin Hp]]. exists p'. split; [now right|auto].
+Qed.
+
+Lemma all_expanded_val r z rows l : 0 <= r <= 1 -> forall fs, all_expanded rows l = Some fs ->
+  exists ts, Forall2 (means r (env z)) fs ts /\ Forall (fun q => 0 <= q) ts.
+Proof.
+  intros Hr. induction l as [|[c sq] l IH]; cbn; intros fs.
+  - intros [= <-]. exists []. auto.
+  - destruct (expanded rows c sq) as [f|] eqn:E; [|discriminate].
+    destruct (all_expanded rows l) as [fs'|]; [|discriminate]. intros [= <-].
+    destruct (expanded_val r (env z) rows c sq f Hr E) as [t [Ht Hn]].
+    destruct (IH fs' eq_refl) as [ts [Hts Hns]]. exists (t :: ts). auto.
+Qed.
+Lemma dot_nonneg a : Forall (fun q => 0 <= q) a -> forall b, Forall (fun q => 0 <= q) b ->
+  0 <= dot a b.
+Proof.
+  induction 1 as [|x a Hx Ha IH]; intros b Hb; cbn; [lra|]. destruct Hb as [|y b Hy Hb]; [lra|].
+  pose proof (Rmult_le_pos _ _ Hx Hy). pose proof (IH b Hb). lra.
+Qed.
+
+(* mu at a place, and a bound on all of them that is continuous *)
+Definition mu_at (rows : list mono) (p : piece) (s : R) (z : list R) : R :=
+  pval (s * IZR (2 ^ depth p) - IZR (index p)) (env z) (Polynomials.num (fmu rows (mu p)))
+    / r (den (fmu rows (mu p))).
+Fixpoint mu_bound (rows : list mono) (ps : list piece) (s : R) (z : list R) : R :=
+  match ps with
+  | [] => 0
+  | p :: ps' => 1 + mu_at rows p s z * mu_at rows p s z + mu_bound rows ps' s z
+  end.
+Lemma mu_bound_nonneg rows ps s z : 0 <= mu_bound rows ps s z.
+Proof.
+  induction ps as [|p ps IH]; cbn; [lra|]. pose proof (Rle_0_sqr (mu_at rows p s z)).
+  unfold Rsqr in *. lra.
+Qed.
+Lemma mu_bound_above rows ps p s z : In p ps ->
+  - mu_at rows p s z <= mu_bound rows ps s z.
+Proof.
+  induction ps as [|q ps IH]; cbn; [tauto|]. intros [->|H].
+  - pose proof (mu_bound_nonneg rows ps s z). pose proof (Rle_0_sqr (mu_at rows p s z + 1)).
+    unfold Rsqr in *. nra.
+  - specialize (IH H). pose proof (Rle_0_sqr (mu_at rows q s z)). unfold Rsqr in *. lra.
+Qed.
+
+(* The heart: outside the funnel, W grows relative to rho by less than a bounded multiple of the
+   excess. *)
+Section Segment.
+Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
+Hypothesis Hlimits : Forall proper (limits d).
+Hypothesis Hmargin : 0 < val (margin w).
+Hypothesis Hok : segment_ok n d g = true.
+Hypothesis Hcov : covered d ps = true.
+Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
+
+Record facts : Prop := {
+  f_nominal : length (nominal g) = n;
+  f_equations : length (equations g) = n;
+  f_feed : length (feed g) = length (limits d);
+  f_gains : length (gains g) = length (limits d);
+  f_curves : Forall (fun c => (0 < length c <= 4)%nat) (nominal g);
+  f_time : begins g < ends g;
+  f_start : 0 < val (level (start g));
+  f_stop : 0 < val (level (stop g));
+  f_shapes : triangular n (shape (start g)) /\ triangular n (shape (stop g));
+  f_affine : Forall (linear_beyond (1 + n + length (limits d))) (equations g) }.
+Lemma triangle_ok_is {A : Type} k : forall M : list (list A), triangle_ok k M = true ->
+  triangular k M.
+Proof.
+  induction k as [|k IH]; intros [|row M]; cbn [triangle_ok triangular]; try discriminate; auto.
+  intros H. apply andb_prop in H as [H1 H2]. apply Nat.eqb_eq in H1. auto.
+Qed.
+Lemma segment_facts : facts.
+Proof.
+  unfold segment_ok in Hok.
+  apply andb_prop in Hok as [A B]. apply andb_prop in A as [A1 A2].
+  apply andb_prop in A1 as [A1 A3]. apply andb_prop in A2 as [A2 A4].
+  apply andb_prop in B as [B1 B2]. apply andb_prop in B1 as [B1 B3].
+  apply andb_prop in B3 as [B3 B6]. apply andb_prop in B6 as [B6 B7].
+  apply triangle_ok_is in B6, B7.
+  apply andb_prop in B2 as [B2 B4]. apply andb_prop in B2 as [B2 B5].
+  apply Nat.eqb_eq in A1, A2, A3, A4. apply num_ltb_lt in B3, B2, B5. rewrite val_zero in *.
+  constructor; auto.
+  - apply Forall_forall. intros c Hc. rewrite forallb_forall in B1. specialize (B1 c Hc).
+    apply andb_prop in B1 as [X Y]. apply Nat.ltb_lt in X. apply Nat.leb_le in Y. auto.
+  - apply Forall_forall. intros e He. rewrite forallb_forall in B4. specialize (B4 e He).
+    unfold linear_beyond. apply Forall_forall. intros t Ht. rewrite forallb_forall in B4.
+    specialize (B4 t Ht). apply Forall_forall. intros k Hk. rewrite forallb_forall in B4.
+    specialize (B4 k Hk). now apply Nat.leb_le in B4.
+Qed.
+
+Lemma rho_pos s : 0 <= s <= 1 -> 0 < rho g s.
+Proof.
+  intros Hs. destruct segment_facts. unfold rho, line.
+  destruct (Req_dec s 1) as [->|N]; [nra|].
+  pose proof (Rmult_lt_0_compat (1 - s) _ ltac:(lra) f_start0).
+  pose proof (Rmult_le_pos s (val (level (stop g))) ltac:(lra) ltac:(lra)). lra.
+Qed.
+
+Lemma piece_at v m s : 0 <= s <= 1 -> (v < length (vertices (box d)))%nat ->
+  (m < length (modes (limits d)))%nat ->
+  exists p, In p ps /\ vertex p = v /\ mode p = m /\ holds p s.
+Proof.
+  intros Hs Hv Hm. unfold covered in Hcov. rewrite forallb_forall in Hcov.
+  specialize (Hcov v ltac:(apply in_seq; lia)). rewrite forallb_forall in Hcov.
+  specialize (Hcov m ltac:(apply in_seq; lia)). apply Z.leb_le in Hcov.
+  destruct (reached_covers v m (s * 65536) ps 0) as [p Hp].
+  - apply Forall_forall. intros p Hp. rewrite forallb_forall in Hps. specialize (Hps p Hp).
+    unfold piece_ok in Hps. destruct (nth_error _ _); [|discriminate].
+    destruct (nth_error _ _); [|discriminate]. destruct (all_expanded _ _); [|discriminate].
+    apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _]. now apply Z.leb_le in X.
+  - apply IZR_le in Hcov. change (IZR (2 ^ 16)) with 65536 in Hcov. lra.
+  - change (2 ^ 16)%Z with 65536%Z in Hcov. lia.
+  - exists p. replace (s * 65536 / 65536) with s in Hp by field. exact Hp.
+Qed.
+
+Lemma growth_bounded s x w0 : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
+  let z := deviation g s x in
+  0 < form (P g s) z z - rho g s ->
+  growth g s x (input d g s x) w0
+    < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s).
+Proof.
+  intros Hs Hx Hw z Hgap. destruct segment_facts.
+  set (us := wanted g s z).
+  assert (Hus : length us = length (limits d)).
+  { unfold us, wanted. rewrite zip_length; congruence. }
+  destruct (mode_exists (limits d) Hlimits us Hus) as [m [Hm [Happ Hheld]]].
+  assert (Hin : input d g s x = applied (limits d) m us) by (unfold input; now rewrite Happ).
+  rewrite Hin.
+  assert (Lapp : length (applied (limits d) m us) = length (limits d)).
+  { rewrite Happ. rewrite zip_length; congruence. }
+  apply (below_on_box (box d)); auto.
+  { apply (growth_affine (1 + n + length (limits d))); auto. rewrite app_length, Lapp. lia. }
+  intros v Hv. apply In_nth_error in Hv as [iv Hiv]. apply In_nth_error in Hm as [im Him].
+  destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
+  { apply nth_error_Some. congruence. } { apply nth_error_Some. congruence. }
+  rewrite forallb_forall in Hps. specialize (Hps p Hp). unfold piece_ok in Hps.
+  rewrite Ev, Em, Hiv, Him in Hps.
+  destruct (all_expanded (sides w) (tau p)) as [taus|] eqn:Etau; [|discriminate].
+  apply andb_prop in Hps as [A B]. apply andb_prop in A as [A1 A2].
+  apply Z.leb_le in A1. apply r_pos in A2.
+  set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
+  assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
+  destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
+  assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (mu_at (multiplier w) p s z)).
+  { split; auto. unfold mu_at. fold r0. field. lra. }
+  pose proof (means_condition s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring) (margin w)
+    (limits d) m v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
+  pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hc) as Hpos.
+  unfold condition in Hpos. fold z in Hpos. fold us in Hpos.
+  pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
+  pose proof (rho_pos s Hs) as Hrho.
+  assert (Hdur : 0 < duration g) by (unfold duration; lra).
+  pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
+  pose proof (mu_bound_above (multiplier w) ps p s z Hp) as Hab.
+  pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hgap) Hab) as Hab'.
+  nra.
+Qed.
+End Segment.
+End Funnel.

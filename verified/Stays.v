@@ -1,0 +1,408 @@
+(* The theorem: what is inside a checked funnel stays inside. *)
+From Coq Require Import ZArith Reals List Lra Lia.
+From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition Funnel.
+Import ListNotations.
+Open Scope R_scope.
+
+Section Stays.
+Context {K : Ints}.
+
+(* Continuity of polynomials along continuous functions. *)
+Lemma c_plus f g t : continuity_pt f t -> continuity_pt g t -> continuity_pt (fun u => f u + g u) t.
+Proof. apply continuity_pt_plus. Qed.
+Lemma c_mult f g t : continuity_pt f t -> continuity_pt g t -> continuity_pt (fun u => f u * g u) t.
+Proof. apply continuity_pt_mult. Qed.
+Lemma c_const c t : continuity_pt (fun _ => c) t.
+Proof. apply continuity_pt_const. intros a b. reflexivity. Qed.
+Lemma c_minus f g t : continuity_pt f t -> continuity_pt g t -> continuity_pt (fun u => f u - g u) t.
+Proof. apply continuity_pt_minus. Qed.
+Lemma c_power f k t : continuity_pt f t -> continuity_pt (fun u => f u ^ k) t.
+Proof.
+  intros H. induction k as [|k IH]; cbn [pow]; [apply c_const|]. now apply (c_mult f).
+Qed.
+Lemma c_bval S t a : continuity_pt S t -> continuity_pt (fun u => bval (S u) a) t.
+Proof.
+  intros H. induction a as [|y a IH]; cbn [bval]; [apply c_const|].
+  apply (c_plus (fun u => r y * (1 - S u) ^ length a) (fun u => S u * bval (S u) a)).
+  - apply (c_mult (fun _ => r y)); [apply c_const|].
+    apply (c_power (fun u => 1 - S u)). apply (c_minus (fun _ => 1)); auto. apply c_const.
+  - now apply (c_mult S).
+Qed.
+Lemma c_mval X t m : (forall i, continuity_pt (fun u => X u i) t) ->
+  continuity_pt (fun u => mval (X u) m) t.
+Proof.
+  intros H. induction m as [|i m IH]; cbn [mval]; [apply c_const|].
+  now apply (c_mult (fun u => X u i)).
+Qed.
+Lemma c_pval S X t p : continuity_pt S t -> (forall i, continuity_pt (fun u => X u i) t) ->
+  continuity_pt (fun u => pval (S u) (X u) p) t.
+Proof.
+  intros HS HX. induction p as [|[m a] p IH]; cbn [pval]; [apply c_const|].
+  apply (c_plus (fun u => bval (S u) a * mval (X u) m)); auto.
+  apply (c_mult (fun u => bval (S u) a)); [now apply c_bval|now apply c_mval].
+Qed.
+
+Section Segment.
+Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
+Hypothesis Hlimits : Forall proper (limits d).
+Hypothesis Hmargin : 0 < val (margin w).
+Hypothesis Hok : segment_ok n d g = true.
+Hypothesis Hcov : covered d ps = true.
+Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
+Let F := segment_facts d g n Hok.
+
+Variable x : list (R -> R).
+Hypothesis Hx : length x = n.
+Hypothesis Cx : forall t, begins g <= t <= ends g -> Forall (fun f => continuity_pt f t) x.
+Hypothesis Dx : forall t, begins g < t < ends g -> exists w, in_box w (box d) /\
+  Forall2 (fun f v => derivable_pt_lim f t v) x
+    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w).
+
+Definition dev (t : R) : list R := deviation g (place g t) (at_time x t).
+Definition gap (t : R) : R := form (P g (place g t)) (dev t) (dev t) - rho g (place g t).
+
+Lemma duration_pos : 0 < duration g.
+Proof. destruct F. unfold duration. lra. Qed.
+Lemma d_place t : derivable_pt_lim (place g) t (/ duration g).
+Proof.
+  pose proof duration_pos. unfold place.
+  apply (limit_same (fun u => (u - begins g) * / duration g)); [reflexivity|].
+  eapply limit_equal; [derive|]. cbn. ring.
+Qed.
+Lemma place_in t : begins g <= t <= ends g -> 0 <= place g t <= 1.
+Proof.
+  intros Ht. pose proof duration_pos as D. unfold place. split.
+  - apply Rmult_le_pos; [lra|]. left. now apply Rinv_0_lt_compat.
+  - apply (Rmult_le_reg_r (duration g)); auto. unfold Rdiv. rewrite Rmult_assoc, Rinv_l by lra.
+    unfold duration. lra.
+Qed.
+Lemma line_place t : line (place g t) (time (start g)) (time (stop g)) = t.
+Proof.
+  pose proof duration_pos as D. unfold line, place, duration, begins, ends in *. field. lra.
+Qed.
+Lemma d_along c t : (length c <= 4)%nat ->
+  derivable_pt_lim (fun u => along (place g u) c) t
+    (curve' (map val c) (place g t) * / duration g).
+Proof.
+  intros H. apply (derivable_pt_lim_comp (place g) (curve (map val c))); [apply d_place|].
+  apply d_curve. now rewrite map_length.
+Qed.
+Lemma place_continuous t : continuity_pt (place g) t.
+Proof. eapply d_continuous, d_place. Qed.
+
+Lemma at_time_length t : length (at_time x t) = n.
+Proof. unfold at_time. now rewrite map_length. Qed.
+Lemma dev_length t : length (dev t) = n.
+Proof.
+  destruct F. unfold dev, deviation. rewrite zip_length; rewrite ?map_length, at_time_length; auto.
+Qed.
+Lemma dev_continuous t : begins g <= t <= ends g -> forall i, continuity_pt (fun u => env (dev u) i) t.
+Proof.
+  intros Ht i. unfold env, dev, deviation. pose proof (Cx t Ht) as C.
+  destruct F as [_ _ _ _ Hcv _ _ _ _ _].
+  assert (DA : forall c, (0 < length c <= 4)%nat ->
+    continuity_pt (fun u => along (place g u) c) t).
+  { intros c Hc. eapply d_continuous, d_along. lia. }
+  clear - C Hcv DA. revert C Hcv. generalize (nominal g).
+  generalize (pred (Pos.to_nat i)). induction x as [|f fs IH]; intros k cs C Hc.
+  { apply (continuous_same (fun _ => 0)); [|apply c_const]. now destruct k. }
+  destruct cs as [|c cs].
+  { apply (continuous_same (fun _ => 0)); [|apply c_const]. now destruct k. }
+  inversion C; inversion Hc; subst. destruct k as [|k]; cbn [at_time map zip nth].
+  - apply (c_minus f (fun u => along (place g u) c)); auto.
+  - apply IH; auto.
+Qed.
+
+Lemma d_dev t : begins g < t < ends g -> forall w0,
+  Forall2 (fun f v => derivable_pt_lim f t v) x
+    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w0) ->
+  slopes dev t (map (fun v => v * / duration g)
+    (relative g (place g t) (at_time x t) (input d g (place g t) (at_time x t)) w0)).
+Proof.
+  intros Ht w0 Hd. unfold relative. rewrite line_place.
+  set (vs := field g t _ _ _) in *. clearbody vs. destruct F as [_ _ _ _ Hcv _ _ _ _ _].
+  exists (zip (fun f c u => f u - along (place g u) c) x (nominal g)). split.
+  - intros u. unfold dev, deviation. generalize (nominal g).
+    clear. induction x as [|f fs IH]; intros [|c cs]; cbn; auto. f_equal. apply IH.
+  - pose proof duration_pos as D.
+    assert (DA : forall c, (0 < length c <= 4)%nat ->
+      derivable_pt_lim (fun u => along (place g u) c) t
+        (curve' (map val c) (place g t) * / duration g)) by (intros; apply d_along; lia).
+    clear - Hd Hcv D DA. revert Hcv. generalize (nominal g).
+    induction Hd as [|f v fs vs Hf Hfs IH]; intros [|c cs] Hc; cbn; constructor; inversion Hc; subst.
+    + eapply limit_equal.
+      { apply (d_minus f (fun u => along (place g u) c)); [exact Hf|]. now apply DA. }
+      field. lra.
+    + now apply IH.
+Qed.
+Lemma d_P t : slopes2 (fun u => P g (place g u)) t (map (map (fun v => v * / duration g)) (P' g)).
+Proof.
+  exists (zip (zip (fun a b u => line (place g u) a b)) (shape (start g)) (shape (stop g))). split.
+  - intros u. unfold P. generalize (shape (start g)) (shape (stop g)).
+    clear. induction l as [|row l IH]; intros [|row' l']; cbn; auto. f_equal; auto.
+    revert row'. induction row as [|a row IHr]; intros [|b row']; cbn; auto. f_equal. apply IHr.
+  - unfold P'. generalize (shape (start g)) (shape (stop g)).
+    assert (D : forall a b, derivable_pt_lim (fun u => line (place g u) a b) t
+      ((val b - val a) * / duration g)).
+    { intros a b. unfold line. eapply limit_equal.
+      { apply (d_plus (fun u => (1 - place g u) * val a) (fun u => place g u * val b)).
+        - apply (d_mult (fun u => 1 - place g u) (fun _ => val a)); [|apply d_const].
+          apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
+        - apply (d_mult (place g) (fun _ => val b)); [apply d_place|apply d_const]. }
+      cbn. ring. }
+    clear - D. induction l as [|row l IH]; intros [|row' l']; cbn; constructor; auto.
+    revert row'. induction row as [|a row IHr]; intros [|b row']; cbn; constructor; auto.
+Qed.
+Lemma dot_scaled c a : forall b, dot (map (fun v => v * c) a) b = dot a b * c.
+Proof. induction a as [|y a IH]; intros [|z b]; cbn; try ring. rewrite IH. ring. Qed.
+Lemma form_scaled c M : forall y z, form (map (map (fun v => v * c)) M) y z = form M y z * c.
+Proof.
+  induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
+  rewrite IH, !dot_scaled. ring.
+Qed.
+Lemma dot_scaled_r c a : forall b, dot a (map (fun v => v * c) b) = dot a b * c.
+Proof. induction a as [|y a IH]; intros [|z b]; cbn; try ring. rewrite IH. ring. Qed.
+Lemma form_scaled_r c M : forall y z, form M y (map (fun v => v * c) z) = form M y z * c.
+Proof.
+  induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
+  rewrite IH, !dot_scaled_r. ring.
+Qed.
+Lemma d_gap t : begins g < t < ends g -> forall w0,
+  Forall2 (fun f v => derivable_pt_lim f t v) x
+    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w0) ->
+  derivable_pt_lim gap t
+    (growth g (place g t) (at_time x t) (input d g (place g t) (at_time x t)) w0 * / duration g).
+Proof.
+  intros Ht w0 Hd. pose proof (d_dev t Ht w0 Hd) as Hdev.
+  pose proof (d_form _ _ _ _ _ _ _ (d_P t) Hdev Hdev) as D.
+  eapply limit_equal.
+  { unfold gap. apply (d_minus (fun u => form (P g (place g u)) (dev u) (dev u))
+      (fun u => rho g (place g u))); [exact D|].
+    unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
+      (fun u => place g u * val (level (stop g)))).
+    - apply (d_mult (fun u => 1 - place g u) (fun _ => val (level (start g)))); [|apply d_const].
+      apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
+    - apply (d_mult (place g) (fun _ => val (level (stop g)))); [apply d_place|apply d_const]. }
+  rewrite form_scaled, form_scaled_r. rewrite (form_symmetric _ (map _ _)), form_scaled_r.
+  unfold growth, rho'. fold (dev t). ring.
+Qed.
+
+Lemma means_gap : exists p, forall t,
+  means (place g t) (env (dev t)) p (gap t).
+Proof.
+  set (B := fbernstein (fplace 0 0) (fremaining 0 0)).
+  exists (fsub (fform (fshape B g) (fdeviation g) (fdeviation g)) (flevel B g)).
+  intros t. destruct F.
+  assert (Hs : place g t * IZR (2 ^ 0) = IZR 0 + place g t) by (cbn; ring).
+  assert (Hl : length (at_time x t) = length (nominal g)) by (rewrite at_time_length; congruence).
+  apply means_sub.
+  - apply means_fform.
+    + apply (means_shape (place g t) (place g t) (dev t) 0 0); auto. lia.
+    + now apply (means_deviation (place g t) (place g t) (dev t) g (at_time x t)).
+    + now apply (means_deviation (place g t) (place g t) (dev t) g (at_time x t)).
+  - apply (means_level (place g t) (place g t) (dev t) 0 0); auto. lia.
+Qed.
+Lemma gap_continuous t : begins g <= t <= ends g -> continuity_pt gap t.
+Proof.
+  intros Ht. destruct means_gap as [p Hp].
+  apply (continuous_same (fun u => pval (place g u) (env (dev u)) (Polynomials.num p) * / r (den p))).
+  { intros u. destruct (Hp u) as [D V]. rewrite V. field. lra. }
+  apply (c_mult (fun u => pval (place g u) (env (dev u)) (Polynomials.num p))); [|apply c_const].
+  apply c_pval; [apply place_continuous|now apply dev_continuous].
+Qed.
+Lemma bound_continuous t : begins g <= t <= ends g ->
+  continuity_pt (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g) t.
+Proof.
+  intros Ht. apply (c_mult (fun u => mu_bound (multiplier w) ps (place g u) (dev u)));
+    [|apply c_const].
+  clear Hcov Hps. induction ps as [|p l IH]; cbn [mu_bound]; [apply c_const|].
+  assert (C : continuity_pt (fun u => mu_at (multiplier w) p (place g u) (dev u)) t).
+  { unfold mu_at. apply (c_mult (fun u => pval (place g u * IZR (2 ^ depth p) - IZR (index p))
+      (env (dev u)) (Polynomials.num (fmu (multiplier w) (mu p))))); [|apply c_const].
+    apply (c_pval (fun u => place g u * IZR (2 ^ depth p) - IZR (index p)) (fun u => env (dev u)));
+      [|now apply dev_continuous].
+    apply (c_minus (fun u => place g u * IZR (2 ^ depth p)) (fun _ => IZR (index p)));
+      [|apply c_const].
+    apply (c_mult (place g)); [apply place_continuous|apply c_const]. }
+  apply (c_plus (fun u => 1 + mu_at (multiplier w) p (place g u) (dev u)
+    * mu_at (multiplier w) p (place g u) (dev u))); auto.
+  apply (c_plus (fun _ => 1)); [apply c_const|].
+  now apply (c_mult (fun u => mu_at (multiplier w) p (place g u) (dev u))).
+Qed.
+
+Lemma segment_stays ta t : begins g <= ta -> ta <= t <= ends g ->
+  inside_segment g x ta -> inside_segment g x t.
+Proof.
+  intros Ha Ht H. assert (G : gap t <= 0); [|unfold gap, dev in G; unfold inside_segment; lra].
+  apply (barrier gap (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g)
+    ta (ends g)); auto.
+  - intros u Hu. apply gap_continuous. lra.
+  - intros u Hu. apply bound_continuous. lra.
+  - intros u Hu. destruct (Dx u ltac:(lra)) as [w0 [Hw Hd]].
+    eexists. split; [apply (d_gap u ltac:(lra) w0 Hd)|]. intros Hpos.
+    pose proof (growth_bounded d w g ps n Hlimits Hmargin Hok Hcov Hps (place g u) (at_time x u) w0
+      (place_in u ltac:(lra)) (at_time_length u) Hw Hpos) as B.
+    pose proof (Rinv_0_lt_compat _ duration_pos) as D.
+    apply (Rmult_lt_compat_r _ _ _ D) in B. unfold gap. fold (dev u) in B. nra.
+  - unfold gap, dev. unfold inside_segment in H. lra.
+Qed.
+End Segment.
+
+(* Segments joined. *)
+Definition member_stays (x : list (R -> R)) (g : segment) : Prop :=
+  forall ta t, begins g <= ta -> ta <= t <= ends g -> inside_segment g x ta -> inside_segment g x t.
+Lemma place_start g : place g (begins g) = 0.
+Proof. unfold place. unfold Rdiv. ring. Qed.
+Lemma place_end g : begins g < ends g -> place g (ends g) = 1.
+Proof. intros H. unfold place, duration. field. lra. Qed.
+Lemma along_ends c : (0 < length c <= 4)%nat ->
+  along 0 c = val (first_of c) /\ along 1 c = val (last_of c).
+Proof.
+  intros H. unfold along, curve, first_of, last_of. rewrite map_length.
+  destruct c as [|c0 [|c1 [|c2 [|c3 [|c4 c]]]]]; cbn in H; try lia; cbn; split; ring.
+Qed.
+Lemma zip_line_row s A B : (forall a b, line s a b = val b) -> length A = length B ->
+  zip (line s) A B = map val B.
+Proof.
+  intros H. revert B. induction A as [|a A IH]; intros [|b B] L; try discriminate; cbn; auto.
+  rewrite H, IH; auto.
+Qed.
+Lemma zip_line k s : (forall a b, line s a b = val b) -> forall A B,
+  triangular k A -> triangular k B -> zip (zip (line s)) A B = map (map val) B.
+Proof.
+  intros H. induction k as [|k IH]; intros [|a A] [|b B] HA HB; cbn [triangular] in *; try tauto.
+  destruct HA as [LA HA], HB as [LB HB]. cbn. rewrite IH by auto. f_equal.
+  apply zip_line_row; auto. congruence.
+Qed.
+Lemma zip_line_row_left s A B : (forall a b, line s a b = val a) -> length A = length B ->
+  zip (line s) A B = map val A.
+Proof.
+  intros H. revert B. induction A as [|a A IH]; intros [|b B] L; try discriminate; cbn; auto.
+  rewrite H, IH; auto.
+Qed.
+Lemma zip_line_left k s : (forall a b, line s a b = val a) -> forall A B,
+  triangular k A -> triangular k B -> zip (zip (line s)) A B = map (map val) A.
+Proof.
+  intros H. induction k as [|k IH]; intros [|a A] [|b B] HA HB; cbn [triangular] in *; try tauto.
+  destruct HA as [LA HA], HB as [LB HB]. cbn. rewrite IH by auto. f_equal.
+  apply zip_line_row_left; auto. congruence.
+Qed.
+Lemma line_0 a b : line 0 a b = val a.
+Proof. unfold line. ring. Qed.
+Lemma line_1 a b : line 1 a b = val b.
+Proof. unfold line. ring. Qed.
+Lemma linked_inside n d g g' x : segment_ok n d g = true -> segment_ok n d g' = true ->
+  stop g = start g' -> map last_of (nominal g) = map first_of (nominal g') ->
+  inside_segment g x (ends g) -> inside_segment g' x (ends g).
+Proof.
+  intros H H' Hk Hn. destruct (segment_facts d g n H) as [_ _ _ _ C T _ _ [_ S] _].
+  destruct (segment_facts d g' n H') as [_ _ _ _ C' T' _ _ [S' S''] _].
+  assert (E : ends g = begins g') by (unfold ends, begins; now rewrite Hk).
+  destruct (segment_facts d g n H) as [_ _ _ _ _ _ _ _ [S0 _] _].
+  unfold inside_segment. rewrite (place_end g T).
+  replace (place g' (ends g)) with 0 by (rewrite E; symmetry; apply place_start).
+  assert (Dev : deviation g 1 (at_time x (ends g)) = deviation g' 0 (at_time x (ends g))).
+  { unfold deviation. f_equal.
+    transitivity (map val (map last_of (nominal g))).
+    - rewrite map_map. apply map_ext_in. intros c Hc. rewrite Forall_forall in C.
+      now destruct (along_ends c (C c Hc)).
+    - rewrite Hn, map_map. apply map_ext_in. intros c Hc. rewrite Forall_forall in C'.
+      symmetry. now destruct (along_ends c (C' c Hc)). }
+  rewrite Dev. unfold P, rho. rewrite line_0, line_1.
+  rewrite (zip_line n 1 line_1 _ _ S0 S), (zip_line_left n 0 line_0 _ _ S' S''), Hk. auto.
+Qed.
+
+Lemma chain n d x gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
+  Forall (member_stays x) gs ->
+  forall g0, In g0 gs ->
+  forall ta t, (match gs with g :: _ => begins g | [] => ta end) <= ta <= t ->
+  (forall g, In g gs -> begins g <= ta <= ends g -> inside_segment g x ta) ->
+  begins g0 <= t <= ends g0 -> inside_segment g0 x t.
+Proof.
+  induction gs as [|g gs IH]; intros Hok Hl Hs g0 H0 ta t Ht Hin Hg0; [destruct H0|].
+  inversion Hok as [|? ? Hok1 Hok2]; subst. inversion Hs as [|? ? Hs1 Hs2]; subst.
+  destruct H0 as [<-|H0].
+  { apply (Hs1 ta t); try lra. apply Hin; [now left|]. lra. }
+  destruct gs as [|g' gs]; [destruct H0|].
+  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk Hn].
+  apply knot_eqb_eq in Hk. apply (list_eqb_eq _ num_eqb_eq) in Hn.
+  assert (E : ends g = begins g') by (unfold ends, begins; now rewrite Hk).
+  (* segments follow each other *)
+  assert (Order : forall gs g, linked (g :: gs) = true ->
+    Forall (fun g => segment_ok n d g = true) (g :: gs) ->
+    forall h, In h gs -> ends g <= begins h).
+  { clear. induction gs as [|g1 gs IH]; intros g Hl Hok h Hh; [destruct Hh|].
+    cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk _].
+    apply knot_eqb_eq in Hk. inversion Hok as [|? ? H1 H2]; subst.
+    inversion H2 as [|? ? H3 H4]; subst.
+    assert (E : ends g = begins g1) by (unfold ends, begins; now rewrite Hk).
+    destruct Hh as [<-|Hh]; [lra|]. destruct (segment_facts d g1 n H3).
+    specialize (IH g1 Hl2 H2 h Hh). lra. }
+  assert (Hb : begins g' <= begins g0).
+  { destruct H0 as [<-|H0]; [lra|]. pose proof (Order gs g' Hl2 Hok2 g0 H0).
+    inversion Hok2; subst. destruct (segment_facts d g' n); auto. lra. }
+  destruct (Rle_lt_dec (begins g') ta) as [C|C].
+  - apply (IH Hok2 Hl2 Hs2 g0 H0 ta t); auto; try lra. intros h Hh. apply Hin. now right.
+  - apply (IH Hok2 Hl2 Hs2 g0 H0 (begins g') t); auto; try lra.
+    intros h Hh Hr. destruct Hh as [<-|Hh].
+    + rewrite <- E. apply (linked_inside n d g g' x); auto.
+      { now inversion Hok2. }
+      apply (Hs1 ta (ends g)); try lra. apply Hin; [now left|]. lra.
+    + exfalso. pose proof (Order gs g' Hl2 Hok2 h Hh). inversion Hok2; subst.
+      destruct (segment_facts d g' n); auto. lra.
+Qed.
+
+Lemma last_end gs g : In g gs -> linked gs = true ->
+  Forall (fun g => begins g < ends g) gs -> begins (hd g gs) <= begins g /\ ends g <= last (map ends gs) 0.
+Proof.
+  revert g. induction gs as [|g1 gs IH]; intros g Hin Hl Ht; [destruct Hin|].
+  inversion Ht as [|? ? T1 T2]; subst. destruct gs as [|g2 gs].
+  { destruct Hin as [<-|[]]. cbn. lra. }
+  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk _].
+  apply knot_eqb_eq in Hk.
+  assert (E : ends g1 = begins g2) by (unfold ends, begins; now rewrite Hk).
+  change (last (map ends (g1 :: g2 :: gs)) 0) with (last (map ends (g2 :: gs)) 0). cbn [hd].
+  destruct (IH g2 (or_introl eq_refl) Hl2 T2) as [_ A]. inversion T2; subst.
+  destruct Hin as [<-|Hin]; [lra|]. destruct (IH g Hin Hl2 T2) as [B C]. cbn [hd] in B. lra.
+Qed.
+
+Theorem stays d w : check d w = true -> forall x, solution d x ->
+  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+Proof.
+  intros H x [Cx Dx] ta t Ha Ht Hin. unfold check in H.
+  set (n := match segments d with [] => O | g :: _ => length (nominal g) end) in *.
+  apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [H1 H3].
+  apply andb_prop in H1 as [Hm Hl]. apply andb_prop in H2 as [Hlen H2].
+  apply Nat.eqb_eq in Hlen. apply num_ltb_lt in Hm. rewrite val_zero in Hm.
+  assert (Hlim : Forall proper (limits d)).
+  { apply Forall_forall. intros l Hin'. rewrite forallb_forall in H3. specialize (H3 l Hin').
+    destruct l as [[a b]|]; cbn; auto. now apply num_ltb_lt. }
+  assert (Each : forall g, In g (segments d) -> exists ps, segment_ok n d g = true /\
+    covered d ps = true /\ forallb (piece_ok d w (products (basis w)) g) ps = true).
+  { intros g Hg. rewrite forallb_forall in H2.
+    assert (G : exists ps, In (g, ps) (combine (segments d) (pieces w))).
+    { clear - Hg Hlen. revert Hg Hlen. generalize (pieces w).
+      induction (segments d) as [|g1 gs IH]; intros [|p ps] Hg Hlen; cbn in *; try tauto;
+        try discriminate. destruct Hg as [->|Hg]; [eauto|]. destruct (IH ps Hg) as [q Hq]; eauto. }
+    destruct G as [ps G]. specialize (H2 _ G). cbn [fst snd] in H2.
+    apply andb_prop in H2 as [A B]. apply andb_prop in A as [A1 A2]. eauto. }
+  assert (Hok : Forall (fun g => segment_ok n d g = true) (segments d)).
+  { apply Forall_forall. intros g Hg. destruct (Each g Hg) as [ps [A _]]. exact A. }
+  assert (Times : Forall (fun g => begins g < ends g) (segments d)).
+  { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
+  assert (Range : forall g, In g (segments d) -> begin d <= begins g /\ ends g <= finish d).
+  { intros g Hg. destruct (last_end (segments d) g Hg Hl Times) as [A B]. split; auto.
+    unfold begin. destruct (segments d); [destruct Hg|]. exact A. }
+  intros g Hg Hgt. apply (chain n d x (segments d) Hok Hl) with (ta := ta); auto.
+  2:{ unfold begin in Ha. destruct (segments d); lra. }
+  apply Forall_forall. intros h Hh. destruct (Each h Hh) as [ps [A [B C]]].
+  destruct (Range h Hh) as [R1 R2].
+  assert (Hx : length x = n).
+  { pose proof (segment_facts d h n A) as [_ E _ _ _ T _ _ _ _].
+    destruct (Dx h ((begins h + ends h) / 2) Hh ltac:(lra)) as [w0 [_ F]].
+    apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence. }
+  intros ta' t' Ha' Ht' Hin'.
+  apply (segment_stays d w h ps n Hlim Hm A B C x Hx) with (ta := ta'); auto.
+  intros u Hu. apply Cx. lra.
+Qed.
+End Stays.
