@@ -69,6 +69,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "kernel": Benchmark("kernel"),
         "lstep": Benchmark("lstep"),
         "monitor": Benchmark("monitor"),
+        "nonlinear": Benchmark("nonlinear", data="."),
         "one_dimensional": Benchmark("one_dimensional"),
         "quadrotor": Benchmark("quadrotor"),
         "recorder": Benchmark("recorder"),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
@@ -17,7 +18,6 @@ from nlsid_core.identification.certified_descent import Outputs, Step, descend
 from nlsid_core.identification.implicit_class import ImplicitRows, delayed_states
 from nlsid_core.identification.implicit_proof import ImplicitProof
 from nlsid_core.identification.implicit_search import (
-    coefficients,
     indeterminates_of,
     kept_in_set,
     left_coefficients,
@@ -97,25 +97,46 @@ class ImplicitSet:
         return float(np.sum((solved[0] - self.rollout.measured) ** 2))
 
     def inside(self, step: Step) -> FloatArray:
-        """θ of the step's program, a sum of squares for every inequality of the set."""
-        rows = self.rows
-        n_v, (bound,) = len(rows.y_scale[0]), variables("bound")
+        """θ of the step's program, a sum of squares for every inequality of the set.
+
+        Terms of f in the inputs alone are in no inequality: they are eliminated from the program.
+        """
+        rows, (bound,) = self.rows, variables("bound")
+        n_v, n_e = len(rows.y_scale[0]), len(rows.left)
         e, f = unknowns(rows)
         S = np.array([[constant(MONOTONE * (i == j)) for j in range(n_v)] for i in range(n_v)])
         columns = []
         for i in range(n_v):
             right = variables([f"f{i}[{k}]" for k in range(len(rows.right))])
             columns.append([*left_coefficients(rows, i, n_v), *right])
-        u = step.D * (np.array(columns, dtype=object).T.ravel() - step.theta)
+        names = np.array(columns, dtype=object).T.ravel()
+        bound_terms = np.concatenate([np.ones(n_e, bool), rows.right[:, : rows.states].any(axis=1)])
+        kept = np.repeat(bound_terms, n_v)
         along = step.D * step.theta / np.linalg.norm(step.D * step.theta)
-        across = np.sqrt(step.damping) * (np.eye(u.size) - (1.0 - FREE) * np.outer(along, along))
-        entries = np.concatenate([step.R @ u + step.r, across @ u])
+        across = np.sqrt(step.damping) * (
+            np.eye(len(step.D)) - (1.0 - FREE) * np.outer(along, along)
+        )
+        everything = np.concatenate([step.R, across])
+        right_side = np.concatenate([step.r, np.zeros(len(across))])
+        first = int((~kept).sum())
+        factor: FloatArray = np.asarray(
+            np.linalg.qr(
+                np.column_stack([everything[:, ~kept], everything[:, kept], right_side]), mode="r"
+            )
+        )
+        u = step.D[kept] * (names[kept] - step.theta[kept])
+        entries = factor[first:, first:-1] @ u + factor[first:, -1]
         program = Program(
             indeterminates_of(rows.names),
             (*set_constraints(rows, e, f, S, self.slowest), NormBound(tuple(entries), bound)),
             minimise=bound,
         )
-        return np.concatenate(coefficients(solve(program), rows)).ravel()
+        found, theta = solve(program), step.theta.copy()
+        theta[kept] = [float(found.value(name)) for name in names[kept]]
+        moved = step.D[kept] * (theta[kept] - step.theta[kept])
+        left = factor[:first, -1] + factor[:first, first:-1] @ moved
+        theta[~kept] -= solve_triangular(factor[:first, :first], left) / step.D[~kept]
+        return theta
 
 
 def minimise_certified_implicit(

@@ -5,11 +5,15 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.__main__ import BENCHMARKS, Benchmark, measured
 from benchmarks.bag_reading import generated_bag
 from benchmarks.machine import peers
+from benchmarks.nonlinear import PublicSet
+from benchmarks.subspace import n4sid
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from tests.house.sources import ROOT, sources
 
 
@@ -45,3 +49,31 @@ def test_a_benchmark_without_its_recordings_is_named_and_leaves_no_file(tmp_path
     assert done.returncode == 1
     assert "no result: heat_exchanger: needs --data with the folder exchanger" in done.stdout
     assert not list(tmp_path.iterdir())
+
+
+def test_n4sid_finds_a_known_linear_system_of_two_outputs() -> None:
+    A, B = np.array([[0.9, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.5]])
+    C = np.array([[1.0, 0.0], [20.0, 5.0]])
+    rng = np.random.default_rng(0)
+    trials = []
+    for k in range(2):
+        u, x = rng.uniform(-1.0, 1.0, (400, 1)), np.zeros((400, 2))
+        for t in range(1, 400):
+            x[t] = A @ x[t - 1] + B @ u[t - 1]
+        trials.append(Trajectory(t=0.1 * np.arange(400), y=x @ C.T, u=u, name=f"trial {k}"))
+    model = n4sid(Dataset(tuple(trials[:1])), 2)
+    assert np.sort_complex(np.linalg.eigvals(model.A)) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(A)), abs=1e-3
+    )
+    error = model.simulate(trials[1]) - trials[1].y
+    assert np.abs(error).max() < 0.01 * np.std(trials[1].y)
+
+
+def test_the_score_of_a_public_set_is_the_rms_of_what_it_says() -> None:
+    t = np.arange(5.0)
+    data = Dataset((Trajectory(t=t, y=np.array([0.0, 2.0, 2.0, 2.0, 2.0]), u=t),))
+    outputs = [np.array([[9.0], [1.0], [3.0], [1.0], [3.0]])]
+    plain = PublicSet("p", ".", lambda _: (data, data, data), "mV", {}, factor=1e3)
+    assert plain.score(outputs, data, skipped=1) == pytest.approx(1e3)
+    summed = PublicSet("s", ".", lambda _: (data, data, data), "m", {}, integrated=True)
+    assert summed.score(outputs, data, skipped=1) == pytest.approx(np.sqrt(0.5)), "-1, 0, -1, 0"

@@ -231,7 +231,7 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "reason"),
     [
-        ("linear", lambda c: c.funnel.update(kind="linear"), "expected 'tube'"),
+        ("linear", lambda c: c.funnel.update(kind="linear"), "is now a tube: run"),
         ("linear", lambda c: c.funnel.update(tubes=[]), "list of 1 to 8"),
         ("linear", lambda c: c.funnel.update(box={"y": [], "u": []}), "needs no box"),
         ("linear", lambda c: c.funnel.update(settling=-1), "whole number from 0"),

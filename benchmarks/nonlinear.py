@@ -1,0 +1,360 @@
+"""Public data sets: the best proved model of all classes, beside comparators and published figures.
+
+python -m benchmarks.nonlinear --data DIR [--json] [NAME ...]
+
+DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. One ladder of classes
+and methods serves every set, those for one input and output where a set has one of each. What is
+best is chosen by the simulation error on validation data among the models with a proof, fitted
+again to training and validation data together, and then simulated once over the test data.
+Trials are as the owners divide them; where they name no validation data it is the end, or every
+third, of the training data. Comparators are chosen in the same way. On sets of more than
+`SAMPLES` training samples the choice is made on that many, and fitted to all.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.io import loadmat
+
+from bags.samples import convert_dart
+from benchmarks.arms import kuka, schunk
+from benchmarks.machine import describe
+from benchmarks.recorded import heat_exchanger, single, wiener_hammerstein
+from benchmarks.subspace import n4sid
+from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import NlsidError
+from nlsid_core.identification import (
+    BlockCascadeClass,
+    CertifiedSem,
+    Fit,
+    ImplicitClass,
+    LeastSquares,
+    LinearClass,
+    Method,
+    MonotoneClass,
+    Rse,
+    Sem,
+    StateAffineClass,
+    identify,
+)
+from nlsid_core.identification.prediction import simulate_trials
+
+SAMPLES = 10_000
+STEPS = 15  # of an iterated search
+ORDERS = (2, 4)
+PERCENT = "%"
+
+
+@dataclass(frozen=True, eq=False)
+class PublicSet:
+    """How one set is divided and scored.
+
+    unit: of the score, the root mean square over all outputs and scored samples; "%" is that of
+    the test outputs' spread. skipped: samples at the start of each trial that are not scored.
+    published: figures with their sources. integrated: the score is of the sum of the output times
+    the sample time, from the measured start. factor: from the output's unit to the score's.
+    """
+
+    name: str
+    folder: str
+    load: Callable[[Path], tuple[Dataset, Dataset, Dataset]]
+    unit: str
+    published: dict[str, float]
+    skipped: int = 0
+    integrated: bool = False
+    factor: float = 1.0
+
+    def score(self, outputs: Sequence[FloatArray], data: Dataset, *, skipped: int) -> float:
+        """The error of simulated outputs (N, n_y), the first `skipped` samples left out."""
+        left, measured = [], []
+        for trial, simulated in zip(data, outputs, strict=True):
+            error = simulated - trial.y
+            if self.integrated:
+                error = np.cumsum(np.where(np.arange(len(error)) >= skipped, error[:, 0], 0.0))
+                error = data.period * error[:, None]
+            left.append(error[skipped:])
+            measured.append(trial.y[skipped:])
+        with np.errstate(over="ignore", invalid="ignore"):
+            rms = float(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+        spread = float(np.std(np.concatenate(measured)))
+        scaled = 100.0 * rms / spread if self.unit == PERCENT else self.factor * rms
+        return scaled if np.isfinite(scaled) else float("inf")
+
+
+def exchanger(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """The first 1500 of 4000 samples, of them the last 500 to choose; scored on all."""
+    flow, temperature = heat_exchanger(folder)
+    parts = (slice(0, 1000), slice(1000, 1500), slice(0, 4000))
+    train, validation, test = (single(f"{p}", flow[p], temperature[p], 1.0) for p in parts)
+    return train, validation, test
+
+
+def wh2009(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """Samples 5001-80000, 80001-100000, and the official test samples 105201-184000."""
+    u, y = wiener_hammerstein(folder)
+    parts = (slice(5000, 80_000), slice(80_000, 100_000), slice(105_200, 184_000))
+    train, validation, test = (single(f"{p}", u[p], y[p], 1 / 51_200) for p in parts)
+    return train, validation, test
+
+
+def emps(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """Motor voltage to the velocity of the slide at 100 Hz; the pulses are the test."""
+    trials = []
+    for name in ("DATA_EMPS", "DATA_EMPS_PULSES"):
+        table = loadmat(folder / f"{name}.mat")
+        q, vir = table["qm"].ravel()[::10], table["vir"].ravel()
+        voltage = vir[: len(vir) // 10 * 10].reshape(-1, 10).mean(axis=1)
+        velocity = np.diff(q)[: len(voltage)] / 0.01  # what the sum of gives the position again
+        trials.append((voltage[: len(velocity)], velocity))
+    (u, y), (u_test, y_test) = trials
+    cut = 2 * len(u) // 3
+    return (
+        single("start", u[:cut], y[:cut], 0.01),
+        single("end", u[cut:], y[cut:], 0.01),
+        single("pulses", u_test, y_test, 0.01),
+    )
+
+
+def kuka_first(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """The first joint: trajectory A, B to choose, C to test."""
+    train, test = kuka(folder, 0)
+    first, second = train.trajectories
+    return Dataset((first,)), Dataset((second,)), test
+
+
+def schunk_first(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """The first joint: every third of trials 1-80 to choose, 81-100 to test."""
+    train, test = schunk(folder, 0)
+    chosen = train.names[2::3]
+    return train.without(chosen), train.select(chosen), test
+
+
+def f1tenth(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """Commanded to measured speed; the test trials of the shipped configuration."""
+    trials = {}
+    for number in range(1, 42):
+        path = folder / "F1tenthCar" / f"measurement_{number}"
+        u = np.loadtxt(path / "input.csv", delimiter=",")[:, 1]
+        y = np.loadtxt(path / "trajectory.csv", delimiter=",")[: len(u), 3]
+        trials[number] = Trajectory(t=0.025 * np.arange(len(u)), y=y, u=u, name=str(number))
+    test = [5, 11, 16, 22, 27, 33, 38, 41]
+    rest = [number for number in trials if number not in test]
+    parts = (rest[0::3] + rest[1::3], rest[2::3], test)
+    train, validation, tests = (Dataset(tuple(trials[k] for k in part)) for part in parts)
+    return train, validation, tests
+
+
+def dart(folder: Path) -> tuple[Dataset, Dataset, Dataset]:
+    """Steering times speed, and speed, to the yaw rate at 20 Hz on the rubbery floor."""
+    trials = []
+    for drive in convert_dart.drives(folder):
+        if not drive.name.startswith("rubbery"):
+            continue
+        at = drive.columns["t"] - drive.columns["t"][0]
+        t = np.arange(0.2, at[-1] - 0.2, 0.05)
+
+        def of(title: str, when: FloatArray, drive: Any = drive, at: FloatArray = at) -> FloatArray:
+            return np.asarray(
+                np.interp(
+                    when,
+                    at,
+                    np.unwrap(drive.columns[title])
+                    if title == "vicon yaw"
+                    else drive.columns[title],
+                )
+            )
+
+        yaw_rate = (of("vicon yaw", t + 0.1) - of("vicon yaw", t - 0.1)) / 0.2
+        moved = [of(f"vicon {axis}", t + 0.1) - of(f"vicon {axis}", t - 0.1) for axis in "xy"]
+        speed = np.hypot(*moved) / 0.2
+        u = np.column_stack([of("steering", t - 0.1) * speed, speed])
+        trials.append(Trajectory(t=t, y=yaw_rate, u=u, name=drive.name))
+    parts = [Dataset(tuple(trials[k::3])) for k in range(3)]
+    return parts[0], parts[1], parts[2]
+
+
+SETS = (
+    PublicSet("exchanger", "exchanger", exchanger, PERCENT, {
+        "thesis, 5th iterate, 2 lags": 13.7, "3 lags": 11.4, "4 lags": 9.7, "nlarx": 26.4,
+    }),
+    PublicSet("wh2009", "wh2009", wh2009, "mV", {
+        "SUBNET": 0.241, "block cascades": 0.28, "PNLSS": 0.42,
+    }, skipped=50, factor=1e3),
+    PublicSet("EMPS", "emps", emps, "mm", {"lowest read": 2.64}, integrated=True, factor=1e3),
+    PublicSet("KUKA, joint 1", "kuka_kr300", kuka_first, "rad/s", {}),
+    PublicSet("Schunk, joint 1", "schunk_arm", schunk_first, "rad/s", {}),
+    PublicSet("F1TENTH speed", "f1tenth", f1tenth, PERCENT, {
+        "first measured, least squares": 11.7, "simulation error": 8.5,
+    }),
+    PublicSet("DART yaw rate", "dart", dart, "rad/s", {}),
+)  # fmt: skip
+
+
+def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
+    """Classes with the methods whose models are proved, for signals like these."""
+    first = data.trajectories[0]
+    one = first.y.shape[1] == first.u.shape[1] == 1
+    for lags in ORDERS:
+        if one:
+            yield LinearClass(lags), CertifiedSem(STEPS)
+        yield StateAffineClass(lags, right_degree=2), Rse(STEPS)
+        yield StateAffineClass(lags, leading_degree=1, right_degree=2), CertifiedSem(STEPS)
+        if first.y.shape[1] == 1:
+            yield MonotoneClass(lags), CertifiedSem(STEPS)
+        yield ImplicitClass(lags, input_degree=3), CertifiedSem(STEPS)
+        if one:
+            yield StateAffineClass(lags, leading_degree=2, right_degree=3), CertifiedSem(STEPS)
+            half = (lags + 1) // 2
+            yield BlockCascadeClass((half, lags - half), phases=(1,), intervals=(8, 16)), Sem()
+    if one:
+        yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """What a search chose, in words, with its validation and test error."""
+
+    what: str
+    validation: float
+    test: float
+
+
+def best_of(
+    case: PublicSet, candidates: Sequence[tuple[Any, Method]], data: tuple[Dataset, ...], *,
+    proved: bool,
+) -> Best | None:  # fmt: skip
+    """The candidate with the least validation error, fitted again and tested."""
+    train, validation, test = data
+    few = shortened(train)
+    found: list[tuple[float, Any, Method, Fit[Any]]] = []
+    for model_class, method in candidates:
+        started = time.process_time()
+        fit = fitted(few, validation, model_class, method, proved=proved)
+        if fit is None:
+            continue
+        error = simulated(case, fit, validation)
+        found.append((error, model_class, method, fit))
+        seconds = time.process_time() - started
+        print(f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {model_class}", flush=True)
+    if not found:
+        return None
+    error, model_class, method, fit = min(found, key=lambda entry: entry[0])
+    both = Dataset((*train.trajectories, *validation.trajectories))
+    needs = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
+    again = fitted(train if needs else both, validation, model_class, method, proved=proved)
+    kept = fit if again is None else again
+    return Best(f"{model_class}, {method.name}", error, simulated(case, kept, test))
+
+
+def fitted(
+    train: Dataset, validation: Dataset, model_class: Any, method: Method, *, proved: bool
+) -> Fit[Any] | None:
+    """A fit; None if there is none, or none with a proof where one is asked for."""
+    try:
+        return identify(
+            train, model_class, method=method, comparators=(), validation=validation,
+            allow_unproved=not proved,
+        )  # fmt: skip
+    except NlsidError as reason:
+        print(f"    no {type(model_class).__name__} by {method.name}: {str(reason)[:100]}")
+        return None
+
+
+def simulated(case: PublicSet, fit: Fit[Any], data: Dataset) -> float:
+    """The case's score of a fit."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        outputs = simulate_trials(fit.model, data.trajectories)
+    return case.score(outputs, data, skipped=case.skipped)
+
+
+def shortened(data: Dataset) -> Dataset:
+    """The first SAMPLES samples."""
+    kept, left = [], SAMPLES
+    for trial in data:
+        N = min(left, len(trial))
+        if N > 0:
+            kept.append(Trajectory(t=trial.t[:N], y=trial.y[:N], u=trial.u[:N], name=trial.name))
+        left -= N
+    return Dataset(tuple(kept))
+
+
+def subspace(case: PublicSet, data: tuple[Dataset, ...]) -> Best | None:
+    """N4SID of the orders, chosen in the same way."""
+    train, validation, test = data
+    found = []
+    for order in ORDERS:
+        try:
+            model = n4sid(shortened(train), order)
+        except (ValueError, np.linalg.LinAlgError):
+            continue
+        error = case.score(
+            [model.simulate(t) for t in validation], validation, skipped=case.skipped
+        )
+        found.append((error, order))
+    if not found:
+        return None
+    error, order = min(found)
+    both = shortened(Dataset((*train.trajectories, *validation.trajectories)))
+    outputs = [n4sid(both, order).simulate(trial) for trial in test]
+    return Best(f"order {order}", error, case.score(outputs, test, skipped=case.skipped))
+
+
+def measure(case: PublicSet, folder: Path) -> dict[str, Any]:
+    """The promised keys of one set."""
+    started = time.process_time()
+    data = case.load(folder / case.folder)
+    one = all(part.shape[1] == 1 for t in data[0] for part in (t.y, t.u))
+    linear = [(LinearClass(n) if one else StateAffineClass(n), LeastSquares()) for n in ORDERS]
+    ours = best_of(case, list(ladder(data[0])), data, proved=True)
+    naive = best_of(case, linear, data, proved=False)
+    usual = subspace(case, data)
+    return {
+        "best_proved": None if ours is None else ours.test,
+        "unit": case.unit,
+        "least_squares": None if naive is None else naive.test,
+        "n4sid": None if usual is None else usual.test,
+        "published": case.published,
+        "seconds": time.process_time() - started,
+        "best": None if ours is None else ours.what,
+        "validation": None if ours is None else ours.validation,
+    }
+
+
+def main() -> None:
+    """Print the table, and with --json one JSON object as the last line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of the sets' folders")
+    parser.add_argument("--json", action="store_true", help="last line is one JSON object")
+    parser.add_argument("names", nargs="*", help="parts of names; all by default")
+    arguments = parser.parse_args()
+    wanted = [s for s in SETS if not arguments.names or any(n in s.name for n in arguments.names)]
+    print(f"test error in simulation, {describe()}\n")
+    rows = {}
+    for case in wanted:
+        print(case.name, flush=True)
+        if not (arguments.data / case.folder).is_dir():
+            print(f"    no folder {case.folder}")
+            continue
+        rows[case.name] = row = measure(case, arguments.data)
+        cells = [f"{key} {row[key]:.4g}" for key in ("best_proved", "least_squares", "n4sid")
+                 if row[key] is not None]  # fmt: skip
+        published = ", ".join(f"{source} {value:g}" for source, value in case.published.items())
+        print(f"  {', '.join(cells)} {case.unit}; published: {published or 'none read'}; "
+              f"{row['seconds']:.0f} s\n  {row['best']}", flush=True)  # fmt: skip
+    if arguments.json:
+        print(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main()
