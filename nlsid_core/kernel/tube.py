@@ -122,7 +122,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         assumptions.append(_inside(model, funnel["box"]))
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
-        assumptions.append(label + _assumption(model, tube, fitted))
+        assumptions.append(label + _assumption(model, tube, fitted, own=_several(tubes)))
     if "response" in funnel:
         assumptions += _response(model, funnel["response"], fitted)
     if "cusum" in funnel:
@@ -303,9 +303,17 @@ def _around_plan(model: Model, policy: Policy | None) -> str:
     )
 
 
+def _several(tubes: list[Tube]) -> bool:
+    """Whether the tubes have observers of their own."""
+    return any(tube.L != tubes[0].L for tube in tubes)
+
+
 def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int) -> str:
     span = text.above(settling * model.period)
-    start = f"after {settling} samples ({span} s) the simulation starts at the observer's state"
+    whose = "the observer's state"
+    if _several(tubes):
+        whose = "one state with the observers, one for each tube"
+    start = f"after {settling} samples ({span} s) the simulation starts at {whose}"
     inlets = " and ".join(text.below(tube.inlet) for tube in tubes)
     if any(tube.inlet for tube in tubes):
         near = f"where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
@@ -323,7 +331,8 @@ def _inside(model: Model, box: Node) -> str:
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 
 
-def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> str:
+def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own: bool) -> str:
+    """own: whether other tubes have other observers."""
     # One output and R = 1: V and E carry its unit squared.
     unit, energy, assumed = "", "e'Re", tube.assumed
     if len(model.y) == 1:
@@ -338,4 +347,5 @@ def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> s
     if assumed.samples is not None:
         bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
     worth = calibration(assumed.measured, assumed.safety_factor, assumed.measured_on, fitted_to)
-    return f"innovation energy: {bound} ({worth})"
+    whose = " of its own observer" if own else ""
+    return f"innovation energy{whose}: {bound} ({worth})"

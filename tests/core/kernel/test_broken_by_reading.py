@@ -14,7 +14,7 @@ import pytest
 
 from nlsid_core import kernel
 from nlsid_core.kernel import Rejected, exact
-from nlsid_core.kernel.files import digest, label
+from nlsid_core.kernel.files import digest, label, unit_label
 
 Json = dict[str, Any]
 SECONDS = 20.0
@@ -102,6 +102,37 @@ def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
 def test_usual_names_and_units_are_as_they_are() -> None:
     for usual in ("speed", "pose.x[0]", "/cmd_vel/x", "m/s^2", "1/s", "%", "°", "m·s⁻¹", "e"):
         assert label(usual) == usual
+
+
+@pytest.mark.parametrize("unit", ["/1000", "m/1000", "*1e3", "E3", "e^3", "x10", "·10³ m", "m 2"])
+def test_a_unit_cannot_change_the_number_before_it(unit: str) -> None:
+    """`0.0000009537 /1000` would be a thousandth of what is proved."""
+    said = decided("tube", tube(unit=unit), {}).statement
+    assert said == (
+        "tube: the measured output stays near the model's simulation under the same inputs, speed "
+        f"within 9.537e-07 {json.dumps(unit)} for 2 samples, which span 0.1 s, for every input; "
+        "and as near the policy's plan, which is the simulation from its start under its inputs, "
+        "for at most its 2 samples, which span 0.1 s, whether those inputs are played, the policy "
+        "is engaged around them, or anything between the two acts, such as the policy's input "
+        "clipped to a range that holds the plan's, as [0.123456, 1] m/s does"
+    )
+
+
+def test_usual_units_stay_as_they_are() -> None:
+    for usual in (
+        "m",
+        "m/s",
+        "m/s^2",
+        "1/s",
+        "rad/s",
+        "%",
+        "°",
+        "m·s⁻¹",
+        "N*m",
+        "kg*m^2/s^3",
+        "µm",
+    ):
+        assert unit_label(usual) == usual
 
 
 def test_combinations_are_counted_before_they_are_listed() -> None:
