@@ -382,6 +382,7 @@ def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
         return Bundle({**good.contents, role: files.encode(document)})
 
     funnel = files.parse_document(good.contents["funnel"])
+    wider = [tube | {"level": 2.0 * tube["level"]} for tube in funnel["tubes"]]
     policy = files.parse_document(good.contents["policy"])
     gain = [[2.0 * entry for entry in row] for row in policy["K"]]
     proof = good.contents["proof"]
@@ -395,7 +396,7 @@ def bundles(good: Bundle, other: Bundle) -> list[tuple[str, str, str]]:
     return [
         ("forged policy", forged.text(), "not the policy this proof is about"),
         ("forged policy and funnel", consistent.text(), "not the"),
-        ("forged funnel", changed("funnel", "level", 2.0 * funnel["level"]).text(), "not the"),
+        ("forged funnel", changed("funnel", "tubes", wider).text(), "not the"),
         ("forged model", changed("model", "c", 1.0).text(), "not the model"),
         (
             "forged proof",

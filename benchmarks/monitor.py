@@ -6,8 +6,7 @@ Latency is from the sending of a sample, whose stamp is on an exact grid, to its
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
 the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
-the priority that a robot gives them. The monitor runs on a funnel made for timing:
-its horizon is as long as the run.
+the priority that a robot gives them. The monitor runs on a funnel made for timing.
 """
 
 import os
@@ -40,10 +39,9 @@ from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python
-from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.designs import Design
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.models import DifferenceEquation, Signal
@@ -75,8 +73,8 @@ def updates() -> dict[str, float]:
     data = read_dataset(f1tenth(), responses=[speed], excitations=[command], max_gap=0.1)
     model = identify(data, LinearClass(LAGS)).model
     designs = [
-        design_tube(
-            model, data, profile=[(0.0, 0.0), (2.8, 0.35)], horizon=2.8, safety_factor=1.5 + 0.1 * i
+        design_output_tube(
+            model, data, profile=[(0.0, 0.0), (2.8, 0.35)], safety_factor=1.5 + 0.1 * i
         )
         for i in range(FUNNELS)
     ]
@@ -90,8 +88,6 @@ def updates() -> dict[str, float]:
                 trial.t.tolist(), trial.y[:, 0].tolist(), trial.u[:, 0].tolist(), strict=True
             )
             for k, (t, y, u) in enumerate(rows):
-                if k == LAGS + designs[0].funnel.assumption.samples:
-                    break
                 started = time.perf_counter_ns()
                 bank.readings(t, y, u)
                 if k >= LAGS:
@@ -101,8 +97,8 @@ def updates() -> dict[str, float]:
     return result
 
 
-def timing_funnel(seconds: float) -> TubeDesign:
-    """A model sampled at 1 kHz and a funnel that lasts `seconds`; for timing only."""
+def timing_funnel() -> OutputTubeDesign:
+    """A model sampled at 1 kHz and a funnel that lasts for ever; for timing only."""
     period, samples = 1.0 / RATE, 200
     rng = np.random.default_rng(1)
     a, b = np.array([1.9, -0.905]), np.array([0.0, 0.003, 0.002])
@@ -115,26 +111,14 @@ def timing_funnel(seconds: float) -> TubeDesign:
         y = blank.simulate(u, [0.0, 0.0]) + 1e-3 * rng.standard_normal(samples)
         t = np.arange(samples) * period
         trials.append(Trajectory(t=t, y=y, u=u, name=f"run_{index}", digest=f"sha256:{index:064x}"))
-    design = design_tube(
-        blank, Dataset(tuple(trials)), profile=[(0.0, 0.0), (0.1, 0.1)], horizon=0.1
-    )
-    more = round((seconds + 10.0) * RATE)
-    u = np.concatenate([design.policy.u, np.repeat(design.policy.u[-1:], more)])
-    x = [design.policy.x[0]]
-    for entry in u[:-1]:
-        x.append(blank.A @ x[-1] + blank.B[:, 0] * entry + blank.offset)
-    policy = replace(design.policy, x=np.array(x), u=u)
-    funnel = replace(
-        design.funnel,
-        level=2.0,
-        half_widths=np.sqrt(2.0 / design.funnel.tau) * (1.0 + 1e-12),  # rounded up
-        assumption=replace(design.funnel.assumption, budget=1.0, samples=more),
-        policy=files.digest(policy.document()),
-    )
-    return Design.proved(blank, policy, funnel, claim=design.claim, proof=design.proof, found=None)
+    design = design_output_tube(blank, Dataset(tuple(trials)))
+    (tube,) = design.funnel.tubes
+    widths = np.sqrt(2.0 / tube.tau) * (1.0 + 1e-12)  # rounded up
+    funnel = replace(design.funnel, tubes=(replace(tube, level=2.0, half_widths=widths),))
+    return Design.proved(blank, None, funnel, claim=design.claim, proof=design.proof, found=None)
 
 
-def bundle_of(design: TubeDesign) -> Bundle:
+def bundle_of(design: OutputTubeDesign) -> Bundle:
     """Its files as they are published."""
     with tempfile.TemporaryDirectory() as folder:
         design.save(folder)
@@ -144,7 +128,7 @@ def bundle_of(design: TubeDesign) -> Bundle:
 class Ear(Node):
     """Publishes the documents, and hears margins and alarms with their time of arrival."""
 
-    def __init__(self, design: TubeDesign) -> None:
+    def __init__(self, design: OutputTubeDesign) -> None:
         super().__init__("ear")
         self.margins: dict[int, int] = {}
         self.echoes: dict[int, int] = {}
@@ -215,7 +199,7 @@ def live(seconds: float) -> dict[str, float]:
     """Missed samples, latency from stamp to margin, and time to ERROR, between processes."""
     isolate()
     rclpy.init()
-    ear = Ear(timing_funnel(seconds))
+    ear = Ear(timing_funnel())
     executor = SingleThreadedExecutor()
     executor.add_node(ear)
     with python(*node("funnel_monitor", source=SOURCE)) as monitor:

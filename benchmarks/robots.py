@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import argparse
 import json
 import logging
+import math
 import shutil
 import tempfile
 import time
@@ -28,7 +29,7 @@ import numpy as np
 
 from bags.chain.config import Config, load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
-from bags.chain.steps import design_funnel_files, identify_bags
+from bags.chain.steps import design_funnel_files, identify_bags, what_a_funnel_catches
 from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.samples import convert_dart, f1tenth
@@ -36,7 +37,6 @@ from bags.setup.candidates import look
 from bags.setup.proposal import Proposal, choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.expressions import Expression
-from bags.signals.reader import read_signals
 from bags.tools.edit import split
 from bags.tools.importing import import_tables
 from benchmarks.cache import cache_folder
@@ -237,13 +237,9 @@ def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
             step = "funnel"
             design = design_funnel_files(out / documents.MODEL, config, out)
             test = [bag for bag in bags if bag.name in config.split.test]
-            widths = [
-                float(width) / spread(bags, signal.path)
-                for width, signal in zip(
-                    design.funnel.half_widths, config.signals.response, strict=True
-                )
-            ]
-            row |= {"half_width_of_range": max(widths), "each": widths}
+            catching = what_a_funnel_catches(out / documents.MODEL, config, design)
+            widths = [width.share for width in catching.widths] if catching is not None else []
+            row |= {"half_width_of_range": max(widths, default=math.nan), "each": widths}
             step = "monitor"
             row |= held_against(config, test, out)
             if robot.folder == "dart":
@@ -267,13 +263,6 @@ def proposed(robot: Robot, bags: list[Path]) -> Proposal:
     found = look(bags)
     responses, excitations = choose(found, robot.responses, robot.excitations)
     return propose(bags, found, responses=responses, excitations=excitations, robot=robot.name)
-
-
-def spread(bags: list[Path], signal: str) -> float:
-    """The response's range over all bags."""
-    read = [read_signals(bag, [signal], sort=True, gaps_in=[signal])[signal] for bag in bags]
-    values = np.concatenate([samples.values for samples in read])
-    return float(np.ptp(values))
 
 
 def held_against(config: Config, test: list[Path], out: Path) -> dict[str, Any]:
@@ -316,7 +305,8 @@ def floors(robot: Robot, bags: list[Path], folder: Path, cache: Path) -> dict[st
             fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
             errors.append(fit.fit.errors["test"][fit.fit.chosen.method.name])
             made = design_funnel_files(out / documents.MODEL, config, out)
-            widths.append(float(made.funnel.half_widths[0]))
+            catching = what_a_funnel_catches(out / documents.MODEL, config, made)
+            widths.append(catching.widths[0].half_width if catching is not None else math.nan)
             for floor, count in counts.items():
                 held = [
                     bag

@@ -2,7 +2,7 @@
 
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
-from nlsid_core.design import LinearTube, design
+from nlsid_core.design import OutputTube, design
 from nlsid_core.identification import LinearClass, identify, simulation_percent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -17,12 +17,12 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
     train, test = dataset.without(TEST), dataset.select(TEST)
 
     fit = identify(train, LinearClass(4))
-    tube = design(LinearTube(fit.model, train, [(0.0, 0.0), (2.9, 0.35)], horizon=2.9))
+    tube = design(OutputTube(fit.model, train, profile=[(0.0, 0.0), (2.9, 0.35)]))
 
     inside = 0
     for trial in test:
         monitor = Monitor(tube.model, tube.policy, tube.funnel)
-        samples = zip(trial.t[:120], trial.y[:, 0], trial.u[:, 0], strict=False)
+        samples = zip(trial.t, trial.y[:, 0], trial.u[:, 0], strict=False)
         readings = [monitor.update(t, y, u) for t, y, u in samples]
         inside += all(r.status in (Status.INSIDE, Status.UNKNOWN) for r in readings)
 

@@ -10,15 +10,14 @@ from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
 
 # The files in a design's folder; a claim calls each by its name without the ending.
 MODEL = "model.json"
@@ -28,8 +27,8 @@ FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
 
 D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
-P = TypeVar("P", bound=LinearPolicy | SampledPolicy | ContinuousPolicy | None)
-F = TypeVar("F", bound=LinearFunnel | SampledFunnel | ContinuousFunnel | TubeFunnel)
+P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)
+F = TypeVar("F", bound=SampledFunnel | ContinuousFunnel | TubeFunnel)
 S = TypeVar("S")
 
 

@@ -10,7 +10,6 @@ from nlsid_core.arrays import Json
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import (
@@ -24,12 +23,12 @@ from nlsid_core.models import (
 )
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
 
 Noun: TypeAlias = (
-    ContinuousFunnel | SampledFunnel | LinearFunnel | TubeFunnel
-    | ContinuousPolicy | SampledPolicy | LinearPolicy | VectorField
+    ContinuousFunnel | SampledFunnel | TubeFunnel
+    | ContinuousPolicy | SampledPolicy | TubePolicy | VectorField
     | BlockCascade | DifferenceEquation | ImplicitModel | MonotoneEquation | StateAffineModel
     | StateModel | TrapezoidalModel
 )  # fmt: skip
@@ -40,10 +39,9 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
         ("nlsid/funnel", "continuous"): ContinuousFunnel.from_document,
         ("nlsid/policy", "continuous"): ContinuousPolicy.from_document,
         ("nlsid/vector_field", None): VectorField.from_document,
-        ("nlsid/funnel", "linear"): LinearFunnel.from_document,
         ("nlsid/funnel", "sampled"): SampledFunnel.from_document,
         ("nlsid/funnel", "tube"): TubeFunnel.from_document,
-        ("nlsid/policy", "linear"): LinearPolicy.from_document,
+        ("nlsid/policy", "tube"): TubePolicy.from_document,
         ("nlsid/policy", "sampled"): SampledPolicy.from_document,
         ("nlsid/model", "block_cascade"): BlockCascade.from_document,
         ("nlsid/model", "difference_equation"): DifferenceEquation.from_document,
@@ -67,6 +65,7 @@ def load(path: Path | str) -> Noun:
 def read(document: Json, *, source: str) -> Noun:
     """`load` for a document in memory."""
     name = files.member(document, "format", str, source=source)
+    files.refuse_old_kind(document, source=source)
     kind = document.get("kind")
     reader = READERS.get((name, kind if isinstance(kind, str) else None))
     if reader is None:

@@ -164,6 +164,14 @@ def header(
         raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{kind}'")
 
 
+def refuse_old_kind(document: Json, *, source: str) -> None:
+    """DocumentError for a funnel or a policy of a kind that there is no more."""
+    if document.get("kind") == "linear":
+        raise DocumentError(
+            f"{source}: kind 'linear' is now 'tube'. Make it again with `nlsid funnel`"
+        )
+
+
 def _leaves(nested: list[Any]) -> Iterable[Any]:
     for entry in nested:
         if isinstance(entry, list):

@@ -28,7 +28,6 @@ from std_srvs.srv import Trigger
 from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
-from bags.recordings.message_types import standard_types
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -39,7 +38,7 @@ from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.lane import Lane
-from nlsid_ros.message_classes import message_class
+from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
@@ -234,7 +233,7 @@ class FunnelMonitor(ManagedNode):
         assert self._watch is not None
         for kind in kinds:
             try:
-                self._watch.pairing.check(topic, kind, standard_types())
+                self._watch.pairing.check(topic, kind, installed_types(kind))
             except BagError as error:
                 unfit = error
                 continue

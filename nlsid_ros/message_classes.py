@@ -1,12 +1,18 @@
-"""rclpy's message class for a type name such as `nav_msgs/msg/Odometry`."""
+"""rclpy's message class for a type name such as `nav_msgs/msg/Odometry`, and the type's fields."""
 
 import importlib
 import re
-from typing import Any
+from functools import cache
+from typing import Any, Final
 
+from bags.recordings.definitions import types_from
+from bags.recordings.message_types import standard_types
 from nlsid_core.errors import BagError
 
 _NAME = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9]*)", re.ASCII)
+_SEQUENCE = re.compile(r"sequence<(.+?)(?:, (\d+))?>")
+_ARRAY = re.compile(r"(.+)\[(\d+)\]")
+_WRITTEN: Final = {"float": "float32", "double": "float64", "boolean": "bool", "octet": "byte"}
 
 
 def message_class(msgtype: str) -> Any:
@@ -18,3 +24,36 @@ def message_class(msgtype: str) -> Any:
         return getattr(importlib.import_module(f"{match[1]}.msg"), match[2])
     except (ImportError, AttributeError) as error:
         raise BagError(f"message type {msgtype} is not installed: {error}") from error
+
+
+@cache
+def installed_types(msgtype: str) -> Any:
+    """The type store of `msgtype` and of what it is made of, as they are installed.
+
+    Raises BagError if the type is neither standard nor installed.
+    """
+    if msgtype in standard_types().fielddefs:
+        return standard_types()
+    texts: dict[str, str] = {}
+    _describe(msgtype, texts)
+    return types_from(msgtype, texts)
+
+
+def _describe(msgtype: str, texts: dict[str, str]) -> None:
+    """The .msg text of a type and of those in it that are not standard."""
+    lines = []
+    for name, kind in message_class(msgtype).get_fields_and_field_types().items():
+        written, suffix = kind, ""
+        if found := _SEQUENCE.fullmatch(kind):
+            written, suffix = found[1], f"[<={found[2]}]" if found[2] else "[]"
+        elif found := _ARRAY.fullmatch(kind):
+            written, suffix = found[1], f"[{found[2]}]"
+        written = re.sub(r"^(w?string)<(\d+)>$", r"\1<=\2", written)
+        if "/" in written:
+            package, _, inner = written.partition("/")
+            written = f"{package}/msg/{inner}"
+            if written not in texts and written not in standard_types().fielddefs:
+                _describe(written, texts)
+            written = f"{package}/{inner}"
+        lines.append(f"{_WRITTEN.get(written, written)}{suffix} {name}")
+    texts[msgtype] = "\n".join(lines) + "\n"

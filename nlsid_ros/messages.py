@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from rclpy.clock import Clock
 
-from bags.recordings.message_types import is_stamped, standard_types
+from bags.recordings.message_types import is_stamped
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core.arrays import ArrayLike
 from nlsid_core.errors import BagError
-from nlsid_ros.message_classes import message_class
+from nlsid_ros.message_classes import installed_types, message_class
 
 
 class SignalMessage:
@@ -20,8 +20,8 @@ class SignalMessage:
     """
 
     def __init__(self, path: SignalPath | SignalVector, msgtype: str) -> None:
-        path.check(msgtype, standard_types())
-        if not is_stamped(msgtype, standard_types()):
+        path.check(msgtype, installed_types(msgtype))
+        if not is_stamped(msgtype, installed_types(msgtype)):
             raise BagError(f"{msgtype} has no header stamp, so {path} could not be paired")
         self.path, self.kind = path, message_class(msgtype)
         self._paths = path.paths if isinstance(path, SignalVector) else (path,)

@@ -9,8 +9,9 @@ from std_msgs.msg import ColorRGBA
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker, MarkerArray
 
-from bags.designs.design import AnyDesign, is_continuous, is_linear, is_sampled
+from bags.designs.design import AnyDesign, is_continuous, is_sampled, is_tube
 from nlsid_core.arrays import FloatArray
+from nlsid_core.models import DifferenceEquation
 
 LIFETIME = 3  # s after the publisher last said so
 LINE = 0.005  # m, width of the lines
@@ -37,9 +38,11 @@ def plan_of(design: AnyDesign) -> Plan:
         widths = np.array([funnel.widths(t) for t in funnel.t])
         names = tuple(f"x{i}" for i in range(funnel.n))
         return Plan(funnel.t - funnel.t0, names, funnel.x.ends(), widths, design.policy.planned)
-    if is_linear(design):
+    if is_tube(design):
         model, policy = design.model, design.policy
-        nominal = policy.x[:, 0] + model.D * policy.u + model.c
+        assert isinstance(model, DifferenceEquation)
+        assert policy is not None
+        nominal = policy.plan(model).y
         t = np.arange(len(nominal)) * policy.period
         width = np.full((len(t), 1), design.funnel.half_width)
         return Plan(t, (model.y.name,), nominal[:, None], width, policy.u[:, None])

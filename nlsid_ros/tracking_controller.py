@@ -28,7 +28,6 @@ from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
-from bags.recordings.message_types import standard_types
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
@@ -38,7 +37,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
-from nlsid_ros.message_classes import message_class
+from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import SignalMessage, frame_of, off_clock, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
@@ -158,7 +157,7 @@ class TrackingController(ManagedNode):
     def _on_design(self, design: AnyDesign, digest: str) -> None:
         """Take a design, but never in the middle of a run: stop that first."""
         response, command = design.response, design.command
-        response.check(self._response_type, standard_types())
+        response.check(self._response_type, installed_types(self._response_type))
         message = SignalMessage(command, self._command_type)
         if self._controller is not None or self._stopping:
             self._halt("the design was replaced")

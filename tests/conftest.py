@@ -10,7 +10,7 @@ import pytest
 from bags.designs.documents import MODEL, MODEL_PROOF
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.identification import Fit, LinearClass, identify
 from nlsid_core.models import DifferenceEquation
 
@@ -68,10 +68,10 @@ def fit(train: Dataset) -> Fit[DifferenceEquation]:
 
 
 @pytest.fixture(scope="session")
-def design(fit: Fit[DifferenceEquation], train: Dataset) -> TubeDesign:
-    """A tube for it, policy engaged or not."""
+def design(fit: Fit[DifferenceEquation], train: Dataset) -> OutputTubeDesign:
+    """Two tubes for it, one for ever and one for 7 s, and around a plan with a policy."""
     model = replace(fit.model, training="sha256:0")
-    return design_tube(
+    return design_output_tube(
         model,
         train,
         profile=[(0.0, 0.0), (1.0, 0.0), (3.0, 0.5), (7.0, 0.5)],
@@ -81,7 +81,7 @@ def design(fit: Fit[DifferenceEquation], train: Dataset) -> TubeDesign:
 
 
 @pytest.fixture
-def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: TubeDesign) -> Path:
+def design_folder(tmp_path: Path, fit: Fit[DifferenceEquation], design: OutputTubeDesign) -> Path:
     """Model, policy, funnel and both proofs as files, as the command line writes them."""
     design.save(tmp_path)
     files.write_document(tmp_path / MODEL_PROOF, fit.proof.document(design.model, MODEL))

@@ -115,13 +115,13 @@ def _none_word(value: object) -> object:
 
 
 class FunnelConfig(Section):
-    """The tube that `nlsid funnel` designs: without `profile` around the model's simulation."""
+    """The tube that `nlsid funnel` designs: around the model's simulation, and around a plan."""
 
     horizon: Annotated[
         Positive | None,
         Key(
-            "how long the disturbance budget has to last: needed with `profile`; without, a second "
-            "tube for so long beside the one that lasts for ever",
+            "a second tube beside the one that lasts for ever, on the energy of a disturbance over "
+            "so long; and how long the plan of `profile` is (null: to its last corner)",
             unit="s",
             example=2.9,
         ),
@@ -129,7 +129,7 @@ class FunnelConfig(Section):
     reaction_time: Annotated[
         Positive | None,
         Key(
-            "how far ahead the forecast is to be narrow, without `profile` (null: ten samples)",
+            "how far ahead the forecast is to be narrow (null: ten samples)",
             unit="s",
             example=0.5,
         ),
@@ -150,7 +150,11 @@ class FunnelConfig(Section):
     ] = 1.5
     inlet: Annotated[
         NonNegative,
-        Key("allowed initial error", unit="the response's unit", example=0.02),
+        Key(
+            "allowed initial error beside the plan of `profile`",
+            unit="the response's unit",
+            example=0.02,
+        ),
     ] = 0.0
     policy: Annotated[
         LqrConfig | None,
@@ -160,8 +164,8 @@ class FunnelConfig(Section):
     profile: Annotated[
         Annotated[tuple[Corner, ...], Field(min_length=2, strict=False)] | None,
         Key(
-            "corners [time, output] of a plan, for `model: linear`; without it the tube is around "
-            "the model's own simulation, for every class of models and for ever",
+            "corners [time, output] of a plan that a policy tracks, for `model: linear`; without "
+            "it the tube is around the model's own simulation only, for every class of models",
             unit="[s, the response's unit]",
             example=[[0.0, 0.0], [2.9, 0.35]],
         ),
@@ -178,10 +182,8 @@ class FunnelConfig(Section):
             if self.inlet:
                 raise ValueError("inlet is for a plan: give `profile`, or leave it out")
             return self
-        if self.horizon is None:
-            raise ValueError("a tube around a plan needs `horizon`, how long its budget lasts")
-        if self.reaction_time is not None:
-            raise ValueError("reaction_time is for a tube without `profile`; leave it out")
+        if self.level == "commands":
+            raise ValueError("around a plan the level is constant: level is for no `profile`")
         times = [time for time, _ in self.profile]
         if any(later <= time for time, later in pairwise(times)):
             raise ValueError(f"profile: times should increase; they are {times}")

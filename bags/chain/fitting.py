@@ -6,6 +6,7 @@ from pathlib import Path
 from bags.chain.config import Config, signal_texts
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
+from bags.recordings.folders import trial_name
 from bags.signals.sampling import Sampler
 from nlsid_core.errors import BagError
 
@@ -26,7 +27,7 @@ def misfits(config: Config, bags: Sequence[Path]) -> list[str]:
             said = [str(error)]
         for what in said:
             found.setdefault(what, []).append(path.name)
-    names = {path.stem if path.is_file() else path.resolve().name for path in bags}
+    names = set(map(trial_name, bags))
     lines = [f"{_some(where)}: {what}" for what, where in found.items()]
     for use in ("test", "validation", "calibration"):
         wanted = getattr(config.split, use)

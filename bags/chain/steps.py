@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bags.chain.config import Config, FunnelConfig
+from bags.chain.config import Config
 from bags.chain.sections import SignalConfig
 from bags.chain.training import load_held_back, load_training, save_held_back, save_training
 from bags.designs import documents
@@ -18,12 +18,11 @@ from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import LinearTube, OutputTube, OutputTubeDesign, TubeDesign, design
+from nlsid_core.design import OutputTube, OutputTubeDesign, design
 from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
-from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Fit, Model
-from nlsid_core.models import DifferenceEquation, StableModel
+from nlsid_core.models import StableModel
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
@@ -250,15 +249,13 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
     return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
 
 
-def design_funnel_files(
-    model_path: Path, config: Config, out: Path
-) -> TubeDesign | OutputTubeDesign:
+def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTubeDesign:
     """A model file in; funnel.json, funnel.proof.json (and model.json) in `out`.
 
-    With a profile, a policy and a tube around its plan, policy.json too; else a tube around the
-    simulation of a model of any class. The observer is chosen on training.npz beside the model, the
-    disturbance measured on the calibration trials of held_back.npz, without which every second
-    training trial is one. Raises DataError or Infeasible.
+    A tube around the simulation of a model of any class; with a profile around a plan of a linear
+    one as well, with the policy that tracks it, policy.json. The observer is chosen on training.npz
+    beside the model, the disturbance measured on the calibration trials of held_back.npz, without
+    which every second training trial is one. Raises DataError or Infeasible.
     """
     options = config.funnel
     if options is None:
@@ -266,33 +263,33 @@ def design_funnel_files(
             "the configuration has no section 'funnel'; `funnel: {}` is one, for a tube around the "
             "model's simulation, and with a profile it plans a motion and its policy"
         )
-    planned = options.profile is not None
-    load = documents.load_model if planned else documents.load_stable_model
+    load = documents.load_stable_model if options.profile is None else documents.load_model
     model: StableModel = load(model_path)
     trials, _ = _trials_beside(model_path, config, model)
-    found: TubeDesign | OutputTubeDesign
-    if planned:
-        found = design(_around_plan(model, trials, options))
-    else:
-        found = design(
-            OutputTube(
-                model,
-                trials.design,
-                trials.calibration,
-                reaction_time=options.reaction_time,
-                safety_factor=options.safety_factor,
-                horizon=options.horizon,
-                level=options.level,
-                box=getattr(config.identification.model_class, "box", None),
-            )
+    weights = options.policy
+    found = design(
+        OutputTube(
+            model,
+            trials.design,
+            trials.calibration,
+            reaction_time=options.reaction_time,
+            safety_factor=options.safety_factor,
+            horizon=options.horizon,
+            level=options.level,
+            box=getattr(config.identification.model_class, "box", None),
+            profile=options.profile,
+            inlet=options.inlet,
+            lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
         )
+    )
+    if found.policy is None:
         (out / documents.POLICY).unlink(missing_ok=True)  # of another design in this folder
     found.save(out)
     return found
 
 
 def what_a_funnel_catches(
-    model_path: Path, config: Config, design: TubeDesign | OutputTubeDesign
+    model_path: Path, config: Config, design: OutputTubeDesign
 ) -> Catching | None:
     """What a designed funnel catches in the test trials beside its model; None if there are none.
 
@@ -303,12 +300,6 @@ def what_a_funnel_catches(
     if test is None:
         return None
     y = np.concatenate([trial.y for trial in (*trials.design, *trials.calibration)])
-    if isinstance(design.funnel, TubeFunnel):
-        factor = design.funnel.tubes[0].safety_factor
-        remedy = "another funnel.reaction_time, or a model that leaves less in its residual"
-    else:
-        factor = design.funnel.assumption.safety_factor
-        remedy = "a shorter funnel.horizon, or a smaller funnel.inlet"
     return what_it_catches(
         Monitor(model, design.policy, design.funnel, centre=Centre.COMMAND),
         model,
@@ -316,8 +307,8 @@ def what_a_funnel_catches(
         held_back=test,
         calibration=trials.calibration,
         ranges=np.ptp(y, axis=0),
-        factor=factor,
-        remedy=remedy,
+        factor=design.funnel.tubes[0].safety_factor,
+        remedy="another funnel.reaction_time, or a model that leaves less in its residual",
     )
 
 
@@ -338,27 +329,6 @@ def _trials_beside(
             "calibration trials; run `nlsid identify` with this configuration"
         )
     assert config.funnel is not None
-    least = least_window(model, train)
-    if config.funnel.profile is not None and isinstance(model, DifferenceEquation):
-        least = round((config.funnel.horizon or 0.0) / model.period) + len(model)
+    least = least_window(model, train, config.funnel.horizon)
     trials = calibration_trials(train, held_back.get("calibration"), least=least)
     return trials, held_back.get("test")
-
-
-def _around_plan(
-    model: StableModel, trials: CalibrationTrials, options: FunnelConfig
-) -> LinearTube:
-    assert isinstance(model, DifferenceEquation)
-    assert options.profile is not None
-    assert options.horizon is not None
-    weights = options.policy
-    return LinearTube(
-        model,
-        trials.design,
-        profile=options.profile,
-        horizon=options.horizon,
-        safety_factor=options.safety_factor,
-        inlet=options.inlet,
-        lqr_weights=None if weights is None else (weights.output_weight, weights.input_weight),
-        calibration=trials.calibration,
-    )

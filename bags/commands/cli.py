@@ -18,7 +18,7 @@ from bags.commands.config_cli import config_app
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
-from nlsid_core.errors import NlsidError
+from nlsid_core.errors import DataError, NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -64,10 +64,12 @@ def nlsid(
 
 @app.command()
 def init(
-    bags: BagsArgument,
     out_file: Annotated[
         Path, typer.Option("--out", help="The YAML to write; must not be there yet.")
     ],
+    bags: Annotated[
+        list[Path] | None, typer.Argument(help="Bags, or folders of bags; none with --live.")
+    ] = None,
     response: Annotated[
         list[str] | None, typer.Option("--response", "-y", help="What answers; repeat.")
     ] = None,
@@ -79,23 +81,40 @@ def init(
     ] = None,
     robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
     yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Look at the running robot's topics instead of bags.")
+    ] = False,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, max=600.0, help="To listen with --live; let the robot move.")
+    ] = 10.0,
 ) -> None:
     """Write a first configuration from bags: signals, clock, period, gaps, split, lags, tube.
 
     It is tried on the bags, every key says why, and what later steps will meet is said first.
     """
-    from bags.commands.init import run_init
+    import tempfile
 
-    run_init(
-        out,
-        bags,
-        out_file,
-        responses=response or (),
-        excitations=excitation or (),
-        definitions=definitions or (),
-        robot=robot,
-        yes=yes,
-    )
+    from bags.commands.init import run_init
+    from bags.commands.listening import listen
+
+    if live is bool(bags):
+        raise typer.BadParameter("give bags, or --live for the robot that is running")
+    if out_file.exists():
+        raise DataError(f"{out_file} exists already; give another name, or remove it")
+    with tempfile.TemporaryDirectory() as folder:
+        if live:
+            out.print(f"listening for {seconds:g} s; let the robot move", soft_wrap=True)
+        run_init(
+            out,
+            [listen(Path(folder) / "heard", seconds)] if live else bags or [],
+            out_file,
+            responses=response or (),
+            excitations=excitation or (),
+            definitions=definitions or (),
+            robot=robot,
+            yes=yes,
+            live=live,
+        )
 
 
 @app.command()
@@ -194,7 +213,7 @@ def funnel(
 ) -> None:
     """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
-    Around the simulation of an identified model of any class, or a plan of a linear one (--model,
+    Around the simulation of an identified model of any class, and a plan of a linear one (--model,
     --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
     it says what it catches: faults put into the test trials, through the monitor.
     """
@@ -326,7 +345,11 @@ def monitor(
         bool, typer.Option("--replay", help="Replay the bags (live monitoring is funnel_monitor).")
     ] = False,
     config: Annotated[
-        Path | None, typer.Option(help="Takes `split.test` (which bags) and `monitor.nominal`.")
+        Path | None,
+        typer.Option(help="Takes `split.test` (which bags), `monitor.nominal`, `definitions`."),
+    ] = None,
+    definitions: Annotated[
+        list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
     ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
@@ -353,7 +376,8 @@ def monitor(
     from bags.designs.design import Wiring
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
-    from bags.recordings.folders import expand_bags
+    from bags.recordings.definitions import read_definitions
+    from bags.recordings.folders import expand_bags, trial_name
 
     if not replay:
         raise typer.BadParameter(
@@ -364,13 +388,14 @@ def monitor(
     proved = documents.load_proved(funnel, wiring=wiring)
     folders = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in folders if f.name in settings.split.test] or folders
+        folders = [f for f in folders if trial_name(f) in settings.split.test] or folders
+    types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
-            replays.append(replay_bag(proved, bag, centre=centre))
+            replays.append(replay_bag(proved, bag, centre=centre, definitions=types))
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
         drawn = report_available() and all(entry.half_width for entry in replays)

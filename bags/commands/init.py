@@ -1,5 +1,6 @@
 """`nlsid init`: a first configuration from bags, asked for on a terminal or said by options."""
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from bags.recordings.folders import expand_bags
 from bags.setup.candidates import Candidate, Found, look
 from bags.setup.proposal import Proposal, choose, propose
 from bags.setup.written import yaml_text
+from bags.signals.expressions import parse_factors
 from nlsid_core.errors import DataError
 from nlsid_core.files import write_atomically
 
@@ -28,10 +30,12 @@ def run_init(
     definitions: Sequence[Path],
     robot: str,
     yes: bool,
+    live: bool = False,
 ) -> Proposal:
     """Look, ask what is not said, try it on the bags, write the YAML; DataError if `target` exists.
 
-    Without a terminal what is not said has to be accepted by `yes`.
+    Without a terminal what is not said has to be accepted by `yes`. live: the bag is a look at a
+    running robot and no trial.
     """
     if target.exists():
         raise DataError(f"{target} exists already; give another name, or remove it")
@@ -61,13 +65,32 @@ def run_init(
         definitions=definitions,
         types=types,
     )
+    if definitions:  # a configuration's paths are seen from where it is
+        proposal.content["definitions"] = [
+            os.path.relpath(path, target.parent) for path in definitions
+        ]
     write_atomically(target, yaml_text(proposal).encode())
     for text in (*chosen_u, *chosen_y):
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
-    for wall in proposal.walls:
+    for wall in dict.fromkeys(proposal.walls):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
-    given = " ".join(map(str, bags))
+    given = "TRIALS" if live else " ".join(map(str, bags))
+    if live:
+        topics = dict.fromkeys(
+            factor.path.topic for text in (*chosen_u, *chosen_y) for factor in parse_factors(text)
+        )
+        console.print(
+            "this was a look at the running robot: record trials of it (folder TRIALS), then run "
+            "init on them for their split, lags and ranges, or go on with these",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+        said = ", ".join(topics)
+        console.print(
+            "  python -m nlsid_ros.trajectory_recorder --ros-args "
+            f"-p \"topics:=[{said}]\" -p bag:=TRIALS/trial_1",
+            soft_wrap=True, markup=False, highlight=False,
+        )  # fmt: skip
     steps = [f"nlsid identify {given} --config {target} --out out"]
     if "funnel" in proposal.content:
         steps += [

@@ -18,9 +18,8 @@ from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import OutputTubeDesign, TubeDesign
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, duration, percent
-from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification import Candidate, Fit, Model, Selection, describe, stated_rate
 from nlsid_core.kernel import text
 from nlsid_core.models import Signal
@@ -154,19 +153,18 @@ def stability(candidate: Candidate[Model]) -> str:
     return f"[green]{stated_rate(candidate.proof, candidate.model.period)}"
 
 
-def funnel_table(design: TubeDesign | OutputTubeDesign) -> Table:
+def funnel_table(design: OutputTubeDesign) -> Table:
     """What the tube promises and on what."""
-    if isinstance(design.funnel, TubeFunnel):
-        return _output_tubes(design)
-    return _driven_tube(design)
-
-
-def _output_tubes(design: OutputTubeDesign) -> Table:
     model, funnel = design.model, design.funnel
     table = Table(title="proved tube", title_justify="left", show_header=False)
     table.add_column(style="dim")
     table.add_column()
-    table.add_row("around", "the model's simulation under the inputs it receives; no policy")
+    table.add_row("around", "the model's simulation under the inputs it receives")
+    if design.policy is not None:
+        played = Fraction(model.period) * (len(design.policy) - 1)
+        engaged = "an LQR around it" if design.policy.K.any() else "its inputs played, K = 0"
+        lasts = f"{len(design.policy)} samples, which span {text.below(played)} s"
+        table.add_row("and", f"the policy's plan, {engaged}, for {lasts}")
     signals = (model.y,) if isinstance(model.y, Signal) else model.y
     for tube in funnel.tubes:
         lasting = "for ever"
@@ -181,23 +179,6 @@ def _output_tubes(design: OutputTubeDesign) -> Table:
         if tube.follows is not None:
             said += " on average, wider and narrower as the commands go: times sqrt(g)"
         table.add_row("half-width", f"{said}, {lasting}")
-    for line in design.verdict.assumptions:
-        table.add_row("assuming", escape(line))
-    return table
-
-
-def _driven_tube(design: TubeDesign) -> Table:
-    model, funnel, assumption = design.model, design.funnel, design.funnel.assumption
-    unit = model.y.unit
-    table = Table(title="proved tube", title_justify="left", show_header=False)
-    table.add_column(style="dim")
-    table.add_column()
-    tracking = "LQR" if design.policy.K.any() else "K = 0 (prediction tube)"
-    table.add_row("policy", tracking)
-    width = text.above(Fraction(funnel.half_width))
-    table.add_row("half-width", f"{width} {unit} of {model.y.name}")
-    span = text.below((assumption.samples - 1) * Fraction(model.period))
-    table.add_row("horizon", f"{assumption.samples} samples, which span {span} s")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
     return table

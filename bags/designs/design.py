@@ -15,12 +15,10 @@ from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.protocol import AnyFunnel, read_funnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import (
-    DifferenceEquation,
     Signal,
     StableModel,
     StateModel,
@@ -28,9 +26,9 @@ from nlsid_core.models import (
 )
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.protocol import AnyPolicy, read_policy
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
@@ -120,7 +118,7 @@ class WiredDesign(Generic[M, P, F]):
     @property
     def has_plan(self) -> bool:
         """Whether the funnel is always around the policy's plan; a tube may follow commands."""
-        return not isinstance(self.funnel, LinearFunnel | TubeFunnel)
+        return not isinstance(self.funnel, TubeFunnel)
 
     @property
     def digest(self) -> str:
@@ -128,7 +126,7 @@ class WiredDesign(Generic[M, P, F]):
         return files.digest(self.funnel.document())
 
     def monitor(self, centre: Centre) -> Monitor:
-        """A monitor for one run; centre: of a linear tube."""
+        """A monitor for one run; centre: of a tube with a policy."""
         period = self.period if isinstance(self.model, VectorField) else None
         return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period)
 
@@ -136,7 +134,7 @@ class WiredDesign(Generic[M, P, F]):
         """A controller for one run; `settling`: s to wait for a state where it may start."""
         period = self.period if isinstance(self.model, VectorField) else None
         if self.policy is None:
-            raise DocumentError("a tube around a model's simulation has no policy to run")
+            raise DocumentError("this tube is around a model's simulation only: no policy to run")
         return Controller(
             self.model, self.policy, self.funnel, limits=limits, settling=settling, period=period
         )
@@ -150,11 +148,10 @@ class WiredDesign(Generic[M, P, F]):
         return self.wiring
 
 
-LinearDesign: TypeAlias = WiredDesign[DifferenceEquation, LinearPolicy, LinearFunnel]
 SampledDesign: TypeAlias = WiredDesign[MeasuredState, SampledPolicy, SampledFunnel]
 ContinuousDesign: TypeAlias = WiredDesign[VectorField, ContinuousPolicy, ContinuousFunnel]
-WiredTube: TypeAlias = WiredDesign[StableModel, None, TubeFunnel]
-AnyDesign: TypeAlias = LinearDesign | SampledDesign | ContinuousDesign | WiredTube
+WiredTube: TypeAlias = WiredDesign[StableModel, TubePolicy | None, TubeFunnel]
+AnyDesign: TypeAlias = SampledDesign | ContinuousDesign | WiredTube
 
 
 def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) -> AnyDesign:
@@ -167,10 +164,12 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
         raise DocumentError("a design has a funnel")
     funnel = read_funnel(documents["funnel"])
     readers: dict[type[AnyFunnel], tuple[type[AnyPolicy] | None, Any]] = {
-        LinearFunnel: (LinearPolicy, DifferenceEquation.from_document),
         SampledFunnel: (SampledPolicy, read_measured_state),
         ContinuousFunnel: (ContinuousPolicy, VectorField.from_document),
-        TubeFunnel: (None, partial(read, source="model")),
+        TubeFunnel: (
+            TubePolicy if "policy" in documents else None,
+            partial(read, source="model"),
+        ),
     }
     kind, read_model = readers[type(funnel)]
     wanted = {"model", "funnel"} | ({"policy"} if kind is not None else set())
@@ -196,11 +195,6 @@ def _read_at(signals: tuple[Signal, ...], *, single: bool) -> SignalPath | Signa
     return SignalVector.parse(signal.path for signal in signals)
 
 
-def is_linear(design: AnyDesign) -> TypeGuard[LinearDesign]:
-    """Whether it is a tube of a linear model."""
-    return isinstance(design.funnel, LinearFunnel)
-
-
 def is_sampled(design: AnyDesign) -> TypeGuard[SampledDesign]:
     """Whether it is a sampled funnel around a motion of a measured state."""
     return isinstance(design.funnel, SampledFunnel)
@@ -212,5 +206,5 @@ def is_continuous(design: AnyDesign) -> TypeGuard[ContinuousDesign]:
 
 
 def is_tube(design: AnyDesign) -> TypeGuard[WiredTube]:
-    """Whether it is a tube around the simulation of a model, without a policy."""
+    """Whether it is a tube around the simulation of a model, and perhaps around a plan."""
     return isinstance(design.funnel, TubeFunnel)

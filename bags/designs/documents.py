@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast, get_args
 
 from bags.designs.bundle import Bundle
-from bags.designs.design import AnyDesign, LinearDesign, SampledDesign, Wiring
+from bags.designs.design import AnyDesign, SampledDesign, WiredTube, Wiring
 from nlsid_core import designs, files
 from nlsid_core.documents import load
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, StableModel
 
@@ -67,17 +67,17 @@ def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[Any
     return Proved(bundle.design(wiring), verdict)
 
 
-def load_proved_funnel(path: Path | str) -> Proved[LinearDesign]:
-    """`load_proved` for a tube of a difference equation; DocumentError if it is another."""
+def load_proved_funnel(path: Path | str) -> Proved[WiredTube]:
+    """`load_proved` for a tube; DocumentError if it is another."""
     proved: Proved[Any] = load_proved(path)
-    if not isinstance(proved.design.funnel, LinearFunnel):
-        raise DocumentError(f"{path}: not a linear funnel; `nlsid track` reads sampled ones")
-    return cast(Proved[LinearDesign], proved)
+    if not isinstance(proved.design.funnel, TubeFunnel):
+        raise DocumentError(f"{path}: not a tube; `nlsid track` reads sampled funnels")
+    return cast(Proved[WiredTube], proved)
 
 
 def load_proved_tracking(path: Path | str) -> Proved[SampledDesign]:
     """`load_proved` for a sampled funnel; DocumentError if it is another."""
     proved: Proved[Any] = load_proved(path)
     if not isinstance(proved.design.funnel, SampledFunnel):
-        raise DocumentError(f"{path}: not a sampled funnel; `nlsid monitor` reads linear ones")
+        raise DocumentError(f"{path}: not a sampled funnel; `nlsid monitor` reads tubes")
     return cast(Proved[SampledDesign], proved)

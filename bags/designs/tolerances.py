@@ -181,7 +181,7 @@ def tolerances(folder: Path | str) -> Tolerances:
             )
         path = goal = funnel.half_widths
         about = "what the model simulates from the commands that were sent, not with the commands"
-        if not isinstance(funnel, TubeFunnel):
+        if design.policy is not None:
             about += "; or with the plan in policy.json where the policy drives"
     rows = zip(signals, path.tolist(), goal.tolist(), strict=True)
     entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)

@@ -1,21 +1,23 @@
 """Offline monitoring: a bag's messages through the same sampling and monitor as the live node."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bags.designs.design import AnyDesign, is_linear, is_tube
+from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
 
+Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
@@ -24,7 +26,7 @@ RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 class Replay:
     """One bag's readings, and what a summary says of them.
 
-    axis: what is measured; unit, half_width: of the one output of a linear tube, else empty and 0.
+    axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
     """
 
     name: str
@@ -122,15 +124,22 @@ def _unjudged(reading: Reading) -> bool:
     return reading.status is Status.UNKNOWN and not _starting(reading)
 
 
-def replay_bag(proved: Proved[AnyDesign], bag: Path | str, *, centre: Centre) -> Replay:
+def replay_bag(
+    proved: Proved[AnyDesign],
+    bag: Path | str,
+    *,
+    centre: Centre,
+    definitions: Definitions | None = None,
+) -> Replay:
     """Every response in `bag` held against a funnel.
 
-    Raises BagError as `replay_messages`.
+    definitions: of message types that the bag does not define. Raises BagError as
+    `replay_messages`.
     """
     design = proved.design
-    stamped = replay_messages(design, bag, centre=centre)
+    stamped = replay_messages(design, bag, centre=centre, definitions=definitions)
     unit, half_width = "", 0.0
-    if is_linear(design) or (is_tube(design) and len(design.signals[0]) == 1):
+    if is_tube(design) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, design.funnel.half_width
     return Replay(
         name=Path(bag).name,
@@ -144,7 +153,11 @@ def replay_bag(proved: Proved[AnyDesign], bag: Path | str, *, centre: Centre) ->
 
 
 def replay_messages(
-    design: AnyDesign, bag: Path | str, *, centre: Centre = Centre.PROFILE
+    design: AnyDesign,
+    bag: Path | str,
+    *,
+    centre: Centre = Centre.PROFILE,
+    definitions: Definitions | None = None,
 ) -> list[Stamped]:
     """What the live monitor says of the messages in `bag`, one by one as they were recorded.
 
@@ -155,29 +168,35 @@ def replay_messages(
     """
     bag = Path(bag)
     planned = centre is Centre.PROFILE or design.has_plan
-    announced = planned and bool(announced_runs(design, bag))
+    announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)
-    stamped = [entry for said in _fed(watch, bag, announced=announced) for entry in said]
+    stamped = [
+        entry for said in _fed(watch, bag, definitions, announced=announced) for entry in said
+    ]
     stamped += watch.end()
     if not stamped:
         raise BagError(f"{bag}: no sample with all of {watch.pairing}")
     return stamped
 
 
-def announced_runs(design: AnyDesign, bag: Path | str) -> list[Run]:
+def announced_runs(
+    design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
+) -> list[Run]:
     """The runs of this funnel that a controller announced in `bag`, in the order it did."""
-    with Bag(bag) as source:
+    with Bag(bag, definitions=definitions) as source:
         messages = source.messages(_run_topics(source))
         found = [_run(message, source) for message in messages]
     digest = design.digest
     return [run for run in found if run.funnel == digest]
 
 
-def _fed(watch: Watch, bag: Path, *, announced: bool) -> Iterator[list[Stamped]]:
+def _fed(
+    watch: Watch, bag: Path, definitions: Definitions | None, *, announced: bool
+) -> Iterator[list[Stamped]]:
     """What `watch` says to every message, in log order."""
     design = watch.design
     digest = design.digest
-    with Bag(bag) as source:
+    with Bag(bag, definitions=definitions) as source:
         for topic in watch.pairing.topics:
             kind = source.types_on(topic)
             try:

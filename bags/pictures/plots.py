@@ -99,7 +99,7 @@ def _tube(axes: Axes, replay: Replay) -> None:
 
 
 def _output(values: Sequence[float]) -> float:
-    """The one output that a linear tube is about; NaN where nothing was measured."""
+    """The one output that a tube is about; NaN where nothing was measured."""
     return values[0] if values else float("nan")
 
 

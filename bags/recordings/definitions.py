@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from bags.recordings.message_types import (
     completed,
@@ -65,6 +66,12 @@ def definitions_from(texts: Mapping[str, str]) -> dict[str, Definition]:
             text = types.generate_msgdef(msgtype, ros_version=2)[0]
             found[msgtype] = Definition(msgtype, text, types.hash_rihs01(msgtype))
     return found
+
+
+def types_from(msgtype: str, texts: Mapping[str, str]) -> Typestore:
+    """What the .msg `texts`, by their types' names, define of `msgtype`; as `definitions_from`."""
+    text = definitions_from(texts)[msgtype].text
+    return types_in_bag(msgtype, MessageDefinition(MessageDefinitionFormat.MSG, text))
 
 
 def read_definitions(paths: Iterable[Path]) -> dict[str, Definition]:

@@ -12,7 +12,8 @@ from bags.recordings.quality import KEY, Profile, offered
 from nlsid_core.errors import BagError
 
 METADATA: Final = "metadata.yaml"
-DATA_FILES: Final = (".mcap", ".db3", ".bag")
+ROS1: Final = ".bag"
+DATA_FILES: Final = (".mcap", ".db3", ROS1)
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
@@ -59,6 +60,11 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
             raise BagError(f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)})")
         found += inside
     return list(dict.fromkeys(found))
+
+
+def trial_name(path: Path) -> str:
+    """What a configuration calls a bag: its folder's name, or its file's without the ending."""
+    return path.stem if path.is_file() else path.resolve().name
 
 
 def bag_files(path: Path) -> BagFiles:
@@ -161,6 +167,8 @@ def _is_bag(folder: Path) -> bool:
     if (folder / METADATA).is_file():
         return True
     stems = sorted(p.stem for p in folder.iterdir() if p.suffix in DATA_FILES)
+    if len(stems) > 1 and any(p.suffix == ROS1 for p in folder.iterdir()):
+        return False  # each is whole, also where one recording was split
     if len(stems) < 2:
         return bool(stems)
     numbered = [stem.rpartition("_") for stem in stems]

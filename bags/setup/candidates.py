@@ -33,6 +33,8 @@ MOST_COMMANDS: Final = 24  # and responses, by their roles, whose pairs are comp
 LONGEST_DELAY: Final = 3.0  # s, of what still counts as an answer
 WINDOW: Final = 5  # messages of a slope
 OTHER_KIND_LIKED: Final = 0.7  # a rate for a reference position; positions that add up a command
+HELD: Final = 0.5  # of the messages repeat the value before: a command, or a robot at rest
+HELD_IS_DRIVEN: Final = 0.05  # for what neither type nor name says the role of
 SLOPES_LIKED: Final = 0.95  # against a rate that is measured
 OTHER_JOINT_LIKED: Final = 0.8  # against the same joint's
 COMMANDS: Final = {  # message types that command; the others are taken by their names
@@ -198,6 +200,8 @@ def _of_bag(
                         continue
                     stamps = columns.log_ns[finite]
                     command, why = _role(signal, msgtype)
+                    if command < 1.0 and float((np.diff(numbers[finite]) == 0.0).mean()) > HELD:
+                        command, why = command + HELD_IS_DRIVEN, f"{why}, mostly held"
                     series[signal] = stamps, numbers[finite]
                     found.append(
                         Candidate(
@@ -281,7 +285,7 @@ def _pairs(
     pairs = []
     for u in driving:
         for y in answering:
-            if u.command <= y.command or (_field(u.text) == _field(y.text) and u.topic == y.topic):
+            if u.command < y.command or (_field(u.text) == _field(y.text) and u.topic == y.topic):
                 continue
             found = [_delay(read[u.text], read[y.text]) for read in series
                      if u.text in read and y.text in read]  # fmt: skip

@@ -19,6 +19,7 @@ from bags.chain.config import Config
 from bags.chain.steps import Trials, read_trials
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found
 from bags.signals.expressions import factors, parse_factors
@@ -43,6 +44,7 @@ SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 RELATED: Final = 0.3  # correlation below which command and response may be unrelated
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
+OTHERS: Final = 3  # commands that are named besides
 STALE: Final = 5.0  # periods without a response that are one too many
 
 
@@ -130,7 +132,7 @@ def propose(
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
     if linear:
-        _say_lags(proposal, trials.train)
+        _say_lags(proposal, trials.train, found)
     else:
         _say_degree(proposal, trials.train)
     _say_funnel(proposal)
@@ -364,7 +366,7 @@ def _say_grid(proposal: Proposal, read: _Read) -> None:
 
 
 def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
-    names = sorted(path.stem if path.is_file() else path.resolve().name for path in bags)
+    names = sorted(map(trial_name, bags))
     if len(names) >= TEST_EVERY:
         proposal.content["split"] = {"test": names[TEST_EVERY - 1 :: TEST_EVERY]}
         proposal.why["test"] = f"every {TEST_EVERY}th of {len(names)} bags, by name"
@@ -404,7 +406,7 @@ def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]
             proposal.why[key] = f"without it: {error}"[:120].rpartition(" ")[0]
 
 
-def _say_lags(proposal: Proposal, train: Dataset) -> None:
+def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
     """The fewest lags whose simulation of a part of the training trials is about as good as any."""
     names = train.names
     held_back = list(names[1::3]) or list(names[:1])
@@ -444,7 +446,18 @@ def _say_lags(proposal: Proposal, train: Dataset) -> None:
         proposal.walls.append(
             f"no number of lags simulates {where.removeprefix('on ')} with less than {best:.3g} % "
             "error: the tube will be wide; another pair of signals, or more of them, may say more"
+            + _others(proposal, found)
         )
+
+
+def _others(proposal: Proposal, found: Found) -> str:
+    """The other commands that the response follows, for people."""
+    signals = proposal.content["signals"]
+    chosen = {signal["path"] for signal in signals["excitation"]}
+    follows = [p for p in found.best_for(signals["response"][0]["path"])
+               if p.command.text not in chosen and abs(p.correlation) >= RELATED]  # fmt: skip
+    said = ", ".join(f"{p.command.text} ({p.correlation:+.2f})" for p in follows[:OTHERS])
+    return f": it follows {said} too (-u, once for each)" if said else ""
 
 
 def _say_degree(proposal: Proposal, train: Dataset) -> None:

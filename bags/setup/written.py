@@ -20,7 +20,7 @@ HEAD: Final = (
 def yaml_text(proposal: Proposal) -> str:
     """The whole file; what the later steps will meet stands at its head."""
     lines = list(_comment(HEAD))
-    for wall in proposal.walls:
+    for wall in dict.fromkeys(proposal.walls):
         lines += _comment(f"Mind: {wall}")
     return "\n".join([*lines, *_section(proposal.content, Config, proposal.why, 0)]) + "\n"
 

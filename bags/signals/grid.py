@@ -12,6 +12,7 @@ from typing import Any, Final, overload
 import numpy as np
 
 from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
 from bags.signals.expressions import Expression, factors, product
 from bags.signals.reader import (
     HEADER_STAMP,
@@ -302,7 +303,7 @@ def read_dataset(
     `Dataset` do.
     """
     paths = [Path(bag) for bag in bags]
-    names = [path.stem if path.is_file() else path.resolve().name for path in paths]
+    names = list(map(trial_name, paths))
     if len(twice := {name for name in names if names.count(name) > 1}):
         raise DataError(f"two bags are called '{min(twice)}'; trials are told apart by name")
     options = {

@@ -12,8 +12,7 @@ from nlsid_core.design.continuous.tvlqr import (
     tvlqr,
 )
 from nlsid_core.design.design import design
-from nlsid_core.design.linear import TubeDesign, design_tube
-from nlsid_core.design.problems import ContinuousTracking, LinearTube, OutputTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
@@ -22,17 +21,14 @@ __all__ = [
     "Feedback",
     "FunnelDesign",
     "Goal",
-    "LinearTube",
     "OutputTube",
     "OutputTubeDesign",
     "SampledTracking",
     "Tracking",
-    "TubeDesign",
     "compose_funnels",
     "design",
     "design_funnel",
     "design_output_tube",
-    "design_tube",
     "discrete_tvlqr",
     "integrate_nominal",
     "lyapunov",

@@ -8,14 +8,11 @@ from typing import overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.sweep import Progress
-from nlsid_core.design.linear import TubeDesign, design_tube
-from nlsid_core.design.problems import ContinuousTracking, LinearTube, OutputTube, SampledTracking
+from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
 
-@overload
-def design(problem: LinearTube) -> TubeDesign: ...
 @overload
 def design(problem: OutputTube) -> OutputTubeDesign: ...
 @overload
@@ -28,11 +25,11 @@ def design(
     progress: Progress | None = None,
 ) -> FunnelDesign: ...
 def design(
-    problem: LinearTube | OutputTube | SampledTracking | ContinuousTracking,
+    problem: OutputTube | SampledTracking | ContinuousTracking,
     *,
     executor: Executor | None = None,
     progress: Progress | None = None,
-) -> TubeDesign | OutputTubeDesign | TrackingDesign | FunnelDesign:
+) -> OutputTubeDesign | TrackingDesign | FunnelDesign:
     """A funnel for the problem, proved, and a policy unless it needs none.
 
     `Design.save` writes them and the proof.
@@ -42,8 +39,6 @@ def design(
     CertificateRejected if an assumption is not one that the kernel accepts.
     """
     match problem:
-        case LinearTube():
-            return design_tube(**vars(problem))
         case OutputTube():
             return design_output_tube(**vars(problem))
         case SampledTracking():

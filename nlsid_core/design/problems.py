@@ -13,7 +13,7 @@ from nlsid_core.design.sampled.motion import Feedback
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import OptionError
 from nlsid_core.funnels.sampled import DisturbanceAssumption
-from nlsid_core.models import DifferenceEquation, StableModel
+from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.options import require_at_least, require_one_of, require_positive, require_ranges
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -24,40 +24,8 @@ Objective = Literal["volume", "reference"]
 
 
 @dataclass(frozen=True, eq=False)
-class LinearTube:
-    """Policy, observer and tube of an identified model, under a bound on the innovations' energy.
-
-    train: what the observer is chosen on. calibration: other trials, on which the bound is measured
-    (None: `calibration_trials` of train); to state how often a next trial exceeds it, the model has
-    to be fitted without them. profile: (s, output) corners of the nominal. horizon: s,
-    how long the energy budget lasts. safety_factor: of the disturbance's amplitude over the largest
-    measured, at least 1. inlet: allowed initial error of the output, in its unit. lqr_weights: of
-    output and input, positive; None is K = 0, a prediction tube.
-    Source: energy form of a disturbance bound, linear case.
-    """
-
-    model: DifferenceEquation
-    train: Dataset
-    profile: Sequence[tuple[float, float]]
-    horizon: float
-    safety_factor: float = 1.5
-    inlet: float = 0.0
-    lqr_weights: tuple[float, float] | None = (1.0, 1.0)
-    calibration: Dataset | None = None
-
-    def __post_init__(self) -> None:
-        if len(self.profile) < 2:
-            raise OptionError("profile", self.profile, "two or more corners (s, output)")
-        require_positive(self, "horizon")
-        require_at_least(self, "safety_factor", 1.0)
-        require_at_least(self, "inlet", 0.0)
-        if self.lqr_weights is not None and not all(weight > 0 for weight in self.lqr_weights):
-            raise OptionError("lqr_weights", self.lqr_weights, "two numbers above 0, or None")
-
-
-@dataclass(frozen=True, eq=False)
 class OutputTube:
-    """Tubes around the simulation of a stable model of any class, whatever drives it; for ever.
+    """Tubes around the simulation of a stable model of any class, for ever; and around a plan.
 
     train: the trials that observer and storage are chosen on. calibration: others, on which the
     level is measured (None: every second recording of `train`, of a single one windows).
@@ -68,6 +36,11 @@ class OutputTube:
     the range of the training trials and a tenth of it on both sides). level: "constant", or
     "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
     `train`.
+
+    profile: of a linear model, (s, output) corners of a plan that a policy tracks, for `horizon` s,
+    else up to the last corner (None: no policy); its level is constant. inlet: allowed initial
+    error of the output beside the plan, in its unit. lqr_weights: of output and input, positive;
+    None is K = 0.
     Source: docs/certificate_tube.md.
     """
 
@@ -79,12 +52,24 @@ class OutputTube:
     horizon: float | None = None
     box: Sequence[tuple[float, float]] | None = None
     level: LevelKind = "auto"
+    profile: Sequence[tuple[float, float]] | None = None
+    inlet: float = 0.0
+    lqr_weights: tuple[float, float] | None = (1.0, 1.0)
 
     def __post_init__(self) -> None:
         for key in ("reaction_time", "horizon"):
             if getattr(self, key) is not None:
                 require_positive(self, key)
         require_at_least(self, "safety_factor", 1.0)
+        require_at_least(self, "inlet", 0.0)
+        if self.profile is not None and len(self.profile) < 2:
+            raise OptionError("profile", self.profile, "two or more corners (s, output)")
+        if self.profile is not None and self.level == "commands":
+            raise OptionError("level", self.level, "constant, or auto, with a profile")
+        if self.profile is None and self.inlet > 0.0:
+            raise OptionError("inlet", self.inlet, "0 without a profile: the start of a plan")
+        if self.lqr_weights is not None and not all(weight > 0 for weight in self.lqr_weights):
+            raise OptionError("lqr_weights", self.lqr_weights, "two numbers above 0, or None")
         require_ranges(self, "box")
         require_one_of(self, "level", get_args(LevelKind))
 
@@ -154,4 +139,4 @@ class ContinuousTracking:
         require_one_of(self, "gain", GAINS)
 
 
-Problem = LinearTube | OutputTube | SampledTracking | ContinuousTracking
+Problem = OutputTube | SampledTracking | ContinuousTracking

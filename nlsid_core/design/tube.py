@@ -1,4 +1,4 @@
-"""`design_output_tube`: a proved tube around the simulation of a stable model of any class.
+"""`design_output_tube`: a proved tube around the simulation of a stable model, or around a plan.
 
     E ζ = 0,   x̄⁺ = F ζ + L e,   o = H ζ + e,   E_{k+1} = ρ E_k + e_k'R e_k
 The kernel's reading of the model file gives F, H and the vertices E. Observers L are Kalman gains
@@ -25,15 +25,18 @@ from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design.levels import LevelKind, followed
+from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.riccati import solve_riccati
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.funnels.level import CommandLevel
 from nlsid_core.funnels.tube import Cusum, Response, Tube, TubeFunnel
 from nlsid_core.identification.stability import prove_stability, storage_on
 from nlsid_core.kernel import Rejected, increments
 from nlsid_core.kernel.files import Node, parse
-from nlsid_core.models import BlockCascade, ImplicitModel, StableModel
+from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
+from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
 
@@ -58,7 +61,7 @@ ROUNDS = 6  # of cutting planes, most of the time 2-4
 CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
-OutputTubeDesign: TypeAlias = Design[Any, None, TubeFunnel, None]
+OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
 
 
 def design_output_tube(
@@ -71,6 +74,9 @@ def design_output_tube(
     horizon: float | None = None,
     box: Sequence[tuple[float, float]] | None = None,
     level: LevelKind = "auto",
+    profile: Sequence[tuple[float, float]] | None = None,
+    inlet: float = 0.0,
+    lqr_weights: tuple[float, float] | None = (1.0, 1.0),
 ) -> OutputTubeDesign:
     """The funnel that `OutputTube` describes; its options are these.
 
@@ -78,11 +84,14 @@ def design_output_tube(
     """
     stepper = Stepper(model)
     settling = _settling(model, stepper, train)
-    trials = calibration_trials(train, calibration, least=least_window(model, train))
+    trials = calibration_trials(train, calibration, least=least_window(model, train, horizon))
     train = trials.design
     y_box, u_box = _box(model, stepper, train, box)
     bounds = None if y_box is None else {"y": y_box.tolist(), "u": u_box.tolist()}  # type: ignore[union-attr]
-    form = _Form.of(model, bounds)
+    K: FloatArray | None = None
+    if profile is not None:
+        K, level = _gain(model, lqr_weights), "constant"
+    form = _Form.of(model, bounds, K)
     samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
     amplitudes = np.maximum(
         np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
@@ -96,6 +105,7 @@ def design_output_tube(
             half_widths=1.0 / np.sqrt(0.99 * design.tau), level=1.0, measured=0.0,
             safety_factor=safety_factor, designed_on=trials.designed_on,
             measured_on=trials.measured_on, samples=samples,
+            inlet=inlet**2 / float(np.linalg.inv(design.P)[0, 0]) if inlet else 0.0,
         )  # fmt: skip
 
     def proved(
@@ -106,23 +116,47 @@ def design_output_tube(
             tubes=tuple(tubes), settling=settling, model=files.digest(model.document()),
             y_box=y_box, u_box=u_box, response=response, cusum=alarm,
         )  # fmt: skip
+        policy = None
+        if profile is not None and K is not None:
+            assert isinstance(model, DifferenceEquation)
+            duration = profile[-1][0] if horizon is None else horizon
+            at_rest, planned = track_profile(model, profile, round(duration / model.period))
+            policy = TubePolicy(
+                at_rest, planned, K=K, L=found[0].L[:, 0], period=model.period, model=funnel.model
+            )
+            funnel = replace(funnel, policy=files.digest(policy.document()))
+            refuse_unmonitorable(funnel)
         trees = [design.multipliers for design in found]
         proof: Json = {} if trees[0] is None else {"multipliers": trees}
-        return Design.proved(model, None, funnel, claim={"kind": "tube"}, proof=proof, found=None)
+        return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
 
     def decided(design: _Found) -> str:
         """Why the kernel refuses the candidate, whatever its level; empty if it is proved."""
         try:
-            proved([tube_of(design, 1 if design.rho == 1.0 else None)], [design])
+            tube = tube_of(design, 1 if design.rho == 1.0 else None)
+            wide = np.sqrt((1.0 + tube.rho * tube.inlet) / (0.99 * tube.tau))
+            proved([replace(tube, half_widths=wide)], [design])
         except CertificateRejected as refusal:
             return str(refusal)
         return ""
 
-    found = [_best(form, gains, e, amplitudes, samples, form.fading(), decided)]
+    start = inlet / safety_factor
+    found = [_best(form, gains, e, amplitudes, samples, form.fading(), decided, start)]
     lasting: list[int | None] = [None]
     if horizon is not None:
-        lasting.append(length := max(1, round(horizon / model.period)))
-        found.append(_best(form, gains, e, amplitudes, length, [1.0], decided))
+        length = max(1, round(horizon / model.period))
+        longest = max(map(len, trials.calibration)) - settling
+        if length > longest:
+            raise DataError(
+                f"horizon {horizon} s is {length} samples; the energy can be measured on the "
+                f"calibration trials for 1 to {longest}"
+            )
+        lasting.append(length)
+        if profile is not None:  # the policy has one observer
+            i = found[0].at
+            gains, e = found[0].L[None], [part[:, i : i + 1] for part in e]
+            found[0] = replace(found[0], at=0)
+        found.append(_best(form, gains, e, amplitudes, length, [1.0], decided, start))
     u = [trial.u for trial in train]
     tubes = []
     for design, samples_left in zip(found, lasting, strict=True):
@@ -131,6 +165,8 @@ def design_output_tube(
             spent = [energy(part[:, design.at], tube)[:, None] for part in e]
             tube = replace(tube, follows=_chosen(level, spent, u))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
+    if profile is not None:  # what is assumed around a plan is what is held there
+        return proved(tubes, found)
     errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
     response = Response(
         np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
@@ -153,9 +189,27 @@ def design_output_tube(
     return proved(tubes, found, response, alarm)
 
 
-def least_window(model: StableModel, train: Dataset) -> int:
-    """Samples of a window of a single recording, on which a tube is designed or measured."""
-    return LEAST_WINDOW * (_settling(model, Stepper(model), train) + REACTION)
+def _gain(model: StableModel, weights: tuple[float, float] | None) -> FloatArray:
+    """K (n,) of the policy that tracks a plan; zeros without weights."""
+    if not isinstance(model, DifferenceEquation):
+        raise DataError(
+            f"a profile is planned for a linear model, not for a {type(model).__name__}; leave it "
+            "out for a tube around the model's simulation"
+        )
+    if weights is None:
+        return np.zeros(len(model))
+    return lqr_gain(model, output_weight=weights[0], input_weight=weights[1])
+
+
+def least_window(model: StableModel, train: Dataset, horizon: float | None = None) -> int:
+    """Samples of a window of a single recording, on which a tube is designed or measured.
+
+    horizon: s, if an energy has to last so long on it.
+    """
+    settling = _settling(model, Stepper(model), train)
+    if horizon is not None:
+        return settling + max(1, round(horizon / model.period))
+    return LEAST_WINDOW * (settling + REACTION)
 
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
@@ -168,7 +222,7 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
         measured = max(measured, float(spent[: tube.samples].max()))
     measured = _above(max(measured, float(np.finfo(float).tiny)))
     level = _above(tube.safety_factor**2 * measured)
-    widths = np.sqrt((level + tube.inlet) / tube.tau)
+    widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
     return replace(
         tube, measured=measured, level=level,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
@@ -272,12 +326,15 @@ def _read(model: StableModel, bounds: Json | None) -> increments.Model:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """The increment form in floats. tree: of a proof's multipliers, with the vertices E of each of
-    its leaves in order, (count, m, m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
+    """The increment form in floats. modes: (F, H), and a second with a policy engaged.
+
+    tree: of a proof's multipliers, with the vertices E of each of its leaves in order, (count, m,
+    m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
     """
 
     F: FloatArray
     H: FloatArray
+    modes: list[tuple[FloatArray, FloatArray]]
     tree: Json | None
     leaves: list[FloatArray]
     mean: FloatArray
@@ -289,7 +346,7 @@ class _Form:
     storage: FloatArray
 
     @classmethod
-    def of(cls, model: StableModel, bounds: Json | None) -> "_Form":
+    def of(cls, model: StableModel, bounds: Json | None, K: FloatArray | None = None) -> "_Form":
         form = _read(model, bounds)
         proof = prove_stability(model) if bounds is None else storage_on(form)
         if proof is None:
@@ -309,8 +366,11 @@ class _Form:
         if form.linear is not None:
             B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
             inputs = B[:, None], D[:, None]
+        modes: list[tuple[FloatArray, FloatArray]] = [(F, H)]
+        if K is not None and K.any() and inputs is not None:
+            modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
         return cls(
-            F, H, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
+            F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
             H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
             np.linalg.inv(proof.P),
         )  # fmt: skip
@@ -419,9 +479,11 @@ def _best(
     samples: int,
     rhos: Sequence[float],
     decided: Callable[[_Found], str],
+    start: float = 0.0,
 ) -> _Found:
     """The pair (L, ρ), solved and proved, of the narrowest tube with a forecast near the narrowest.
 
+    start: the first output's error there, in the unit in which the innovations are not scaled up.
     e: innovations (N, B, p) of the gains in each trial. Pairs are tried in the order of what the
     mean increment alone would give: W = A W A'/ρ + L R⁻¹L', width² = α (R⁻¹_jj + C_j W C_j'/ρ), α
     the most that E can be, `samples` after 0 or ever. SOLVED are solved; while the kernel refuses
@@ -429,14 +491,17 @@ def _best(
     """
     near = CLOSE if min(rhos) < 1.0 else 1.0
 
-    def widths(i: int, rho: float, R: FloatArray, variance: FloatArray) -> tuple[float, float]:
+    def widths(
+        i: int, rho: float, R: FloatArray, variance: FloatArray, W: FloatArray
+    ) -> tuple[float, float]:
         """A forecast's and the lasting tube's, per amplitude."""
+        began = rho * start**2 / float(W[0, 0]) if start else 0.0
         spent = [np.einsum("ti,ij,tj->t", part[:, i], R, part[:, i]) for part in e]
         weights = rho ** np.arange(samples + 1)
         ahead = max(float(np.convolve(part, weights).max()) for part in spent)
         ever = max(float(lfilter([1.0], [1.0, -rho], part).max()) for part in spent)
         scale = float(np.mean(np.sqrt(variance) / amplitudes))
-        return scale * float(np.sqrt(ahead)), scale * float(np.sqrt(ever))
+        return scale * float(np.sqrt(ahead + began)), scale * float(np.sqrt(ever + began))
 
     def ordered(found: list[tuple[float, float, Any]]) -> list[Any]:
         """By the lasting width where the forecast is near the narrowest, then by the forecast."""
@@ -452,7 +517,7 @@ def _best(
             continue
         variance = np.diag(np.linalg.inv(R)) + np.einsum("ij,jk,ik->i", form.C, W, form.C) / rho
         if np.isfinite(variance).all() and (variance > 0.0).all():
-            ranked.append((*widths(i, rho, R, variance), (i, rho)))
+            ranked.append((*widths(i, rho, R, variance, W), (i, rho)))
     pairs, refused = ordered(ranked), ""
     for first in range(0, min(len(pairs), MOST), SOLVED):
         tried: list[tuple[float, float, Any]] = []
@@ -460,11 +525,16 @@ def _best(
             found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
             if found is not None:
                 entry = replace(found, at=i)
-                tried.append((*widths(i, rho, found.R, 1.0 / found.tau), entry))
+                W = np.linalg.inv(found.P)
+                tried.append((*widths(i, rho, found.R, 1.0 / found.tau, W), entry))
         for candidate in ordered(tried):
             refused = decided(candidate)
             if not refused:
                 return candidate  # type: ignore[no-any-return]
+    if len(form.modes) > 1:
+        raise Infeasible(
+            "no proved tube serves both the played inputs and the policy; try a larger input weight"
+        )
     if refused:
         raise Infeasible(f"no proved tube: {refused}")
     raise Infeasible(
@@ -534,14 +604,16 @@ def _balanced(
     moved = np.linalg.norm(np.vstack([T @ form.F[:, :m], form.H[:, :m] / sizes[:, None]]), axis=0)
     nu = 1.0 / np.where(moved > 0.0, moved, 1.0)
     S = block_diag(np.diag(nu), root)
-    F = np.hstack([T @ form.F @ S, T @ L * sizes])
-    H = np.hstack([form.H @ S / sizes[:, None], np.eye(p)])
+    modes = [
+        (np.hstack([T @ F @ S, T @ L * sizes]), np.hstack([H @ S / sizes[:, None], np.eye(p)]))
+        for F, H in form.modes
+    ]
     D = np.linalg.inv(form.mean[:, :m] * nu) if m else np.zeros((0, 0))
     leaves = [D @ E @ S for E in form.leaves]
     windows = _Windows([part / sizes for part in e], rho)
     solution = None
     for _ in range(ROUNDS if p > 1 else 1):
-        solution = _program(F, H, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
+        solution = _program(modes, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
         if solution is None:
             return None
         if p == 1 or not windows.cut(solution[1]):
@@ -589,8 +661,7 @@ class _Windows:
 
 
 def _program(
-    F: FloatArray,
-    H: FloatArray,
+    modes: list[tuple[FloatArray, FloatArray]],
     leaves: list[FloatArray],
     rho: float,
     m: int,
@@ -601,15 +672,17 @@ def _program(
 ) -> tuple[FloatArray, FloatArray, FloatArray, list[list[FloatArray]]] | None:
     """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
 
-    F: (n, m + n + p) = [F L], H: (p, m + n + p) = [H I], all in balanced units.
+    modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
+    of a linear model only.
     """
-    n, p = len(F), len(H)
+    n, p = len(modes[0][0]), len(modes[0][1])
     size = m + n + p
     P = cp.Variable((n, n), symmetric=True)
     tau = cp.Variable(p)
     R: Any = np.eye(1) if p == 1 else cp.Variable((p, p), symmetric=True)
     supply: Any = _placed(rho * P, m, size) + _placed(R, m + n, size)
-    forms = [supply - F.T @ P @ F] + [supply - tau[j] * np.outer(h, h) for j, h in enumerate(H)]
+    forms = [supply - F.T @ P @ F for F, _ in modes]
+    forms += [supply - tau[j] * np.outer(h, h) for _, H in modes for j, h in enumerate(H)]
     room = ROOM * np.eye(size)
     constraints: list[Any] = [P >> ROOM * np.eye(n)]
     if p > 1:

@@ -6,13 +6,12 @@ from typing import Protocol, TypeAlias
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DocumentError
-from nlsid_core.funnels import continuous, linear, sampled, tube
+from nlsid_core.funnels import continuous, sampled, tube
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 
-AnyFunnel: TypeAlias = LinearFunnel | SampledFunnel | ContinuousFunnel | TubeFunnel
+AnyFunnel: TypeAlias = SampledFunnel | ContinuousFunnel | TubeFunnel
 
 
 class Funnel(Protocol):
@@ -45,11 +44,11 @@ class Funnel(Protocol):
 def read_funnel(document: Json, *, source: str = "funnel") -> AnyFunnel:
     """The funnel of a document, by its kind; DocumentError says what is wrong with it."""
     kinds: dict[object, type[AnyFunnel]] = {
-        linear.KIND: LinearFunnel,
         sampled.KIND: SampledFunnel,
         continuous.KIND: ContinuousFunnel,
         tube.KIND: TubeFunnel,
     }
+    files.refuse_old_kind(document, source=source)
     kind = document.get("kind")
     if kind not in kinds:
         raise DocumentError(

@@ -9,7 +9,7 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.factor import rounding_of
-from nlsid_core.funnels.linear import FORMAT
+from nlsid_core.funnels.tube import FORMAT
 
 KIND = "sampled"
 _AXES = {"S": 3, "A": 3, "tube": 1, "inlet": 1, "half_widths": 2, "roots": 1}

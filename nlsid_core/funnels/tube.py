@@ -1,6 +1,11 @@
-"""`TubeFunnel`: tubes around a model's own simulation, and the assumption that each rests on."""
+"""`TubeFunnel`: tubes around a model's own simulation, and the assumption that each rests on.
 
+With a policy, around its plan too: the simulation from the plan's start under the planned inputs.
+"""
+
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -8,6 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.funnels.factor import factor_of, rounding_of
 from nlsid_core.funnels.level import CommandLevel
 
 FORMAT = "nlsid/funnel"
@@ -61,6 +67,23 @@ class Tube:
                 f"tube: rho {self.rho}, samples {self.samples}, level {self.level}, tau "
                 f"{self.tau.tolist()}, half-widths {self.half_widths.tolist()} are not a tube"
             )
+
+    @cached_property
+    def factor(self) -> FloatArray:
+        """F (n, n), F'F = P; DataError if P is not ≻ 0."""
+        return factor_of(self.P)
+
+    @cached_property
+    def rounding(self) -> float:
+        """What rounding can hide of |F x̄|, of itself; DataError if that is too much."""
+        return float(rounding_of(self.factor, "the tube's P"))
+
+    def start_size(self, x_bar: FloatArray) -> float:
+        """How far out of V <= inlet a start x̄ (n,) is: 1 on its boundary, rounded up."""
+        size = float(np.linalg.norm(self.factor @ x_bar)) * (1.0 + self.rounding)
+        if self.inlet > 0.0:
+            return size / math.sqrt(self.inlet) * (1.0 + self.rounding)
+        return math.inf if size != 0.0 else 0.0
 
     @property
     def assumption(self) -> str:
@@ -171,7 +194,8 @@ class TubeFunnel:
     The simulation starts at the observer's state after `settling` samples. y_box (p, 2), u_box
     (n_u, 2): where outputs, states and inputs have to stay, for implicit models whose increments
     are known on a box only; else None. model: its digest. response: what else is assumed, beside
-    what the tubes assume. cusum: a second alarm, which is no assumption.
+    what the tubes assume. cusum: a second alarm, which is no assumption. policy: the digest of the
+    policy whose plan the tubes are around too, None without one.
     """
 
     tubes: tuple[Tube, ...]
@@ -181,6 +205,7 @@ class TubeFunnel:
     u_box: FloatArray | None = None
     response: Response | None = None
     cusum: Cusum | None = None
+    policy: str | None = None
 
     def __post_init__(self) -> None:
         if not self.tubes:
@@ -198,6 +223,25 @@ class TubeFunnel:
         """The first output's, in its unit."""
         return float(self.half_widths[0])
 
+    @property
+    def made_for(self) -> tuple[str, str | None]:
+        """The digests of the model, and of the policy if there is one."""
+        return self.model, self.policy
+
+    @property
+    def last(self) -> float:
+        """The last sample that the proof covers; inf where one of the tubes lasts for ever."""
+        return max(math.inf if t.samples is None else t.samples - 1 for t in self.tubes)
+
+    @property
+    def rounding(self) -> float:
+        """What rounding can hide of the size of a start; DataError if that is too much."""
+        return max(tube.rounding for tube in self.tubes)
+
+    def start_size(self, x_bar: FloatArray) -> float:
+        """How far out of what may start beside the plan x̄ (n,) is: 1 on its boundary."""
+        return max(tube.start_size(x_bar) for tube in self.tubes)
+
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         box: Json = {}
@@ -208,6 +252,7 @@ class TubeFunnel:
             "version": files.VERSION,
             "kind": KIND,
             "model": self.model,
+            **({} if self.policy is None else {"policy": self.policy}),
             "settling": self.settling,
             **box,
             **({} if self.response is None else {"response": self.response.document()}),
@@ -220,6 +265,9 @@ class TubeFunnel:
         """Raises DocumentError if the document is not a funnel of this kind."""
         files.header(document, FORMAT, source=source, kind=KIND)
         entries = files.member(document, "tubes", list, source=source)
+        policy = None
+        if "policy" in document:
+            policy = files.member(document, "policy", str, source=source)
         box: dict[str, Any] = {}
         if "box" in document:
             given = files.member(document, "box", dict, source=source)
@@ -234,6 +282,7 @@ class TubeFunnel:
             **beside,
             settling=files.member(document, "settling", int, source=source),
             model=files.member(document, "model", str, source=source),
+            policy=policy,
             **box,
         )
 

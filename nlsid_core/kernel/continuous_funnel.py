@@ -375,10 +375,9 @@ def _assumptions(field: Field, policy: Policy, bounds: list[Bounds], hold: Hold)
     ranges = ", ".join(f"w{j} in {_range(ends)}" for j, ends in enumerate(field.box))
     result = [obeyed] + [f"at every time {ranges}"] * bool(ranges)
     if field.expansion:
-        said = field.expansion if field.expansion.isascii() else json.dumps(field.expansion)
         result.append(
             "the equations expand others, and that the ranges of w cover what they leave out is an "
-            f"assumption of the vector field, computed by: {said}"
+            f"assumption of the vector field, computed by: {json.dumps(field.expansion)}"
         )
     return tuple(result)
 

@@ -32,6 +32,11 @@ VERSION = 2  # of proofs and of all documents they are about
 
 _LABEL = re.compile(r"(?!e[-+0-9])(1/|[A-Za-z_/%°µ])[A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
 
+# Digits in exponents only: "0.2 m/1000" and "0.2 /1000" would be other numbers.
+_UNIT = re.compile(
+    r"(?![eE][-+^0-9])(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
+)
+
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
 Terms = list[tuple[tuple[int, ...], Fraction]]  # of a polynomial: exponents and coefficients
 
@@ -284,6 +289,11 @@ def label(text: str) -> str:
     Quoted are spaces, punctuation, other scripts, and what could be read as a number's end.
     """
     return text if _LABEL.fullmatch(text) else json.dumps(text)
+
+
+def unit_label(text: str) -> str:
+    """A unit behind a number: as it is if it cannot change how the number is read, else quoted."""
+    return text if not text or _UNIT.fullmatch(text) else json.dumps(text)
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:

@@ -17,7 +17,7 @@ from math import comb, prod
 from . import text
 from .exact import Matrix, combined, definite, transposed
 from .exact import product as times
-from .files import Node, Rejected, label
+from .files import Node, Rejected, label, unit_label
 from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
 from .terms import derivative
 
@@ -178,6 +178,9 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
         raise Rejected(f"a model of kind {kind} needs no box: its increments are known everywhere")
     if not 0 < model.states <= MAX_STATES:
         raise Rejected(f"{node.where}: {model.states} states; 1 to {MAX_STATES} are decided")
+    for signals, what in ((model.y, "outputs"), (model.u, "inputs")):
+        if len({signal.name for signal in signals}) < len(signals):
+            raise Rejected(f"{node.where}: two {what} have the same name")
     return model
 
 
@@ -557,7 +560,7 @@ def _signal(node: Node) -> Signal:
     parts = node.members("name unit path")
     parts["path"].text()
     name, unit = parts["name"].text(), parts["unit"].text()
-    return Signal(label(name), label(unit) if unit else "")
+    return Signal(label(name), unit_label(unit))
 
 
 def _inputs_in_range(beyond: str, u: Sequence[Signal], ranges: Sequence[Sequence[Fraction]]) -> str:

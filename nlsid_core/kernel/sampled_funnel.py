@@ -25,7 +25,7 @@ from math import comb, factorial, prod
 
 from .decision import Decision
 from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed
-from .files import Node, Read, Rejected, Terms, bound_files, label
+from .files import Node, Read, Rejected, Terms, bound_files, label, unit_label
 from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 from .text import above, below
@@ -357,7 +357,7 @@ def _read_model(node: Node) -> Model:
     for entry, (low, high) in zip(x + u, box, strict=True):
         named = entry.members("name unit path")
         name, unit = named["name"].text(), named["unit"].text()
-        signals.append((label(name), label(unit) if unit else "", low, high))
+        signals.append((label(name), unit_label(unit), low, high))
     exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
     if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
         raise Rejected("a model needs a positive period, monomials, and a rate for each position")

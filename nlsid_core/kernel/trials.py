@@ -59,6 +59,17 @@ def shared(trials: list[Recorded], others: list[Recorded]) -> int:
     return count
 
 
+def distinct(trials: list[Recorded]) -> int:
+    """How many of them share no sample with another that is counted: the most there can be."""
+    reached: dict[str, int] = {}
+    count = 0
+    for trial in sorted(set(trials), key=lambda t: t.end):
+        if trial.first >= reached.get(trial.recording, 0):
+            reached[trial.recording] = trial.end
+            count += 1
+    return count
+
+
 def calibration(
     measured: Fraction, factor: Fraction, trials: list[Recorded], fitted_to: list[Recorded] | None
 ) -> str:
@@ -66,7 +77,7 @@ def calibration(
 
     fitted_to: what made the model; None if it does not say.
     """
-    count = len(set(trials))
+    count = distinct(trials)
     kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
     those = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
     return (

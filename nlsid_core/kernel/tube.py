@@ -1,4 +1,4 @@
-"""Claim `tube`: outputs stay near the model's own simulation, for ever, while innovations fade.
+"""Claim `tube`: outputs stay near the model's own simulation, or near a policy's plan.
 
 The model runs twice under the same inputs: the simulation x, and the observer x̂ with L e injected
 after each step, e the innovation. With x̄ = x̂ - x and the increment form of the model,
@@ -7,14 +7,19 @@ At every vertex E, with multipliers N:
     diag(0, ρP, R) - [F L]'P[F L] + sym(N [E 0]) ≻ 0,
     diag(0, ρP, R) - τ_j [H_j 1_j]'[H_j 1_j] + sym(N_j [E 0]) ≻ 0.
 With E_{k+1} = ρE_k + e_k'Re_k, E_0 = 0: V(x̄_k) <= ρ^k V(x̄_0) + E_k and τ_j o_j² <= ρV + e'Re, at
-most inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel may
-hold several such tubes, each with its assumption. Source: docs/certificate_tube.md.
+most ρ inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel
+may hold several such tubes, each with its assumption.
+
+A policy's plan is the simulation from its start under its inputs u_k. Where the policy acts, the
+input is û = u_k - κKx̄, 0 <= κ <= 1: one more ν, û - u_k, whose row [1, κK] gives it, so F becomes
+F - κBK and H becomes H - κDK. Both inequalities are concave in κ: κ = 0 and 1 decide all between.
+Source: docs/certificate_tube.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
-from . import driven_tube, text
+from . import text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
@@ -24,13 +29,29 @@ from .trials import Recorded, calibration, read_trials, shared
 
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
+MAX_PLAN = 10**6  # samples of a plan
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """E <= level g, with what measured it. samples: None is for ever, else an energy's (ρ = 1).
+
+    follows: g, 1 if it is None.
+    """
+
+    level: Fraction
+    samples: int | None
+    measured: Fraction
+    safety_factor: Fraction
+    measured_on: list[Recorded]
+    follows: CommandLevel | None
 
 
 @dataclass(frozen=True)
 class Tube:
-    """One tube of a funnel file; n states, p outputs. samples: None is for ever.
+    """One tube of a funnel file; n states, p outputs.
 
-    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,). measured_on: the trials of `measured`.
+    L: (n, p), P: (n, n), R: (p, p), tau, half_widths: (p,).
     """
 
     rho: Fraction
@@ -39,27 +60,39 @@ class Tube:
     R: Matrix
     tau: list[Fraction]
     half_widths: list[Fraction]
-    level: Fraction
     inlet: Fraction
-    samples: int | None
-    measured: Fraction
-    safety_factor: Fraction
-    measured_on: list[Recorded]
-    follows: CommandLevel | None
+    assumed: Assumption
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What the claim needs of a policy file: K (1, n), L (n, p), and the samples of its plan."""
+
+    K: Matrix
+    L: Matrix
+    samples: int
+
+    @property
+    def acts(self) -> bool:
+        """Whether there is any feedback."""
+        return any(self.K[0])
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
-    """Decide {kind, about: {model, funnel}} by {multipliers}, or a tube about a policy."""
+    """Decide {kind, about: {model, funnel}}, or with a policy beside them, by {multipliers}."""
     about = claim.members("kind about")["about"]
-    if type(about.value) is dict and "policy" in about.value:
-        return driven_tube.decide(claim, proof, read)
-    documents, digests = bound_files(about, read, "model funnel")
-    made_for, names = {"model": digests["model"]}, "settling tubes"
-    stated = documents["funnel"]
-    funnel = stated.document(
-        "funnel", names, "tube", optional="box response cusum", made_for=made_for
+    planned = type(about.value) is dict and "policy" in about.value
+    roles = "model policy funnel" if planned else "model funnel"
+    documents, digests = bound_files(about, read, roles)
+    if documents["funnel"].kind() == "linear":
+        raise Rejected("a funnel of kind 'linear' is now a tube: run `nlsid funnel` again")
+    made_for = {role: digests[role] for role in roles.split()[:-1]}
+    beside = "box" if planned else "box response cusum"
+    funnel = documents["funnel"].document(
+        "funnel", "settling tubes", "tube", optional=beside, made_for=made_for
     )
     model = read_model(documents["model"], funnel.get("box"))
+    policy = _read_policy(documents["policy"], model, digests["model"]) if planned else None
     tubes = [_read(node, model) for node in funnel["tubes"].items(1, MAX_TUBES)]
     given = proof.members("", "multipliers").get("multipliers")
     trees: list[Node] | list[None] = [None] * len(tubes)
@@ -67,47 +100,86 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         trees = given.items(len(tubes), len(tubes))
     margin = Fraction(1)
     for tube, tree in zip(tubes, trees, strict=True):
+        if policy and tube.L != policy.L:
+            raise Rejected("the observer of a tube is not the policy's: L is another")
+        if policy and tube.assumed.follows:
+            raise Rejected("a level that follows the commands is for a tube without a policy")
         definite(tube.P, "P")
         definite(tube.R, "R")
-        positive(model, tree, _forms(model, tube))
+        for mode, moved in _modes(model, policy):
+            positive(moved, tree, _forms(moved, tube, mode))
         for tau, width, signal in zip(tube.tau, tube.half_widths, model.y, strict=True):
-            used = (tube.level + tube.inlet) / (tau * width**2)
+            used = (tube.assumed.level + tube.rho * tube.inlet) / (tau * width**2)
             left = f"{signal.name} can leave the stated half-width {text.above(width)}"
             at_most(used, 1, left)
             margin = min(margin, 1 - used)
     content = documents["model"].value
     named = type(content) is dict and "bags" in content
     fitted = read_trials(documents["model"].member("bags")) if named else None
-    assumptions = [_start(model, tubes, funnel["settling"].whole(0, MAX_SAMPLES))]
+    settling = funnel["settling"].whole(0, MAX_SAMPLES)
+    assumptions = [_start(model, policy, tubes, settling)]
     if "box" in funnel:
         assumptions.append(_inside(model, funnel["box"]))
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
-        assumptions.append(label + _assumption(model, tube, fitted))
+        assumptions.append(label + _assumption(model, tube, fitted, own=_several(tubes)))
     if "response" in funnel:
         assumptions += _response(model, funnel["response"], fitted)
     if "cusum" in funnel:
         _read_cusum(model, funnel["cusum"])
-    return Decision(_statement(model, tubes), margin, tuple(assumptions), digests)
+    return Decision(_statement(model, policy, tubes), margin, tuple(assumptions), digests)
 
 
-def _forms(model: Model, tube: Tube) -> list[tuple[str, Matrix]]:
+def _modes(model: Model, policy: Policy | None) -> list[tuple[str, Model]]:
+    """The increments with the plan's inputs played, and with the policy engaged if it acts."""
+    if policy is None or not policy.acts:
+        return [("", model)]
+    linear, (K,) = model.linear, policy.K
+    if linear is None:
+        raise Rejected("a policy with feedback is decided for a model of kind difference_equation")
+    engaged = replace(
+        model,
+        F=[[f - b * k for f, k in zip(row, K, strict=True)]
+           for row, b in zip(model.F, linear.B, strict=True)],
+        H=[[h - linear.D * k for h, k in zip(row, K, strict=True)] for row in model.H],
+    )  # fmt: skip
+    return [(", the plan's inputs played,", model), (", the policy engaged,", engaged)]
+
+
+def _forms(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
     """The two inequalities of the module's docstring, without the multipliers."""
     p = len(model.H)
     supply = block_diagonal(zero(model.unknowns), scaled(tube.P, tube.rho), tube.R)
     F = [row + gain for row, gain in zip(model.F, tube.L, strict=True)]
     growth = combined(supply, congruence(F, tube.P), -1)
-    forms = [("the decrease of V up to the innovation's energy", growth)]
+    forms = [(f"the decrease of V up to the innovation's energy{mode}", growth)]
     for j, (row, tau) in enumerate(zip(model.H, tube.tau, strict=True)):
         output = row + [Fraction(int(i == j)) for i in range(p)]
         bound = combined(supply, congruence([output], [[tau]]), -1)
-        forms.append((f"the bound on {model.y[j].name} by V", bound))
+        forms.append((f"the bound on {model.y[j].name} by V{mode}", bound))
     return forms
 
 
 def _read(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
     parts = node.members("rho L P R tau half_widths level inlet assumption", "follows")
+    rho = parts["rho"].number()
+    tube = Tube(
+        rho=rho, L=parts["L"].array(n, p), P=parts["P"].array(n, n), R=parts["R"].array(p, p),
+        tau=parts["tau"].array(p), half_widths=parts["half_widths"].array(p),
+        inlet=parts["inlet"].number(), assumed=_read_assumption(parts, rho, len(model.u)),
+    )  # fmt: skip
+    if min(tube.tau) <= 0 or min(tube.half_widths) <= 0:
+        raise Rejected("tau and half-widths should be positive")
+    if tube.inlet < 0:
+        raise Rejected("the inlet should be 0 or more")
+    if tube.assumed.follows is not None and (rho == 1 or tube.inlet):
+        raise Rejected("a level that follows the commands is for fading, without an inlet")
+    return tube
+
+
+def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assumption:
+    """level, assumption and follows of a tube's members."""
     names = "kind measured safety_factor designed_on measured_on"
     given = parts["assumption"].members(names, "samples")
     kind = given["kind"].text()
@@ -115,31 +187,42 @@ def _read(node: Node, model: Model) -> Tube:
         raise Rejected(f"assumption {kind!r} is unknown; known: fading, energy")
     if (kind == "energy") != ("samples" in given):
         raise Rejected("the assumption energy is for a number of samples, fading for ever")
-    tube = Tube(
-        rho=parts["rho"].number(), L=parts["L"].array(n, p), P=parts["P"].array(n, n),
-        R=parts["R"].array(p, p), tau=parts["tau"].array(p),
-        half_widths=parts["half_widths"].array(p), level=parts["level"].number(),
-        inlet=parts["inlet"].number(),
-        samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
-        measured=given["measured"].number(), safety_factor=given["safety_factor"].number(),
-        measured_on=read_trials(given["measured_on"]),
-        follows=read_level(parts["follows"], len(model.u), 1) if "follows" in parts else None,
-    )  # fmt: skip
-    if not 0 < tube.rho <= 1 or (kind == "energy") != (tube.rho == 1):
+    if not 0 < rho <= 1 or (kind == "energy") != (rho == 1):
         raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
-    if min(tube.tau) <= 0 or min(tube.half_widths) <= 0:
-        raise Rejected("tau and half-widths should be positive")
-    if min(tube.inlet, tube.measured) < 0 or tube.safety_factor < 1:
-        raise Rejected("inlet and measured should be 0 or more, the safety factor 1 or more")
-    if tube.follows is not None and (kind == "energy" or tube.inlet):
-        raise Rejected("a level that follows the commands is for fading, without an inlet")
-    if not tube.measured_on:
+    assumed = Assumption(
+        level=parts["level"].number(),
+        samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
+        measured=given["measured"].number(),
+        safety_factor=given["safety_factor"].number(),
+        measured_on=read_trials(given["measured_on"]),
+        follows=read_level(parts["follows"], inputs, 1) if "follows" in parts else None,
+    )
+    if assumed.measured < 0 or assumed.safety_factor < 1:
+        raise Rejected("measured should be 0 or more, the safety factor 1 or more")
+    if not assumed.measured_on:
         raise Rejected("the assumption was measured on no trial")
-    if shared(tube.measured_on, read_trials(given["designed_on"])):
+    if shared(assumed.measured_on, read_trials(given["designed_on"])):
         raise Rejected("a trial that the tube was designed on cannot measure its assumption")
-    least = tube.safety_factor**2 * tube.measured
-    at_most(least, tube.level, "the level is below safety_factor^2 x measured")
-    return tube
+    least = assumed.safety_factor**2 * assumed.measured
+    at_most(least, assumed.level, "the level is below safety_factor^2 x measured")
+    return assumed
+
+
+def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
+    n, p = model.states, len(model.H)
+    plan = node.document("policy", "period start u K L", "tube", made_for={"model": made_for})
+    if plan["period"].number() != model.period:
+        raise Rejected("the policy's period is not the model's")
+    plan["start"].array(n)
+    u = plan["u"].array(None, len(model.u))
+    if not 0 < len(u) <= MAX_PLAN:
+        raise Rejected(f"a plan should have 1 to {MAX_PLAN} samples")
+    if model.linear is None:
+        raise Rejected("a plan is decided for a model of kind difference_equation")
+    low, high = model.linear.input_range
+    if any(not low <= entry <= high for row in u for entry in row):
+        raise Rejected("a planned input is outside the model's input range")
+    return Policy(plan["K"].array(len(model.u), n), plan["L"].array(n, p), len(u))
 
 
 def _response(model: Model, node: Node, fitted_to: list[Recorded] | None) -> list[str]:
@@ -179,32 +262,63 @@ def _read_cusum(model: Model, node: Node) -> None:
         raise Rejected("cusum: deviation and threshold should be positive, drift 0 or more")
 
 
-def _statement(model: Model, tubes: list[Tube]) -> str:
+def _statement(model: Model, policy: Policy | None, tubes: list[Tube]) -> str:
     said = []
     for i, tube in enumerate(tubes, 1):
         widths = " and ".join(
             f"{signal.name} within {signal.quantity(text.above(width))}"
-            + (" sqrt(g)" if tube.follows else "")
+            + (" sqrt(g)" if tube.assumed.follows else "")
             for signal, width in zip(model.y, tube.half_widths, strict=True)
         )
         how_long = "for ever"
-        if tube.samples is not None:
-            span = text.below((tube.samples - 1) * model.period)
-            how_long = f"for {tube.samples} samples, which span {span} s"
+        if tube.assumed.samples is not None:
+            how_long = f"for {_samples(model, tube.assumed.samples)}"
         said.append(f"{f'({i}) ' if len(tubes) > 1 else ''}{widths} {how_long}")
     return (
         f"tube: the measured output stays near the model's simulation under the same inputs, "
-        f"{'; '.join(said)}, {model.inputs}"
+        f"{'; '.join(said)}, {model.inputs}{_around_plan(model, policy)}"
     )
 
 
-def _start(model: Model, tubes: list[Tube], settling: int) -> str:
+def _samples(model: Model, count: int) -> str:
+    return f"{count} samples, which span {text.below((count - 1) * model.period)} s"
+
+
+def _around_plan(model: Model, policy: Policy | None) -> str:
+    """What is claimed of the plan beside what is claimed of every simulation."""
+    if policy is None:
+        return ""
+    same = (
+        "; and as near the policy's plan, which is the simulation from its start under its inputs, "
+        f"for at most its {_samples(model, policy.samples)}, "
+    )
+    if not policy.acts or model.linear is None:
+        return f"{same}with those inputs played (no feedback)"
+    low, high = model.linear.input_range
+    clipped = model.u[0].quantity(f"[{text.exact(low)}, {text.exact(high)}]")
+    return (
+        f"{same}whether those inputs are played, the policy is engaged around them, or anything "
+        "between the two acts, such as the policy's input clipped to a range that holds the "
+        f"plan's, as {clipped} does"
+    )
+
+
+def _several(tubes: list[Tube]) -> bool:
+    """Whether the tubes have observers of their own."""
+    return any(tube.L != tubes[0].L for tube in tubes)
+
+
+def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int) -> str:
     span = text.above(settling * model.period)
-    start = f"after {settling} samples ({span} s) the simulation starts at the observer's state"
-    if not any(tube.inlet for tube in tubes):
-        return start
+    whose = "the observer's state"
+    if _several(tubes):
+        whose = "one state with the observers, one for each tube"
+    start = f"after {settling} samples ({span} s) the simulation starts at {whose}"
     inlets = " and ".join(text.below(tube.inlet) for tube in tubes)
-    return f"{start}, or where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
+    if any(tube.inlet for tube in tubes):
+        near = f"where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
+        return f"{start}, or {near}" + (", as the plan does" if policy else "")
+    return start + (", as the plan does" if policy else "")
 
 
 def _inside(model: Model, box: Node) -> str:
@@ -217,20 +331,21 @@ def _inside(model: Model, box: Node) -> str:
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 
 
-def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None) -> str:
+def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own: bool) -> str:
+    """own: whether other tubes have other observers."""
     # One output and R = 1: V and E carry its unit squared.
-    unit, energy = "", "e'Re"
+    unit, energy, assumed = "", "e'Re", tube.assumed
     if len(model.y) == 1:
         unit = f"({model.y[0].unit})^2" if model.y[0].unit and tube.R == [[1]] else ""
         energy = "e^2" if tube.R == [[1]] else f"{text.exact(tube.R[0][0])} e^2"
-    squared = Signal("", unit)
-    level = squared.quantity(text.below(tube.level))
+    level = Signal("", unit).quantity(text.below(assumed.level))
     growth = f"E+ = {text.exact(tube.rho)} E + {energy} from 0"
     bound = f"E <= {level} after every sample, {growth}"
-    if tube.follows is not None:
-        g = formula(tube.follows, 0, model.u)
+    if assumed.follows is not None:
+        g = formula(assumed.follows, 0, model.u)
         bound = f"E <= {level} g after every sample, {growth}, g = {g}"
-    if tube.samples is not None:
-        bound = f"sum of {energy} <= {level} over {tube.samples} samples"
-    worth = calibration(tube.measured, tube.safety_factor, tube.measured_on, fitted_to)
-    return f"innovation energy: {bound} ({worth})"
+    if assumed.samples is not None:
+        bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
+    worth = calibration(assumed.measured, assumed.safety_factor, assumed.measured_on, fitted_to)
+    whose = " of its own observer" if own else ""
+    return f"innovation energy{whose}: {bound} ({worth})"

@@ -6,20 +6,19 @@ from typing import Any, Protocol, TypeAlias
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DocumentError
-from nlsid_core.policies import continuous, linear, sampled
+from nlsid_core.policies import continuous, sampled, tube
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
 
-AnyPolicy: TypeAlias = LinearPolicy | SampledPolicy | ContinuousPolicy
+AnyPolicy: TypeAlias = TubePolicy | SampledPolicy | ContinuousPolicy
 
 
 class Policy(Protocol):
-    """A plan and the feedback around it; `when`: a sample, or s of a continuous policy."""
+    """A plan and the feedback around it; `when`: a sample, or s of a continuous policy.
 
-    @property
-    def made_for(self) -> str:
-        """The digest of the model or vector field."""
+    Of a tube, `TubePolicy.plan(model)`, since the plan is the model's own solution.
+    """
 
     @property
     def planned(self) -> FloatArray:
@@ -35,17 +34,15 @@ class Policy(Protocol):
     def covers(self, when: float, x: FloatArray) -> tuple[Any, Any]:
         """The least and greatest input that the proof covers at `when` for the state x."""
 
-    def document(self) -> Json:
-        """The JSON form; every number round-trips exactly."""
-
 
 def read_policy(document: Json, *, source: str = "policy") -> AnyPolicy:
     """The policy of a document, by its kind; DocumentError says what is wrong with it."""
     kinds: dict[object, type[AnyPolicy]] = {
-        linear.KIND: LinearPolicy,
+        tube.KIND: TubePolicy,
         sampled.KIND: SampledPolicy,
         continuous.KIND: ContinuousPolicy,
     }
+    files.refuse_old_kind(document, source=source)
     kind = document.get("kind")
     if kind not in kinds:
         known = ", ".join(map(str, kinds))

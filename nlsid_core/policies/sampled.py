@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
 from nlsid_core.errors import DocumentError, ShapeError
-from nlsid_core.policies.linear import FORMAT
+from nlsid_core.policies.tube import FORMAT
 
 KIND = "sampled"
 

@@ -1,48 +1,16 @@
 """What a funnel's proof assumes, measured sample by sample: which part of it is used, 1 = all."""
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
-from nlsid_core.funnels.factor import UNIT
-from nlsid_core.funnels.linear import LinearFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.running.observer import StateObserver
-
-
-class EnergyMeter:
-    """E⁺ = ρE + R e² of one innovation over the budgets of m funnels.
-
-    What rounding could hide is added.
-    """
-
-    def __init__(self, funnels: Sequence[LinearFunnel]) -> None:
-        self._rho = np.array([funnel.rho for funnel in funnels])
-        self._R = np.array([funnel.R[0, 0] for funnel in funnels])
-        self._budget = np.array([funnel.assumption.budget for funnel in funnels])
-        rounding = [(funnel.assumption.samples + 3) * UNIT for funnel in funnels]
-        self._share = (1.0 + 2.0 * np.array(rounding)) / self._budget
-        self.restart()
-
-    def restart(self) -> None:
-        """A new run: nothing is used."""
-        self._spent = np.zeros(len(self._budget))
-
-    def update(self, innovation: FloatArray) -> list[float]:
-        """The part of each budget that is used after these innovations (m,)."""
-        self._spent = self._rho * self._spent + self._R * (innovation * innovation)
-        used: list[float] = (self._spent * self._share).tolist()
-        return used
-
-    def excess(self, i: int) -> str:
-        """How funnel i's assumption is broken."""
-        return f"disturbance energy {self._spent[i]:.4g} above the budget {self._budget[i]:.4g}"
 
 
 class DisturbanceMeter:

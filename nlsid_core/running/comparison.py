@@ -15,23 +15,24 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError, apart
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.factor import refuse_unmonitorable
-from nlsid_core.funnels.linear import LinearFunnel
+from nlsid_core.funnels.factor import UNIT, refuse_unmonitorable
 from nlsid_core.funnels.sampled import SampledFunnel
+from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy
 from nlsid_core.policies.sampled import SampledPolicy
-from nlsid_core.running.assumption import EnergyMeter, meter_of
+from nlsid_core.policies.tube import TubePolicy
+from nlsid_core.running.assumption import meter_of
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Level
+from nlsid_core.running.tubes import ROUNDING, assuming
 
 COMMAND_TOLERANCE = 1e-9  # relative: rounding between computing a policy's input and recording it
 
 
 class Centre(Enum):
-    """What a linear tube is around: the model driven by the received commands, or the plan."""
+    """What a tube is around: the model driven by the received commands, or the policy's plan."""
 
     COMMAND = "command"
     PROFILE = "profile"
@@ -85,76 +86,42 @@ class Comparison(Protocol):
         """The next sample against the sets; SolverError if the model has no next state."""
 
 
-class LinearComparison:
-    """x̂ and the nominal x of a difference equation against m of its funnels, stacked.
+class PlanComparison:
+    """A linear model's output beside the plans of m policies, each with its funnel of tubes.
 
-    Ten cost little more than one; each funnel's numbers are the same bit for bit alone or stacked.
+    A policy has one observer x̂, and so have the tubes beside it. Each funnel's numbers are the same
+    bit for bit alone or with others.
     """
 
     def __init__(
         self,
         model: DifferenceEquation,
-        policies: Sequence[LinearPolicy],
-        funnels: Sequence[LinearFunnel],
-        centre: Centre,
+        policies: Sequence[TubePolicy],
+        funnels: Sequence[TubeFunnel],
     ) -> None:
-        for policy, funnel in zip(policies, funnels, strict=True):
-            if policy.period != model.period:
-                raise CertificateMismatch("the policy has another sample time than the model")
-            if centre is Centre.PROFILE and len(policy) < funnel.assumption.samples:
-                raise CertificateMismatch(
-                    f"the policy plans {len(policy)} samples, the funnel "
-                    f"{funnel.assumption.samples}"
-                )
-        self.model, self._centre, self._funnels = model, centre, tuple(funnels)
+        if any(policy.period != model.period for policy in policies):
+            raise CertificateMismatch("the policy has another sample time than the model")
+        if any(tube.follows is not None for funnel in funnels for tube in funnel.tubes):
+            raise CertificateMismatch("around a plan no level follows the commands")
+        for funnel in funnels:
+            refuse_unmonitorable(funnel)
+        self.model, self._funnels = model, tuple(funnels)
         self.period, self.lags = model.period, len(model)
-        self.last = [funnel.last for funnel in funnels]
-        n, m = len(model), len(funnels)
-        self.axes = (*(f"{model.y.name} +{i}" for i in range(n)), "innovation")
-        # x̂⁺ = A x̂ + B u + f + L e, transposed, as one product with the row [x̂, u, 1, e]
-        self._step = np.array(
-            [np.vstack([model.A.T, model.B.T, model.offset, policy.L]) for policy in policies]
-        )
-        rounded_up = [funnel.factor.T * (1.0 + funnel.rounding) for funnel in funnels]
-        self._factor = np.array(rounded_up)  # [x̄, e] @ factor has length 1 on the boundary
-        self._half_widths = np.array([funnel.axis_half_widths for funnel in funnels])
-        self._meter = EnergyMeter(funnels)
-        if centre is Centre.PROFILE:
-            longest = max(funnel.assumption.samples for funnel in funnels) + 1
-            self._K = np.array([policy.K for policy in policies])
-            self._x_plan = np.array([_held(policy.x, longest) for policy in policies])
-            self._u_plan = np.array([_held(policy.u, longest) for policy in policies])
-        self._rows = np.zeros((m, 2, n + 3))  # [x̂, u, 1, e] and [x_k, u_k, 1, 0] of each funnel
-        self._rows[:, :, n + 1] = 1.0
-        self._deviation = np.empty((m, n + 1))  # [x̄, e]
-        self._unbroken = [""] * m
-        unit = f" ({model.y.unit})²" if model.y.unit else ""
-        self.assuming = [
-            f"{_energy(f)} ≤ {f.assumption.budget:.4g}{unit} over {f.assumption.samples} samples"
-            for f in funnels
+        self._plans = [policy.plan(model) for policy in policies]
+        self.last = [
+            min(plan.last, funnel.last) for plan, funnel in zip(self._plans, funnels, strict=True)
         ]
-        self.over = [f"{f.assumption.samples} samples" for f in funnels]
-        self._name_parts()
+        self._step = np.vstack([model.A.T, model.B.T, model.offset])  # of a row [x̂, u, 1]
+        self._D, self._c = model.D, model.c
+        self.assuming = [assuming(funnel.tubes) for funnel in funnels]
+        self.over = [f"{last + 1:g} samples" for last in self.last]
         self.restart()
-
-    def _name_parts(self) -> None:
-        """Views of the stacked rows, made once: slicing is a third of an update otherwise."""
-        n, rows = len(self.model), self._rows
-        self._x, self._x_nominal = rows[:, 0, :n], rows[:, 1, :n]
-        self._x_both = rows[:, :, :n]
-        self._y_past, self._y_nominal = rows[:, 0, 0], rows[:, 1, 0]
-        self._u, self._u_nominal = rows[:, 0, n], rows[:, 1, n]
-        self._e = rows[:, 0, n + 2]
-        self._x_bar, self._e_bar = self._deviation[:, :n], self._deviation[:, n]
-        self._deviation_row = self._deviation[:, None, :]
-        self._D, self._c = self.model.D, self.model.c
-        self._lowest, self._highest = self.model.u_range
 
     def restart(self) -> None:
         """A new run."""
         self._y_lags: list[float] = []
         self._u_lags: list[float] = []
-        self._meter.restart()
+        self._spent = [[0.0] * len(funnel.tubes) for funnel in self._funnels]
 
     def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
         """Numbers as they are."""
@@ -174,75 +141,66 @@ class LinearComparison:
 
     def collect(self, y: float, u: float) -> list[str] | None:
         """Gather the first n samples, which give the observers their exact state."""
-        n = len(self.model)
         self._y_lags.append(y)
         self._u_lags.append(u)
-        if len(self._y_lags) < n:
+        if len(self._y_lags) < len(self.model):
             return None
         x = self.model.state_after(self._y_lags, self._u_lags)
-        planned = self._x_plan[:, 0] if self._centre is Centre.PROFILE else x
-        self._x[:], self._x_nominal[:] = x, planned
+        self._x = [x] * len(self._funnels)
         broken = []
-        for funnel, x_bar in zip(self._funnels, self._x - self._x_nominal, strict=True):
-            size = funnel.start_size(x_bar)
+        for plan, funnel in zip(self._plans, self._funnels, strict=True):
+            size = funnel.start_size(x - plan.x[0])
             far = f"started outside the inlet: {size:.3g} times as far out as its boundary"
             broken.append("" if size <= 1.0 else far)
         return broken
 
     def compare(self, when: float, t: float, y: float, u: float) -> Compared:
-        """Sample k = `when` against the tubes, then every x̂ and x one sample on."""
-        k, played, D, c = int(when), self._centre is Centre.COMMAND, self._D, self._c
-        self._u[:] = u
-        self._u_nominal[:] = u if played else self._u_plan[:, k]
-        innovation = y - (self._y_past + (D * u + c))
-        self._e[:] = innovation
-        self._e_bar[:] = innovation
-        np.subtract(self._x, self._x_nominal, out=self._x_bar)
-        used = self._meter.update(innovation)
-        away = (self._deviation_row @ self._factor)[:, 0]
-        sizes: list[float] = np.sqrt((away * away).sum(axis=1)).tolist()
-        worst = (np.abs(self._deviation) / self._half_widths).argmax(axis=1).tolist()
-        output = self._y_nominal + (D * self._u_nominal + c)
-        broken = self._unbroken
-        in_range = self._lowest <= u <= self._highest
-        if not (played and in_range and _all_kept(used)):
-            broken = self._broken(k, t, u, used)
-        deviation = self._deviation.tolist()
-        self._x_both[:] = self._rows @ self._step
-        if not played:
-            self._x_nominal[:] = self._x_plan[:, k + 1]
-        return Compared(
-            sizes,
-            used,
-            [self.axes[i] for i in worst],
-            broken,
-            [(planned,) for planned in output.tolist()],
-            deviation,
-        )
+        """Sample k = `when` against the tubes, then every x̂ one sample on."""
+        k, known = int(when), np.array([u, 1.0])
+        found = Compared([], [], [], [], [], [])
+        for i, plan in enumerate(self._plans):
+            x = self._x[i]
+            e = y - (float(x[0]) + self._D * u + self._c)
+            planned = float(plan.y[min(k, len(plan) - 1)])
+            size, used, most = self._held(i, k, y - planned, e)
+            found.sizes.append(size)
+            found.used.append(used)
+            found.worst.append(self.model.y.name)
+            found.broken.append(self._broken(k, t, u, i, used, most) if k <= plan.last else "")
+            found.nominal.append((planned,))
+            found.deviation.append([y - planned, e])
+            self._x[i] = np.append(x, known) @ self._step + plan.policy.L * e
+        return found
 
-    def _broken(self, k: int, t: float, u: float, used: list[float]) -> list[str]:
-        """How each assumption is broken at this sample."""
-        name, lowest, highest = self.model.u.name, self._lowest, self._highest
-        m = len(self._funnels)
-        planned: list[float] = [u] * m
-        meant = planned
-        if self._centre is Centre.PROFILE:
-            planned = self._u_plan[:, k].tolist()
-            meant = (self._u_plan[:, k] - (self._K * self._x_bar).sum(axis=1)).tolist()
-        broken = []
-        for i in range(m):
-            low, high = min(planned[i], meant[i]), max(planned[i], meant[i])
-            room = COMMAND_TOLERANCE * (1.0 + abs(meant[i]))
-            if not used[i] <= 1.0:
-                broken.append(f"{self._meter.excess(i)} at t = {t:g} s")
-            elif not lowest <= u <= highest:
-                told = apart(u, lowest, highest)
-                broken.append(f"{name} {told[0]} outside the fitted range [{told[1]}, {told[2]}]")
-            elif not low - room <= u <= high + room:
-                broken.append(f"{name} {u:.6g} is not the policy's {meant[i]:.6g} at t = {t:g} s")
-            else:
-                broken.append("")
-        return broken
+    def _held(self, i: int, k: int, away: float, e: float) -> tuple[float, float, int]:
+        """|o| in half-widths, the part of a level used and whose: the most of funnel i's tubes."""
+        size, used, most, spent = 0.0, 0.0, 0, self._spent[i]
+        for j, tube in enumerate(self._funnels[i].tubes):
+            spent[j] = (tube.rho * spent[j] + tube.R[0, 0] * e * e) * (1.0 + 8.0 * UNIT)
+            if tube.samples is not None and k >= tube.samples:
+                continue
+            size = max(size, abs(away) / (float(tube.half_widths[0]) * (1.0 - ROUNDING)))
+            part = spent[j] / (tube.level * (1.0 - ROUNDING))
+            if not part <= used:
+                used, most = part, j
+        return size, used, most
+
+    def _broken(self, k: int, t: float, u: float, i: int, used: float, most: int) -> str:
+        """How funnel i's assumption is broken at this sample; most: the tube of which `used` is."""
+        plan, (lowest, highest) = self._plans[i], self.model.u_range
+        planned, meant = float(plan.planned[k]), plan(k, self._x[i])
+        low, high = min(planned, meant), max(planned, meant)
+        room = COMMAND_TOLERANCE * (1.0 + abs(meant))
+        if not used <= 1.0:
+            level = self._funnels[i].tubes[most].level
+            spent = self._spent[i][most]
+            return f"innovation energy {spent:.4g} above the level {level:.4g} at t = {t:g} s"
+        if not lowest <= u <= highest:
+            told = apart(u, lowest, highest)
+            return f"{self.model.u.name} {told[0]} outside the fitted range [{told[1]}, {told[2]}]"
+        if not low - room <= u <= high + room:
+            return f"{self.model.u.name} {u:.6g} is not the policy's {meant:.6g} at t = {t:g} s"
+        return ""
 
 
 class SampledComparison:
@@ -440,19 +398,3 @@ def not_the_policys(t: float, u: FloatArray, wanted: FloatArray, names: Sequence
         return ""
     i = int(np.argmax(apart))
     return f"{names[i]} {u[i]:.6g} is not the policy's {wanted[i]:.6g} at t = {t:g} s"
-
-
-def _all_kept(used: list[float]) -> bool:
-    """Whether no assumption is used up; NaN is no proof of that."""
-    return all(part <= 1.0 for part in used)
-
-
-def _energy(funnel: LinearFunnel) -> str:
-    """What the assumption bounds, in letters."""
-    weight = "" if funnel.R[0, 0] == 1.0 else f"{funnel.R[0, 0]:.3g} "
-    return f"Σ {weight}e²" if funnel.rho == 1.0 else f"E, E⁺ = {funnel.rho:.4g} E + {weight}e²,"
-
-
-def _held(plan: FloatArray, length: int) -> FloatArray:
-    """`plan` cut to `length` samples, or with its last one repeated."""
-    return plan[np.minimum(np.arange(length), len(plan) - 1)]

@@ -1,6 +1,6 @@
 """`Controller`: runs a policy on samples as they come; the live twin of what was proved.
 
-Of a linear tube input k+1 depends on the samples up to k only, so it is known a period before it
+Of a tube input k+1 depends on the samples up to k only, so it is known a period before it
 acts. Of the other kinds input k answers sample k and has the period to get there.
 """
 
@@ -18,6 +18,7 @@ from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.protocol import AnyFunnel
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.policies.protocol import AnyPolicy
+from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
 from nlsid_core.running.monitor import Dynamics, refuse_mismatch
 from nlsid_core.running.observer import (
@@ -116,6 +117,10 @@ class Controller:
     ) -> None:
         for parts in stages:
             refuse_mismatch(*parts)
+        stages = [
+            (model, policy.plan(model) if isinstance(policy, TubePolicy) else policy, funnel)
+            for model, policy, funnel in stages
+        ]
         model, policy, funnel = stages[0]
         self._stages, self.limits, self._settling = stages, limits, settling
         self._continuous = isinstance(model, VectorField)
@@ -231,7 +236,7 @@ class Controller:
 def _observer(model: Any, policy: Any) -> Observer:
     """The observer that the policy answers."""
     if isinstance(model, DifferenceEquation):
-        return PredictingObserver(model, policy.L)
+        return PredictingObserver(model, policy.policy.L)
     return (
         MeasuredStateObserver()
         if isinstance(model, VectorField)

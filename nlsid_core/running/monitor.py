@@ -16,18 +16,17 @@ from nlsid_core import files
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import LinearFunnel
-from nlsid_core.funnels.protocol import AnyFunnel, Funnel
+from nlsid_core.funnels.protocol import AnyFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.models.measured_state import MeasuredState
-from nlsid_core.policies.protocol import AnyPolicy, Policy
+from nlsid_core.policies.protocol import AnyPolicy
 from nlsid_core.running.comparison import (
     Centre,
     Comparison,
     ContinuousComparison,
-    LinearComparison,
+    PlanComparison,
     SampledComparison,
 )
 from nlsid_core.running.grid import Grid
@@ -46,12 +45,12 @@ class Monitor:
 
     model: the model, or the vector field, that the policy and the funnel were made for. u: the
     input applied from t on (the latest command with a stamp not after t); it may be None at the
-    last sample. centre: of a linear tube. period: s between samples, of a continuous funnel only.
+    last sample. centre: of a tube with a policy. period: s between samples, of a continuous funnel.
 
-    Tubes around a model's simulation need no policy, and are held for ever: see `TubeRun`. Of the
-    other kinds, a run starts with the first sample, or at the stamp given to `restart`. It ends at
-    the first sample that is missing, not finite or off the grid of the start, and where the proof
-    ends; after that every reading is unknown until `restart`.
+    Tubes around a model's simulation are held for ever: see `TubeRun`. Around a plan, a run starts
+    with the first sample, or at the stamp given to `restart`. It ends at the first sample that is
+    missing, not finite or off the grid of the start, and where the proof ends; after that every
+    reading is unknown until `restart`.
 
     Raises CertificateMismatch if the parts do not belong together, DataError if the funnel cannot
     be monitored in float64.
@@ -76,7 +75,7 @@ class Monitor:
         *,
         centre: Centre = Centre.COMMAND,
     ) -> "Monitor":
-        """One robot against several linear funnels, or tubes, of its model at once; see `readings`.
+        """One robot against several funnels of tubes of its model at once; see `readings`.
 
         Ten cost little more than one.
         """
@@ -117,13 +116,14 @@ class Monitor:
         self.funnels = tuple(funnels)
         tubes = [funnel for funnel in funnels if isinstance(funnel, TubeFunnel)]
         # Whether a sample that is missing is only that, and no end of the run.
-        self.goes_on = len(tubes) == len(funnels)
+        followed = centre is Centre.PROFILE and None not in policies
+        self.goes_on = len(tubes) == len(funnels) and not followed
         if self.goes_on:
             model: Any = models[0]
             self._tubes = TubeRun(model, tubes)
             self.lags = self._tubes.lags
             return
-        self._comparison = _comparison(models, policies, funnels, centre, period)
+        self._comparison = _comparison(models, policies, funnels, period)
         comparison = self._comparison
         self.lags = comparison.lags  # samples before an announced start that the observer needs
         self._count = len(comparison.last)
@@ -241,18 +241,15 @@ class Monitor:
         return said
 
 
-def refuse_mismatch(model: Dynamics, policy: Policy | None, funnel: Funnel | TubeFunnel) -> None:
+def refuse_mismatch(model: Dynamics, policy: AnyPolicy | None, funnel: AnyFunnel) -> None:
     """CertificateMismatch if the funnel was not made for this policy, or either for this model."""
     digest = files.digest(model.document())
-    if isinstance(funnel, TubeFunnel):
-        if funnel.model != digest:
-            raise CertificateMismatch("the funnel was made for another model")
-        return
-    if policy is None:
-        raise CertificateMismatch("this kind of funnel is about a policy")
-    if funnel.made_for[0] != digest or policy.made_for != digest:
+    made_for, its_policy = funnel.made_for
+    if made_for != digest or (policy is not None and policy.made_for != digest):
         raise CertificateMismatch("policy or funnel was made for another model")
-    if funnel.made_for[1] != files.digest(policy.document()):
+    if its_policy is not None and policy is None:
+        raise CertificateMismatch("the funnel is about a policy")
+    if policy is not None and its_policy != files.digest(policy.document()):
         raise CertificateMismatch("the funnel was made for another policy")
 
 
@@ -260,18 +257,17 @@ def _comparison(
     models: list[Any],
     policies: list[Any],
     funnels: list[Any],
-    centre: Centre,
     period: float | None,
 ) -> Comparison:
     """The arithmetic for funnels of this kind."""
     kinds = {type(funnel) for funnel in funnels}
-    if kinds == {LinearFunnel}:
-        return LinearComparison(models[0], policies, funnels, centre)
+    if kinds == {TubeFunnel}:
+        return PlanComparison(models[0], policies, funnels)
     if kinds == {SampledFunnel} and len(funnels) == 1:
         return SampledComparison(models[0], policies[0], funnels[0])
     if kinds == {ContinuousFunnel}:
         return ContinuousComparison(models, policies, funnels, period or math.nan)
-    raise DataError("several funnels at once are held against linear tubes of one model only")
+    raise DataError("several funnels at once are held against tubes of one model only")
 
 
 def _all_at_most(sizes: list[float], bound: float) -> bool:

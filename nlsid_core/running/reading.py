@@ -31,10 +31,10 @@ class Reading(NamedTuple):
     already taken off; NaN if unknown, -inf if the size is not finite. assumption: the part of what
     the assumption allows that is used, 1 is all of it; NaN if it is not measured. time_to_exit: s
     until the margin is 0 if it goes on falling as it does (no proof); inf if it does not fall.
-    worst_axis: the axis nearest its bound: a state, or `speed +2`, what the past says of the speed
-    two samples ahead, or `innovation`. nominal, measured: each measured signal, in its unit;
-    nominal is empty if unknown. level: see `Level`. reason: why it is not inside, empty if it is.
-    assuming: the assumption in words. deviation: from the nominal, on each axis in its unit.
+    worst_axis: the axis nearest its bound, an output or a state. nominal, measured: each measured
+    signal, in its unit; nominal is empty if unknown. level: see `Level`. reason: why it is not
+    inside, empty if it is. assuming: the assumption in words. deviation: from the nominal, on each
+    axis in its unit.
     alarm: a second alarm in words, which is no assumption and changes no status; empty if there is
     none. half_widths: of the tube at this sample, of each measured signal in its unit, where they
     follow the commands; else empty.

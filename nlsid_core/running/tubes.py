@@ -84,7 +84,7 @@ class TubeRun:
             (np.array(f.y_box).T, np.array(f.u_box).T, np.tile(np.array(f.y_box), (n // p, 1)).T)
             for f in boxed
         ]
-        self._assuming = [_assumption(funnel.tubes) for funnel in funnels]
+        self._assuming = [assuming(funnel.tubes) for funnel in funnels]
         self.restart()
 
     def restart(self) -> None:
@@ -367,5 +367,6 @@ class _Judged(NamedTuple):
     away: list[float]
 
 
-def _assumption(tubes: Sequence[Tube]) -> str:
+def assuming(tubes: Sequence[Tube]) -> str:
+    """What they assume, in letters."""
     return "; ".join(tube.assumption for tube in tubes)

@@ -22,8 +22,8 @@ from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import TubeDesign
-from nlsid_core.design.linear import innovations
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.design.tube import energy, innovations
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 from tests.conftest import PERIOD, synthetic_dataset
@@ -39,11 +39,11 @@ def held_back() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def found(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+def found(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catching:
     return catches(design, train, held_back)
 
 
-def catches(design: TubeDesign, train: Dataset, held_back: Dataset) -> Catching:
+def catches(design: OutputTubeDesign, train: Dataset, held_back: Dataset) -> Catching:
     return what_it_catches(
         Monitor(design.model, design.policy, design.funnel, centre=Centre.COMMAND),
         design.model,
@@ -60,23 +60,24 @@ def row(found: Catching, fault: str) -> Row:
     return next(row for row in found.rows if row.fault == fault)
 
 
-def energies(design: TubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray:
-    e = innovations(design.model, design.policy.L[None, :], replace(trial, y=y))[:, 0]
-    return np.cumsum(e**2)[: design.funnel.assumption.samples]
+def used(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> FloatArray:
+    """The largest part of a level that is used at every sample."""
+    lasting, ending = design.funnel.tubes
+    e = innovations(design.model, lasting.L[None], replace(trial, y=y), design.funnel.settling)
+    for_ever, ends = (energy(e[:, 0], tube) / tube.level for tube in (lasting, ending))
+    ends[ending.samples :] = 0.0
+    return np.asarray(np.maximum(for_ever, ends))
 
 
-def first_bad(design: TubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
-    """The first judged sample after which the energy or the command is beyond what is assumed."""
-    n, (low, high) = len(design.model), design.model.u_range
-    spent = energies(design, trial, y)
-    u = trial.u[n : n + len(spent), 0]
-    beyond = (spent > design.funnel.assumption.budget) | (u < low) | (u > high)
+def first_bad(design: OutputTubeDesign, trial: Trajectory, y: FloatArray) -> int | None:
+    """The first judged sample after which more is used than is assumed."""
+    beyond = used(design, trial, y) > 1.0
     return int(np.flatnonzero(beyond)[0]) if beyond.any() else None
 
 
 @pytest.mark.parametrize("factor", [0.6, 0.8])
 def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
-    design: TubeDesign, found: Catching, held_back: Dataset, factor: float
+    design: OutputTubeDesign, found: Catching, held_back: Dataset, factor: float
 ) -> None:
     bad = [first_bad(design, trial, factor * trial.y) for trial in held_back]
     delays = [PERIOD * k for k in bad if k is not None]
@@ -87,14 +88,12 @@ def test_caught_and_when_are_what_the_energy_of_the_innovations_says(
 
 
 def test_untouched_trials_are_false_alarms_and_others_have_no_more(
-    design: TubeDesign, found: Catching, held_back: Dataset
+    design: OutputTubeDesign, found: Catching, held_back: Dataset
 ) -> None:
     untouched = row(found, UNTOUCHED)
     assert untouched.fault == found.rows[0].fault
-    budget = design.funnel.assumption.budget
-    assert all(energies(design, trial, trial.y)[-1] <= budget for trial in held_back)
     exceeded = sum(first_bad(design, trial, trial.y) is not None for trial in held_back)
-    assert untouched.funnel.violated == exceeded == 1, "a command beyond the fitted range"
+    assert untouched.funnel.violated == exceeded == 0
     assert all(other.count <= exceeded for other in untouched.others.values())
     assert found.trials == 10
     assert [row.fault for row in found.rows] == [UNTOUCHED, *(name for name, _ in SABOTAGES)]
@@ -114,7 +113,7 @@ def test_detectors_are_named_beside_each_sabotage_and_catch_what_they_should(
     assert row(found, "sensor x 0.6").others["box"].count > 0
 
 
-def test_copies_are_what_their_names_say(design: TubeDesign, held_back: Dataset) -> None:
+def test_copies_are_what_their_names_say(design: OutputTubeDesign, held_back: Dataset) -> None:
     trial, faults = held_back.trajectories[0], dict(SABOTAGES)
     made = {name: fault(trial, np.array([2.0]), design.model) for name, fault in faults.items()}
     y = trial.y
@@ -129,7 +128,7 @@ def test_copies_are_what_their_names_say(design: TubeDesign, held_back: Dataset)
     assert all(np.array_equal(copy.u, trial.u) for copy in made.values()), "what was commanded"
 
 
-def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: TubeDesign) -> None:
+def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: OutputTubeDesign) -> None:
     """On a trial that the model itself made, it is the model's own response to 0.8 u."""
     u = np.repeat(np.array([0.0, 0.6, 0.2, 0.5]), 20)
     full, weak = (_simulated(design, gain * u, u) for gain in (1.0, 0.8))
@@ -138,7 +137,7 @@ def test_a_weak_actuator_is_what_the_model_makes_of_less_input(design: TubeDesig
     np.testing.assert_allclose(copy.y[:, 0], weak, atol=1e-12)
 
 
-def _simulated(design: TubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
+def _simulated(design: OutputTubeDesign, applied: FloatArray, first: FloatArray) -> FloatArray:
     """By the difference equation: n zeros under the full input, then the model under `applied`."""
     model, n = design.model, len(design.model)
     y, u = np.zeros(len(applied)), applied.copy()
@@ -149,16 +148,15 @@ def _simulated(design: TubeDesign, applied: FloatArray, first: FloatArray) -> Fl
 
 
 def test_widths_and_shares_are_measured_on_the_calibration_trials(
-    design: TubeDesign, train: Dataset, found: Catching
+    design: OutputTubeDesign, train: Dataset, found: Catching
 ) -> None:
     (width,) = found.widths
     assert width.half_width == design.funnel.half_width
     assert width.share == width.half_width / np.ptp(np.concatenate([trial.y for trial in train]))
     assert width.said.endswith(" m/s")
-    budget, samples = design.funnel.assumption.budget, design.funnel.assumption.samples
     for name, share in found.shares:
         trial = train.select([name]).trajectories[0]
-        assert share == pytest.approx(energies(design, trial, trial.y)[-1] / budget, rel=1e-9)
+        assert share == pytest.approx(used(design, trial, trial.y).max(), rel=1e-8)
     assert [share for _, share in found.shares] == sorted((s for _, s in found.shares))[::-1]
     n = len(design.model)
     errors = []
@@ -168,7 +166,7 @@ def test_widths_and_shares_are_measured_on_the_calibration_trials(
         for t in range(n, len(y)):
             past = y[t - n : t][::-1], trial.u[t - n : t + 1, 0][::-1]
             y[t] = design.model.a @ past[0] + design.model.b @ past[1] + design.model.c
-        errors.append(np.abs(trial.y[:, 0] - y)[n : n + samples].max())
+        errors.append(np.abs(trial.y[:, 0] - y)[n:].max())
     assert width.error == pytest.approx(max(errors), rel=1e-9)
 
 

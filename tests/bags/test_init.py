@@ -2,13 +2,18 @@
 
 import os
 import re
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
@@ -21,7 +26,7 @@ from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
 from bags.setup.proposal import choose
 from nlsid_core.errors import BagError, DataError
-from tests.bag_messages import COMMAND, SPEED, speed_bag
+from tests.bag_messages import COMMAND, SPEED, START_NS, header, speed_bag
 from tests.conftest import SHARED
 
 CMD = "/cmd_vel:twist.linear.x"
@@ -106,6 +111,89 @@ def test_unstamped_commands_are_paired_by_log_times_and_said(tmp_path: Path) -> 
     assert load_config(config).clock == "log"
     assert "mind: /cmd_vel (geometry_msgs/msg/Twist) has no header stamp" in said
     assert "inside" in whole_way(tmp_path / "bags", config, tmp_path / "out")
+
+
+def boat(folder: Path, trials: int = 4) -> tuple[Path, Path]:
+    """Bags of types that only .msg files define, in a folder; and those files' package."""
+    package = folder / "my_boat"
+    (package / "msg").mkdir(parents=True)
+    (package / "msg" / "Thrust.msg").write_text("std_msgs/Header header\nfloat32[2] thrust\n")
+    (package / "msg" / "Nav.msg").write_text("std_msgs/Header header\nfloat64 surge\n")
+    types = get_typestore(Stores.ROS2_JAZZY)
+    for kind in ("Thrust", "Nav"):
+        text = (package / "msg" / f"{kind}.msg").read_text()
+        types.register(get_types_from_msg(text, f"my_boat/msg/{kind}"))
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        path, surge, thrust = folder / "trials" / f"run_{trial}", 0.0, np.float32(0.0)
+        path.parent.mkdir(exist_ok=True)
+        with Writer(path, version=9) as writer:
+            on = {
+                kind: writer.add_connection(topic, f"my_boat/msg/{kind}", typestore=types)
+                for kind, topic in (("Thrust", "/boat/left"), ("Nav", "/boat/nav"))
+            }
+            for k in range(300):
+                thrust = np.float32(rng.standard_normal()) if k % 7 == 0 else thrust
+                surge += 0.2 * (float(thrust) - surge) + 0.01 * rng.standard_normal()
+                stamp_ns = START_NS + k * 100_000_000
+                for kind, number in (
+                    ("Thrust", np.array([thrust, 0.0], np.float32)),
+                    ("Nav", surge),
+                ):
+                    message = types.types[f"my_boat/msg/{kind}"](header(stamp_ns), number)
+                    data = types.serialize_cdr(message, f"my_boat/msg/{kind}")
+                    writer.write(on[kind], stamp_ns, data)
+        [storage] = path.glob("*.db3")
+        with closing(sqlite3.connect(storage)) as database:  # as bags before version 6 were
+            database.execute("delete from message_definitions")
+            database.commit()
+    return folder / "trials", package
+
+
+def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> None:
+    """Neither type nor name says which number drives; the configuration lies elsewhere."""
+    bags, package = boat(tmp_path)
+    config = tmp_path / "config" / "robot.yaml"
+    config.parent.mkdir()
+    said = nlsid("init", bags, "--yes", "--out", config, "--definitions", package)
+    settings = load_config(config)
+    assert settings.signals.excitation[0].path == "/boat/left:thrust[0]"
+    assert settings.signals.response[0].path == "/boat/nav:surge"
+    assert said.count("mind: /boat/nav is of type my_boat/msg/Nav") == 1
+    assert "run_3" in whole_way(bags, config, tmp_path / "out"), "the test trial is judged"
+
+
+def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path) -> None:
+    types = get_typestore(Stores.ROS1_NOETIC)
+    kinds = types.types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    (tmp_path / "bags").mkdir()
+    for trial in range(3):
+        rng = np.random.default_rng(trial)
+        with Ros1Writer(tmp_path / "bags" / f"run_{trial}.bag") as writer:
+            topics = {
+                topic: writer.add_connection(topic, "geometry_msgs/msg/Twist", typestore=types)
+                for topic in ("/cmd_vel", "/odom_twist")
+            }
+            command, speed = 0.0, 0.0
+            for k in range(300):
+                command = float(rng.uniform(0, 1)) if k % 9 == 0 else command
+                speed += 0.2 * (command - speed)
+                for topic, number in (("/cmd_vel", command), ("/odom_twist", speed)):
+                    noise = 0.01 * float(rng.standard_normal()) if topic == "/odom_twist" else 0.0
+                    twist = kinds["geometry_msgs/msg/Twist"](
+                        vector(number + noise, 0.0, 0.0), vector(0.0, 0.0, 0.0)
+                    )
+                    data = types.serialize_ros1(twist, "geometry_msgs/msg/Twist")
+                    writer.write(topics[topic], START_NS + k * 50_000_000, data)
+    config = tmp_path / "robot.yaml"
+    nlsid(
+        "init", tmp_path / "bags", "--out", config,
+        "-u", "/cmd_vel:linear.x", "-y", "/odom_twist:linear.x",
+    )  # fmt: skip
+    assert load_config(config).split.test == ("run_2",)
+    said = whole_way(tmp_path / "bags", config, tmp_path / "out")
+    assert said.count("run_") == said.count("run_2.bag") > 0, "the test trial alone is monitored"
 
 
 def test_a_delay_that_is_known_is_found(tmp_path: Path) -> None:

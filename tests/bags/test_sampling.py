@@ -21,7 +21,7 @@ from bags.signals.grid import read_dataset
 from bags.signals.reader import read_signals
 from bags.signals.sampling import Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
-from nlsid_core.design import design_tube
+from nlsid_core.design import design_output_tube
 from nlsid_core.errors import BagError
 from nlsid_core.identification import LinearClass, identify
 from nlsid_core.running.comparison import Centre
@@ -338,7 +338,7 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     )
     fit = identify(data, LinearClass(4))
     model = replace(fit.model, training="sha256:0")
-    made = design_tube(model, data, profile=[(0.0, 0.0), (10.0, 0.5)], horizon=9.7, inlet=0.1)
+    made = design_output_tube(model, data, profile=[(0.0, 0.0), (9.7, 0.5)], inlet=0.1)
     design = WiredDesign(made.model, made.policy, made.funnel)
     said = replay_messages(design, bags[0], centre=Centre.COMMAND)
     trial = data.trajectories[0]

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from bags.commands.cli import app
 from bags.designs.tolerances import CONTROLLER, TABLE, VALIDATOR, Tolerance, tolerances
 from nlsid_core import files
-from nlsid_core.design import TubeDesign
+from nlsid_core.design import OutputTubeDesign
 from nlsid_core.designs import FUNNEL, PROOF
 from nlsid_core.errors import CertificateRejected, DataError
 from nlsid_core.kernel import text
@@ -68,7 +68,7 @@ def test_every_file_says_the_claim_the_unit_and_what_to_compare_with(arm: Path) 
 
 
 def test_a_speed_has_thresholds_for_validators_and_no_joint(
-    design: TubeDesign, tmp_path: Path
+    design: OutputTubeDesign, tmp_path: Path
 ) -> None:
     design.save(tmp_path)
     done = CliRunner().invoke(app, ["tolerances", str(tmp_path), "--out", str(tmp_path / "out")])
@@ -87,10 +87,12 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
     assert "what the model simulates from the commands" in table
 
 
-def test_what_is_not_proved_has_no_tolerances(design: TubeDesign, tmp_path: Path) -> None:
+def test_what_is_not_proved_has_no_tolerances(design: OutputTubeDesign, tmp_path: Path) -> None:
     design.save(tmp_path)
     funnel = files.load_document(tmp_path / FUNNEL)
-    files.write_document(tmp_path / FUNNEL, funnel | {"half_widths": [1e-3]})
+    files.write_document(
+        tmp_path / FUNNEL, funnel | {"tubes": [funnel["tubes"][0] | {"half_widths": [1e-3]}]}
+    )
     with pytest.raises(CertificateRejected):
         tolerances(tmp_path)
 

@@ -4,18 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.stats import binomtest
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials, windows
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign, design_tube
-from nlsid_core.design.linear import (
-    innovation_energies,
-    kalman_gain,
-    open_loop_covariance,
-)
+from nlsid_core.design import OutputTubeDesign, design_output_tube
+from nlsid_core.design.riccati import solve_riccati
+from nlsid_core.design.tube import energy, innovations
 from nlsid_core.errors import DataError
+from nlsid_core.funnels.tube import Tube
 from nlsid_core.identification import Fit
 from nlsid_core.models import DifferenceEquation
 from tests.conftest import synthetic_dataset
@@ -76,19 +75,23 @@ def test_windows_of_two_pieces_of_one_recording_do_not_share_samples(train: Data
 
 
 def test_the_level_is_the_largest_energy_of_the_calibration_trials(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     scaling = calibration_trials(train, least=72).calibration
-    assumption = design.funnel.assumption
-    energies = innovation_energies(design.model, design.policy.L[None, :], scaling)
-    assert assumption.measured == energies.max()
-    assert {name for name, _ in assumption.designed_on} == {"run_0", "run_2", "run_4"}
-    others = innovation_energies(design.model, design.policy.L[None, :], train)
-    assert others.max() > 0
+    for tube in design.funnel.tubes:
+        assert tube.measured == pytest.approx(largest(design, tube, scaling), rel=1e-11)
+        assert tube.measured >= largest(design, tube, scaling)
+        assert {name for name, _ in tube.designed_on} == {"run_0", "run_2", "run_4"}
+
+
+def largest(design: OutputTubeDesign, tube: Tube, trials: Dataset) -> float:
+    """The largest E over these trials."""
+    found = [innovations(design.model, tube.L[None], trial, 2)[:, 0] for trial in trials]
+    return max(float(energy(e, tube)[: tube.samples].max()) for e in found)
 
 
 def test_the_calibration_trials_do_not_choose_the_observer(
-    design: TubeDesign, train: Dataset
+    design: OutputTubeDesign, train: Dataset
 ) -> None:
     """Calibration trials a hundred times noisier: the same L and P, another level."""
     split = calibration_trials(train, least=72)
@@ -96,12 +99,13 @@ def test_the_calibration_trials_do_not_choose_the_observer(
     loud = Dataset(
         tuple(replace(t, y=t.y + 0.5 * noise.standard_normal(t.y.shape)) for t in split.calibration)
     )
-    other = design_tube(
+    other = design_output_tube(
         design.model, split.design, profile=PROFILE, horizon=7.0, inlet=0.02, calibration=loud
     )
     np.testing.assert_array_equal(other.policy.L, design.policy.L)
-    np.testing.assert_array_equal(other.funnel.P, design.funnel.P)
-    assert other.funnel.assumption.measured > 100 * design.funnel.assumption.measured
+    for louder, tube in zip(other.funnel.tubes, design.funnel.tubes, strict=True):
+        np.testing.assert_array_equal(louder.P, tube.P)
+        assert louder.measured > 100 * tube.measured
 
 
 def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
@@ -109,15 +113,15 @@ def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
 ) -> None:
     split = calibration_trials(train, least=72)
     apart = replace(fit.model, bags=split.designed_on, training="sha256:0")
-    made = design_tube(
+    made = design_output_tube(
         apart, split.design, profile=PROFILE, horizon=7.0, calibration=split.calibration
     )
     assert "with probability at most 1/4)" in made.verdict.assumptions[1]
-    seen = design_tube(replace(fit.model, bags=split.measured_on[:2], training="sha256:0"),
+    seen = design_output_tube(replace(fit.model, bags=split.measured_on[:2], training="sha256:0"),
                        train, profile=PROFILE, horizon=7.0)  # fmt: skip
     assert "as the model was fitted to 2 of them)" in seen.verdict.assumptions[1]
     long = Dataset(synthetic_dataset(0.01, trials=1, samples=400).trajectories)
-    cut = design_tube(replace(fit.model, training="sha256:0"), long,
+    cut = design_output_tube(replace(fit.model, training="sha256:0"), long,
                       profile=PROFILE, horizon=7.0)  # fmt: skip
     said = cut.verdict.assumptions[1]
     assert "largest of 2 distinct windows" in said
@@ -141,7 +145,7 @@ def test_exchangeable_trials_exceed_the_largest_as_often_as_stated(
     """
     rng, model = np.random.default_rng(scaling), fit.model
     gains = np.array([kalman_gain(model, ratio) for ratio in RATIOS])
-    reach = np.array([1.0 + open_loop_covariance(model, L)[0, 0] for L in gains])
+    reach = np.array([1.0 + solve_discrete_lyapunov(model.A, np.outer(L, L))[0, 0] for L in gains])
     found = energies(model, gains, rng, trials=REPEATS * (3 + scaling + 1))
     designing, measured, after = np.split(found.reshape(REPEATS, -1, len(gains)), [3, -1], axis=1)
     chosen = (designing.max(axis=1) * reach).argmin(axis=1)
@@ -167,6 +171,13 @@ def test_trials_that_choose_the_observer_say_less_of_the_next_one(
     exceeded = int((found[row, m, chosen] > found[row, :m, chosen].max(axis=1)).sum())
     low, _ = binomtest(exceeded, REPEATS).proportion_ci(CONFIDENCE)
     assert low > 1.0 / (m + 1)
+
+
+def kalman_gain(model: DifferenceEquation, noise_ratio: float) -> FloatArray:
+    """L (n,) for noise_ratio, variance of a disturbance of the input over the measurement's."""
+    A, B, C = model.A, model.B, model.C
+    S = solve_riccati(A.T, C.T, noise_ratio * B @ B.T, np.eye(1))
+    return np.asarray((A @ S @ C.T)[:, 0] / (1.0 + (C @ S @ C.T)[0, 0]))
 
 
 def energies(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import TubeDesign, design_tube
+from nlsid_core.design import OutputTubeDesign, design_output_tube
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
@@ -19,14 +19,14 @@ WIDE = Limits(lowest=-10.0, highest=10.0, stop_rate=1.0)
 
 
 @pytest.fixture(scope="module")
-def moving(design: TubeDesign, train: Dataset) -> TubeDesign:
+def moving(design: OutputTubeDesign, train: Dataset) -> OutputTubeDesign:
     """A tube that starts at a speed, so that the policy may also take input away."""
     profile = [(0.0, 0.3), (2.0, 0.3), (5.0, 0.5), (7.0, 0.5)]
-    return design_tube(design.model, train, profile=profile, horizon=7.0, inlet=0.02)
+    return design_output_tube(design.model, train, profile=profile, horizon=7.0, inlet=0.02)
 
 
 def closed_loop(
-    design: TubeDesign, *, noise: float, push: float
+    design: OutputTubeDesign, *, noise: float, push: float
 ) -> tuple[Controller, list[Reading]]:
     """A run on the design's own model, pushed for four samples in the middle."""
     plant = ModelPlant(design.model)
@@ -52,23 +52,25 @@ def closed_loop(
     return controller, readings
 
 
-def test_the_monitor_finds_every_input_to_be_the_policys(moving: TubeDesign) -> None:
+def test_the_monitor_finds_every_input_to_be_the_policys(moving: OutputTubeDesign) -> None:
     controller, readings = closed_loop(moving, noise=0.002, push=0.0)
     assert controller.ended == "the plan is over"
+    assert moving.policy is not None
     assert len(readings) == len(moving.policy)
     assert {reading.status for reading in readings} == {Status.INSIDE}
 
 
-def test_a_push_beyond_the_budget_is_seen_as_one(moving: TubeDesign) -> None:
+def test_a_push_beyond_the_budget_is_seen_as_one(moving: OutputTubeDesign) -> None:
     _, readings = closed_loop(moving, noise=0.002, push=2.0)
     worst = min(readings, key=lambda reading: reading.margin)
     assert worst.status is Status.OUTSIDE
-    assert "above the budget" in worst.reason
+    assert "above the level" in worst.reason
 
 
 def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
-    design: TubeDesign,
+    design: OutputTubeDesign,
 ) -> None:
+    assert design.policy is not None
     controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
     for k in range(12):
         assert controller.update(k * PERIOD, 3.0) == design.policy.u[0]
@@ -80,7 +82,7 @@ def test_a_robot_that_is_not_at_the_start_is_waited_for_and_then_given_up(
     [(0.3, math.nan, "speed is nan"), (0.5, 0.0, "missing"), (0.05, 0.0, "time went back")],
 )
 def test_a_state_that_cannot_be_used_ends_the_run(
-    design: TubeDesign, t: float, y: float, reason: str
+    design: OutputTubeDesign, t: float, y: float, reason: str
 ) -> None:
     controller = Controller(design.model, design.policy, design.funnel, limits=WIDE, settling=1.0)
     for k in range(3):

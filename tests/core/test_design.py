@@ -10,10 +10,16 @@ import pytest
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.design import ContinuousTracking, LinearTube, SampledTracking, TubeDesign, design
+from nlsid_core.design import (
+    ContinuousTracking,
+    OutputTube,
+    OutputTubeDesign,
+    SampledTracking,
+    design,
+)
 from nlsid_core.design.continuous.design import design_funnel
-from nlsid_core.design.linear import design_tube
 from nlsid_core.design.sampled.design import design_state_funnel
+from nlsid_core.design.tube import design_output_tube
 from nlsid_core.designs import FUNNEL, MODEL, POLICY, PROOF, AnyDesign, Design, load_design
 from nlsid_core.errors import (
     CertificateMismatch,
@@ -30,10 +36,13 @@ from tests.tracked import assumption, designed, tracked
 PROFILE = ((0.0, 0.0), (7.0, 0.5))
 
 
-def test_the_verb_solves_what_each_problem_says(tube: TubeDesign, train: Dataset) -> None:
-    found = design(LinearTube(tube.model, train, PROFILE, 7.0))
-    assert found.funnel.assumption.samples == round(7.0 / tube.model.period)
-    assert "for 70 samples" in found.verdict.statement
+def test_the_verb_solves_what_each_problem_says(tube: OutputTubeDesign, train: Dataset) -> None:
+    found = design(OutputTube(tube.model, train, profile=PROFILE, horizon=6.0))
+    assert found.funnel.tubes[1].samples == round(6.0 / tube.model.period)
+    assert "for at most its 60 samples" in found.verdict.statement
+    longer = design(OutputTube(tube.model, train, profile=PROFILE))
+    assert len(longer.funnel.tubes) == 1
+    assert "for at most its 70 samples" in longer.verdict.statement
     base = tracked()
     problem = SampledTracking(base.model, base.policy, base.feedback, assumption())
     seen: list[str] = []
@@ -45,7 +54,7 @@ def test_the_verb_solves_what_each_problem_says(tube: TubeDesign, train: Dataset
 @pytest.mark.parametrize(
     ("problem", "search"),
     [
-        (LinearTube, design_tube),
+        (OutputTube, design_output_tube),
         (SampledTracking, design_state_funnel),
         (ContinuousTracking, design_funnel),
     ],
@@ -67,7 +76,8 @@ def test_a_problem_states_what_its_search_takes(problem: type[Any], search: Any)
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"horizon": 100.0}, "can be measured"),
+        ({"horizon": 7.9}, "horizon 7.9 s is 79 samples; the energy can be measured"),
+        ({"inlet": 0.1, "profile": None}, "inlet is 0.1; it should be 0 without a profile"),
         ({"horizon": 0.0}, "horizon is 0.0; it should be a finite number above 0"),
         ({"safety_factor": 0.99}, "safety_factor is 0.99; it should be a finite number, at least"),
         ({"inlet": -1e-9}, "inlet is -1e-09; it should be a finite number, at least 0"),
@@ -77,11 +87,11 @@ def test_a_problem_states_what_its_search_takes(problem: type[Any], search: Any)
     ],
 )
 def test_a_tube_that_makes_no_sense_is_refused(
-    tube: TubeDesign, train: Dataset, options: dict[str, Any], reason: str
+    tube: OutputTubeDesign, train: Dataset, options: dict[str, Any], reason: str
 ) -> None:
     sensible: dict[str, Any] = {"profile": PROFILE, "horizon": 7.0}
     with pytest.raises(DataError, match=reason):
-        design(LinearTube(tube.model, train, **(sensible | options)))
+        design(OutputTube(tube.model, train, **(sensible | options)))
 
 
 @pytest.mark.parametrize("options", [{"goal": 0.0}, {"start": -1.0}, {"goal": float("nan")}])
@@ -93,14 +103,14 @@ def test_a_sampled_problem_refuses_radii_that_are_not_positive(options: dict[str
 
 
 @pytest.fixture(name="tube")
-def _tube(request: pytest.FixtureRequest) -> TubeDesign:
+def _tube(request: pytest.FixtureRequest) -> OutputTubeDesign:
     """The session's tube, by a name that is not the verb's."""
-    found: TubeDesign = request.getfixturevalue("design")
+    found: OutputTubeDesign = request.getfixturevalue("design")
     return found
 
 
 @pytest.fixture(params=["linear", "sampled"])
-def any_design(request: pytest.FixtureRequest, tube: TubeDesign) -> AnyDesign:
+def any_design(request: pytest.FixtureRequest, tube: OutputTubeDesign) -> AnyDesign:
     return tube if request.param == "linear" else designed()
 
 
@@ -149,15 +159,17 @@ def test_a_proof_of_something_else_is_no_design(
         load_design(tmp_path)
 
 
-def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: TubeDesign) -> None:
-    narrow = replace(tube.funnel, half_widths=tube.funnel.half_widths * 0.9)
+def test_nothing_is_a_design_that_the_kernel_does_not_prove(tube: OutputTubeDesign) -> None:
+    first, *rest = tube.funnel.tubes
+    narrower = replace(first, half_widths=first.half_widths * 0.9)
+    narrow = replace(tube.funnel, tubes=(narrower, *rest))
     with pytest.raises(CertificateRejected):
         Design.proved(
             tube.model, tube.policy, narrow, claim=tube.claim, proof=tube.proof, found=None
         )
     assert tube.decided() == tube.verdict
     with pytest.raises(CertificateRejected):
-        replace(tube, proof={"slack": -1.0}).decided()
+        replace(tube, proof={"multipliers": []}).decided()
     same = Design.proved(
         tube.model, tube.policy, tube.funnel, claim=tube.claim, proof=tube.proof, found=None
     )

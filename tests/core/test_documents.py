@@ -12,12 +12,11 @@ from nlsid_core.documents import load
 from nlsid_core.dynamics import Nominal, VectorField, constant_on, cubic_through, linear_through
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.linear import EnergyAssumption
-from nlsid_core.funnels.linear import LinearFunnel as EnergyTube
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
+from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
-from nlsid_core.policies.linear import LinearPolicy as TubePolicy
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.policies.tube import TubePolicy
 
 
 def random_funnel(n: int = 3, knots: int = 6) -> ContinuousFunnel:
@@ -50,16 +49,17 @@ def discrete_documents() -> dict[str, Any]:
     """The other kinds of funnels and policies."""
     assumption = DisturbanceAssumption("response", 0.2, 0.1, 2.0, (("run", "sha256:0"),))
     two = np.array([np.eye(2)] * 3)
-    energy = EnergyAssumption(4.0, 10, 1.0, 2.0, (("trial", "sha256:1"),))
+    ones, trial = np.ones(1), (("trial", "sha256:1"),)
+    tube = Tube(0.5, np.ones((2, 1)), np.eye(2), np.eye(1), ones, ones, 4.0, 1.0, 2.0, (), trial)
     return {
         "discrete": SampledFunnel(
             two, two[:2], np.ones(3), np.ones(3), np.ones((3, 2)), assumption, "m", "p"
         ),
-        "tube": EnergyTube(np.eye(2), 1.0, 0.5, np.array([0.3]), np.array([2.0]), energy, "m", "p"),
+        "tube": TubeFunnel((tube,), 2, "m", policy="p"),
         "tracking": SampledPolicy(
             np.zeros((3, 2)), np.zeros((2, 1)), np.zeros((2, 1, 2)), np.eye(2), 0.1, "m"
         ),
-        "tube_policy": TubePolicy(np.zeros((3, 2)), np.zeros(3), np.zeros(2), np.ones(2), 0.1, "m"),
+        "tube_policy": TubePolicy(np.zeros(2), np.zeros(3), np.zeros(2), np.ones(2), 0.1, "m"),
     }
 
 

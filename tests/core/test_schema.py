@@ -12,9 +12,9 @@ SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 FILES = {
     MODEL: "model",
     POLICY: "policy",
-    FUNNEL: "funnel",
+    FUNNEL: "funnel_tube",
     MODEL_PROOF: "proof_stability",
-    FUNNEL_PROOF: "proof_tube",
+    FUNNEL_PROOF: "proof_output_tube",
 }
 
 

@@ -182,7 +182,7 @@ def test_a_funnel_of_taylor_models_holds_for_the_true_dynamics(
 ) -> None:
     verdict = check(design.save(tmp_path)[-1])
     assert "keeps x0 in [-0.4001, 0.4001]" in verdict.statement
-    assert any("computed by: cubic Taylor models" in text for text in verdict.assumptions)
+    assert any('computed by: "cubic Taylor models' in text for text in verdict.assumptions)
     assert any("w0 in [-1, 1]" in text for text in verdict.assumptions)
     truth, rng = TrueDynamics(swinging_truth), np.random.default_rng(3)
     run = simulate_boundary(truth, design.policy, design.funnel, starts=3000, rng=rng)

@@ -39,7 +39,6 @@ BELOW = {
 SOLVERS = {"clarabel", "cvxpy"}
 SOLVERS_KNOWN_TO = {
     "nlsid_core/conic.py": SOLVERS,
-    "nlsid_core/design/linear.py": {"cvxpy"},  # one small problem, solved once a funnel
     "nlsid_core/design/tube.py": {"cvxpy"},  # a few small ones a funnel
 }
 SYMPY_EDGE = "nlsid_core/polynomial/sympy_edge.py"  # optional, and imported by nobody inside

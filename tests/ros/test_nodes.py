@@ -213,9 +213,8 @@ def test_the_publisher_takes_another_funnel_while_it_runs_if_it_is_proved(
         for name in names:
             (tmp_path / place / name).write_bytes((funnel.parent / name).read_bytes())
     forged = files.load_document(tmp_path / "forged" / documents.FUNNEL)
-    files.write_document(
-        tmp_path / "forged" / documents.FUNNEL, forged | {"level": 2.0 * forged["level"]}
-    )
+    forged["tubes"][0]["level"] *= 2.0
+    files.write_document(tmp_path / "forged" / documents.FUNNEL, forged)
     with (
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.funnel_publisher", funnel=funnel) as publisher,

@@ -121,7 +121,7 @@ def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path
         spin_until(lambda: funnels[-1] == files.digest(design))
 
         count = len(funnels)
-        forged = design | {"level": 2.0 * design["level"]}
+        forged = design | {"tubes": [design["tubes"][0] | {"level": 2.0}]}
         files.write_document(tmp_path / documents.FUNNEL, forged)
         spin_until(lambda: any("REJECTED" in text for text in said))
         assert len(funnels) == count

@@ -3,13 +3,13 @@
 Of the increment form, what docs/certificate_stability.md states comes from that page's oracle.
 """
 
-from collections.abc import Mapping
+import random
+from collections.abc import Iterator, Mapping
 from fractions import Fraction
 from itertools import product
 from typing import Any
 
 from nlsid_core import files
-from tests.core.kernel import oracle_driven_tube
 from tests.core.kernel.oracle_stability import (
     Json,
     Rows,
@@ -248,11 +248,8 @@ def follows(level: Json, model: Json, rows: int) -> bool:
 
 def disjoint(given: Json) -> bool:
     """Whether something was measured, and on other samples than what chose it."""
-    before, on = (
-        [oracle_driven_tube.span(t["digest"]) for t in given[k]]
-        for k in ("designed_on", "measured_on")
-    )
-    return bool(on) and not any(oracle_driven_tube.overlap(a, b) for a, b in product(before, on))
+    before, on = ([span(t["digest"]) for t in given[k]] for k in ("designed_on", "measured_on"))
+    return bool(on) and not any(overlap(a, b) for a, b in product(before, on))
 
 
 def beside(model: Json, funnel: Json, p: int) -> bool:
@@ -277,12 +274,42 @@ def beside(model: Json, funnel: Json, p: int) -> bool:
     return True
 
 
-def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
-    """Whether every obligation holds, for the funnel's and the proof's content."""
+def closed(model: Json, policy: Json, kappa: Fraction) -> tuple[Rows, Rows]:
+    """F - κBK and H - κDK of a difference equation."""
+    a, b = ([exact(entry) for entry in model[key]] for key in "ab")
+    K, n = [exact(entry) for entry in policy["K"][0]], len(a)
+    A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
+    B = [b[i + 1] + a[i] * b[0] for i in range(n)]
+    F = [[A[i][j] - kappa * B[i] * K[j] for j in range(n)] for i in range(n)]
+    return F, [[Fraction(int(j == 0)) - kappa * b[0] * K[j] for j in range(n)]]
+
+
+def is_a_plan(model: Json, policy: Json, funnel: Json) -> bool:
+    """What has to hold of a policy beside the inequalities."""
+    low, high = (exact(end) for end in model["u_range"])
+    n, u = len(model["a"]), [exact(entry) for (entry,) in policy["u"]]
+    return (
+        model["kind"] == "difference_equation"
+        and len(policy["start"]) == n == len(policy["K"][0])
+        and exact(policy["period"]) == exact(model["period"])
+        and 1 <= len(u) <= 10**6
+        and all(low <= entry <= high for entry in u)
+        and all(tube["L"] == policy["L"] for tube in funnel["tubes"])
+    )
+
+
+def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None) -> bool:
+    """Whether every obligation holds, for the contents of the files and of the proof."""
     F, m, box, ray, hull = form(model, funnel.get("box"))
-    H = outputs(model, m, len(F))
-    if not beside(model, funnel, len(H)):
+    modes = [(F, outputs(model, m, len(F)))]
+    if not beside(model, funnel, len(modes[0][1])):
         return False
+    if policy is not None:
+        if {"response", "cusum"} & set(funnel) or any("follows" in t for t in funnel["tubes"]):
+            return False
+        if not is_a_plan(model, policy, funnel):
+            return False
+        modes.append(closed(model, policy, Fraction(1)))
     trees = proof.get("multipliers", [None] * len(funnel["tubes"]))
     if not 1 <= len(trees) == len(funnel["tubes"]) <= 8 or ("multipliers" in proof) != (m > 0):
         return False
@@ -300,23 +327,77 @@ def is_proved(model: Json, funnel: Json, proof: Json) -> bool:
             return False
         if not disjoint(given):
             return False
-        if not holds(F, H, m, tube, tree, (box, ray, hull)):
+        if not all(holds(F, H, m, tube, tree, (box, ray, hull)) for F, H in modes):
             return False
         for tau, width in zip(tube["tau"], tube["half_widths"], strict=True):
-            if not width > 0 or level + inlet > exact(tau) * exact(width) ** 2:
+            if not width > 0 or level + rho * inlet > exact(tau) * exact(width) ** 2:
                 return False
     return True
+
+
+def span(digest: str) -> tuple[str, float, float]:
+    """The recording of a trial, its first sample and the one after its last."""
+    recording, _, window = digest.partition("[")
+    if "[" not in digest:
+        return recording, 0, float("inf")
+    first, end = window.removesuffix("]").split(":")
+    if not window.endswith("]") or not int(first) < int(end) < 10**12:
+        raise ValueError(digest)
+    return recording, int(first), int(end)
+
+
+def overlap(a: tuple[str, float, float], b: tuple[str, float, float]) -> bool:
+    return a[0] == b[0] and max(a[1], b[1]) < min(a[2], b[2])
+
+
+def V(P: Rows, x: list[Fraction]) -> Fraction:
+    n = range(len(P))
+    return sum((x[i] * P[i][j] * x[j] for i in n for j in n), Fraction(0))
+
+
+def runs(
+    model: Json, policy: Json, tube: Json, rng: random.Random, samples: int
+) -> Iterator[tuple[Fraction, Fraction]]:
+    """(o, E) of an exact run with random start in the inlet, innovations, and κ at every sample.
+
+    It lasts `samples`, no more than those of an energy.
+    """
+    P, rho = matrix(tube["P"], len(tube["P"]), len(tube["P"])), exact(tube["rho"])
+    n, R = len(P), exact(tube["R"][0][0])
+    inlet, level = exact(tube["inlet"]), exact(tube["level"])
+    L = [exact(entry[0]) for entry in policy["L"]]
+    x = [Fraction(rng.randrange(-8, 9)) for _ in range(n)]
+    while inlet and V(P, x) > inlet:
+        x = [entry / 2 for entry in x]
+    if not inlet:
+        x = [Fraction(0)] * n
+    E = Fraction(0)
+    for _ in range(samples):
+        e = Fraction(rng.randrange(-8, 9), 4)
+        for _ in range(60):
+            if rho * E + R * e * e > level:
+                e /= 2
+        if rho * E + R * e * e > level:
+            e = Fraction(0)
+        E = rho * E + R * e * e
+        F, (output,) = closed(model, policy, Fraction(rng.randrange(5), 4))
+        yield sum((h * entry for h, entry in zip(output, x, strict=True)), e), E
+        x = [sum((F[i][j] * x[j] for j in range(n)), L[i] * e) for i in range(n)]
+        x = [entry.limit_denominator(10**12) for entry in x]
 
 
 def agrees(document: Json, about: Mapping[str, Json]) -> bool:
     """Whether a proof document about these files proves its claim, with or without a policy."""
     try:
         bindings = document["claim"]["about"]
-        if "policy" in bindings:
-            return oracle_driven_tube.agrees(document, about)
         model, funnel = (about[bindings[role]["file"]] for role in ("model", "funnel"))
-        if funnel["model"] != files.digest(model):
+        policy = about[bindings["policy"]["file"]] if "policy" in bindings else None
+        if funnel["model"] != files.digest(model) or ("policy" in funnel) != (policy is not None):
             return False
-        return is_proved(model, funnel, document["proof"])
+        if policy is not None and (
+            policy["model"] != funnel["model"] or funnel["policy"] != files.digest(policy)
+        ):
+            return False
+        return is_proved(model, funnel, document["proof"], policy)
     except (ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
         return False

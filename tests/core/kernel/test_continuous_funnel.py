@@ -328,7 +328,7 @@ def test_the_sentence_says_what_is_decided_and_nothing_more(files: Files, tmp_pa
         "with no hold and no delay, u0 clipped to [-1.5, 2]",
         "at every time w0 in [-0.125, 0.25]",
         "the equations expand others, and that the ranges of w cover what they leave out is an "
-        "assumption of the vector field, computed by: by hand",
+        'assumption of the vector field, computed by: "by hand"',
     )
     assert Fraction(str(verdict).split("\n")[0].rsplit(" ", 1)[1]) <= verdict.margin
 

@@ -2,6 +2,7 @@
 
 import random
 from collections.abc import Callable
+from decimal import Context, Decimal
 from types import SimpleNamespace
 from typing import Any
 
@@ -40,12 +41,13 @@ def test_the_sentences_are_those_of_the_page() -> None:
     )
     assert (
         said[1]
-        == "  assuming after 3 samples (0.07501 s) the simulation starts at the observer's state"
+        == "  assuming after 3 samples (0.07501 s) the simulation starts at one state with the "
+        "observers, one for each tube"
     )
     rho = funnel["tubes"][0]["rho"]
     assert f"E+ = {rho} E + e^2 from 0 (largest of 5 distinct trials, each " in said[2]
     assert said[2].endswith("exceeds their largest with probability at most 1/6)")
-    assert "(2) innovation energy: sum of e^2 <= " in said[3]
+    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[3]
 
 
 def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
@@ -70,6 +72,45 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
     assert said[3].startswith("  assuming output error: |speed - simulated| / (")
     assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 sum 0.9^i (change of {name}" in said[3]
     assert "probability at most 1/6)" in said[3]
+
+
+def test_windows_that_share_samples_count_once() -> None:
+    """[0:20] and [5:30] of one recording are no two trials; [20:30] beside [0:20] is another."""
+    for ends, count in (
+        (("0:20", "5:30", "10:40"), 1), (("0:20", "20:30", "5:25"), 2), (("0:9", "0:9"), 1)
+    ):  # fmt: skip
+        model, funnel, proof = claim("linear")
+        given, one = first_assumption(funnel), "sha256:" + 64 * "7"
+        given["measured_on"] = [{"name": end, "digest": f"{one}[{end}]"} for end in ends]
+        level = rounded(tubes(funnel)["level"], "ROUND_FLOOR")
+        measured = rounded(given["measured"], "ROUND_CEILING")
+        several = f"{count} distinct windows, each" if count > 1 else "1 distinct window,"
+        assert decide(model, funnel, proof).assumptions[1] == (
+            f"(1) innovation energy of its own observer: E <= {level} (m/s)^2 after every sample, "
+            f"E+ = {tubes(funnel)['rho']} E + e^2 from 0 (largest of {several} taken whole, "
+            f"{measured}, safety factor 1.5 in amplitude; no probability is stated of a next "
+            "trial, as windows of one recording are hardly exchangeable)"
+        )
+
+
+def rounded(value: float, mode: str) -> str:
+    number = Context(prec=4, rounding=mode).create_decimal(Decimal(value)).normalize()
+    return f"{number:f}"
+
+
+def test_one_observer_of_all_tubes_is_called_so() -> None:
+    model, funnel, proof = claim("linear")
+    funnel["tubes"] = funnel["tubes"][:1]
+    said = decide(model, funnel, proof).assumptions
+    assert said[0] == "after 3 samples (0.07501 s) the simulation starts at the observer's state"
+    assert said[1].startswith("innovation energy: E <= ")
+
+
+def test_two_outputs_of_one_name_are_refused() -> None:
+    model, funnel, proof = claim("two_outputs")
+    model["y"][1]["name"] = model["y"][0]["name"]
+    with pytest.raises(CertificateRejected, match="two outputs have the same name"):
+        decide(model, funnel, proof)
 
 
 def test_trials_that_the_model_was_fitted_on_and_windows_are_said() -> None:
@@ -231,7 +272,7 @@ def test_another_model_with_right_digests_is_refused(what: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "reason"),
     [
-        ("linear", lambda c: c.funnel.update(kind="linear"), "expected 'tube'"),
+        ("linear", lambda c: c.funnel.update(kind="linear"), "is now a tube: run"),
         ("linear", lambda c: c.funnel.update(tubes=[]), "list of 1 to 8"),
         ("linear", lambda c: c.funnel.update(box={"y": [], "u": []}), "needs no box"),
         ("linear", lambda c: c.funnel.update(settling=-1), "whole number from 0"),

@@ -1,0 +1,422 @@
+"""The claim `tube` about a policy: the sentence, and what is refused and why."""
+
+import json
+import random
+from decimal import Context, Decimal
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags.designs.documents import FUNNEL, FUNNEL_PROOF, MODEL, POLICY
+from nlsid_core import files, proofs
+from nlsid_core.arrays import Json
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
+from tests.core.kernel import oracle_tube as oracle
+from tests.core.kernel.tube_claims import claim
+
+NAMES = {"model": MODEL, "policy": POLICY, "funnel": FUNNEL}
+
+
+@pytest.fixture
+def documents(design: OutputTubeDesign) -> dict[str, Json]:
+    """The three documents by role."""
+    return {role: copied(getattr(design, role).document()) for role in NAMES}
+
+
+def copied(document: Json) -> Json:
+    return json.loads(json.dumps(document))  # type: ignore[no-any-return]
+
+
+def bound(documents: dict[str, Json]) -> dict[str, Json]:
+    """The documents with every digest inside them made to fit again."""
+    model, policy, funnel = (documents[role] for role in NAMES)
+    policy = policy | {"model": files.digest(model)}
+    funnel = funnel | {"model": files.digest(model), "policy": files.digest(policy)}
+    return {"model": model, "policy": policy, "funnel": funnel}
+
+
+def decide(documents: dict[str, Json]) -> proofs.Verdict:
+    """The verdict on documents as they are, with a proof that names their digests."""
+    about = {role: proofs.binding(NAMES[role], document) for role, document in documents.items()}
+    proof = proofs.proof_document({"kind": "tube", "about": about}, {})
+    return proofs.decide(proof, {NAMES[role]: documents[role] for role in NAMES})
+
+
+def is_proved(documents: dict[str, Json]) -> bool:
+    return oracle.is_proved(documents["model"], documents["funnel"], {}, documents["policy"])
+
+
+def changing(funnel: Json, **changes: object) -> Json:
+    """The funnel with its first tube changed."""
+    return funnel | {"tubes": [funnel["tubes"][0] | changes, *funnel["tubes"][1:]]}
+
+
+def assuming(funnel: Json, **changes: object) -> Json:
+    return changing(funnel, assumption=funnel["tubes"][0]["assumption"] | changes)
+
+
+def lasting(funnel: Json, samples: object) -> Json:
+    """The funnel with the energy of its second tube over so many samples."""
+    energy = funnel["tubes"][1]
+    changed = energy | {"assumption": energy["assumption"] | {"samples": samples}}
+    return funnel | {"tubes": [funnel["tubes"][0], changed]}
+
+
+def first(funnel: Json) -> Json:
+    return funnel["tubes"][0]  # type: ignore[no-any-return]
+
+
+def test_the_sentence_and_the_assumptions_are_these(documents: dict[str, Json]) -> None:
+    funnel, model, policy = (documents[key] for key in ("funnel", "model", "policy"))
+    lasting, energy = funnel["tubes"]
+    low, high = model["u_range"]
+    verdict = decide(documents)
+    # Rounded outward to four digits from the numbers in the files.
+    span = down((len(policy["u"]) - 1) * model["period"])
+    wide = [up(tube["half_widths"][0]) for tube in (lasting, energy)]
+    assert verdict.statement == (
+        "tube: the measured output stays near the model's simulation under the same inputs, (1) "
+        f"speed within {wide[0]} m/s for ever; (2) speed within {wide[1]} m/s for 70 samples, "
+        f"which span {span} s, for every input; and as near the policy's plan, which is the "
+        f"simulation from its start under its inputs, for at most its 70 samples, which span "
+        f"{span} s, whether those inputs are played, the policy is engaged around them, or "
+        "anything between the two acts, such as the policy's input clipped to a range that holds "
+        f"the plan's, as [{exactly(low)}, {exactly(high)}] m/s does"
+    )
+    inlets = " and ".join(down(tube["inlet"]) for tube in (lasting, energy))
+    trials = "no probability is stated of a next trial, as the model was fitted to 3 of them"
+    measured = [tube["assumption"]["measured"] for tube in (lasting, energy)]
+    assert verdict.assumptions == (
+        f"after 2 samples ({up(0.2)} s) the simulation starts at the observer's state, or where V "
+        f"= xbar'P xbar <= {inlets}, xbar the observer's state minus its own, as the plan does",
+        f"(1) innovation energy: E <= {down(lasting['level'])} (m/s)^2 after every sample, E+ = "
+        f"{lasting['rho']} E + e^2 from 0 (largest of 3 distinct trials, each taken whole, "
+        f"{up(measured[0])}, safety factor 1.5 in amplitude; {trials})",
+        f"(2) innovation energy: sum of e^2 <= {down(energy['level'])} (m/s)^2 over 70 samples "
+        f"(largest of 3 distinct trials, each taken whole, {up(measured[1])}, safety factor 1.5 in "
+        f"amplitude; {trials})",
+    )
+    assert 0.0 < verdict.margin < 0.01
+
+
+def exactly(value: float) -> str:
+    return repr(value).removesuffix(".0")
+
+
+def up(value: float) -> str:
+    """Four significant digits, upward, by the decimal module."""
+    return rounded(value, "ROUND_CEILING")
+
+
+def down(value: float) -> str:
+    return rounded(value, "ROUND_FLOOR")
+
+
+def rounded(value: float, mode: str) -> str:
+    number = Context(prec=4, rounding=mode).create_decimal(Decimal(value)).normalize()
+    return f"{number:f}"
+
+
+def test_a_start_at_the_plans_and_played_inputs_are_said_in_those_words(
+    documents: dict[str, Json],
+) -> None:
+    for tube in documents["funnel"]["tubes"]:
+        tube["inlet"] = 0
+    documents["policy"]["K"] = [[0.0, 0.0]]
+    verdict = decide(bound(documents))
+    assert verdict.assumptions[0].endswith(
+        "the simulation starts at the observer's state, as the plan does"
+    )
+    assert verdict.statement.endswith("with those inputs played (no feedback)")
+
+
+@pytest.mark.parametrize("engaged", [0, 1])
+def test_the_half_width_bounds_the_output_in_the_tube(
+    design: OutputTubeDesign, engaged: int
+) -> None:
+    model, policy, rng = design.model, design.policy, np.random.default_rng(0)
+    assert policy is not None
+    c = model.C[0] - engaged * model.D * policy.K
+    for tube in design.funnel.tubes:
+        root = np.linalg.cholesky(np.linalg.inv(tube.rho * tube.P))
+        direction = rng.standard_normal((20_000, len(model) + 1))
+        most = tube.level + tube.rho * tube.inlet
+        direction *= np.sqrt(most) / np.linalg.norm(direction, axis=1, keepdims=True)
+        outputs = direction[:, :-1] @ root.T @ c + direction[:, -1]
+        assert np.abs(outputs).max() <= tube.half_widths[0]
+
+
+def test_repeated_trials_count_once_and_no_trial_measures_nothing(
+    documents: dict[str, Json],
+) -> None:
+    once = first(documents["funnel"])["assumption"]["measured_on"][0]
+    again = {"name": "the same under another name", "digest": once["digest"]}
+    documents["funnel"] = assuming(documents["funnel"], measured_on=[once, again, once])
+    assert "largest of 1 distinct trial, taken whole, " in decide(documents).assumptions[1]
+    documents["funnel"] = assuming(documents["funnel"], measured_on=[])
+    with pytest.raises(CertificateRejected, match="measured on no trial"):
+        decide(documents)
+
+
+def trials(*digests: str) -> list[Json]:
+    return [{"name": f"trial {i}", "digest": digest} for i, digest in enumerate(digests)]
+
+
+def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:
+    return bound(documents | {"model": documents["model"] | {"bags": trials(*digests)}})
+
+
+@pytest.mark.parametrize(
+    ("measured_on", "fitted", "said"),
+    [
+        (("a", "b", "c"), ("d",), "exceeds their largest with probability at most 1/4)"),
+        (("a", "a", "b", "b"), ("d",), "exceeds their largest with probability at most 1/3)"),
+        (("a", "b", "c"), ("b", "a", "d", "b"), "as the model was fitted to 2 of them)"),
+        (("a", "b"), ("b[3:4]",), "as the model was fitted to 1 of them)"),
+        (("a[0:9]", "b"), (), "as windows of one recording are hardly exchangeable)"),
+    ],
+)
+def test_a_probability_is_stated_only_of_trials_that_made_nothing(
+    documents: dict[str, Json], measured_on: tuple[str, ...], fitted: tuple[str, ...], said: str
+) -> None:
+    changed = assuming(
+        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials("e", "a[9:10]")
+        if measured_on[0] == "a[0:9]" else trials("e"),
+    )  # fmt: skip
+    verdict = decide(fitted_to(documents | {"funnel": changed}, *fitted))
+    assert verdict.assumptions[1].endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("measured_on", "designed_on", "allowed"),
+    [
+        (("a", "b"), ("c", "d"), True),
+        (("a", "b"), ("c", "b"), False),
+        (("a",), ("a[5:6]",), False),
+        (("a[5:6]",), ("b", "a"), False),
+        (("a[0:10]",), ("a[10:20]", "a[30:31]"), True),
+        (("a[10:20]",), ("a[0:11]", "a[2:3]"), False),
+        (("a[10:20]",), ("a[0:30]", "a[1:2]", "a[3:5]"), False),
+        (("a[10:20]", "a[40:50]"), ("a[49:60]",), False),
+    ],
+)
+def test_no_sample_designs_a_tube_and_scales_it(
+    documents: dict[str, Json],
+    measured_on: tuple[str, ...],
+    designed_on: tuple[str, ...],
+    allowed: bool,
+) -> None:
+    documents["funnel"] = assuming(
+        documents["funnel"], measured_on=trials(*measured_on), designed_on=trials(*designed_on)
+    )
+    assert is_proved(documents) is allowed
+    if allowed:
+        decide(documents)
+    else:
+        with pytest.raises(CertificateRejected, match="was designed on cannot measure"):
+            decide(documents)
+
+
+@pytest.mark.parametrize("window", ["[", "[]", "[1:1]", "[2:1]", "[-1:2]", "[0:1", "[0:1]x",
+                                    "[0:9999999999999]", "[0:1000000000000]x",
+                                    "[٠:١]"])  # fmt: skip
+def test_a_window_that_is_none_is_rejected(documents: dict[str, Json], window: str) -> None:
+    documents["funnel"] = assuming(documents["funnel"], measured_on=trials("a" + window))
+    with pytest.raises(CertificateRejected, match="a window should be"):
+        decide(documents)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda f: changing(f, level=first(f)["level"] * 0.999), "the level is below"),
+        (lambda f: changing(f, level=first(f)["level"] * 1.03), "half-width"),
+        (lambda f: changing(f, inlet=first(f)["inlet"] + 0.05 * first(f)["level"]), "half-width"),
+        (lambda f: changing(f, inlet=-1.0), "0 or more"),
+        (lambda f: changing(f, level=-1.0), "the level is below"),
+        (lambda f: changing(f, P=(1.01 * np.array(first(f)["P"])).tolist()), "the decrease of V"),
+        (lambda f: changing(f, P=(-np.array(first(f)["P"])).tolist()), "P is not positive"),
+        (lambda f: changing(f, P=[[1.0, 2.0], [0.0, 1.0]]), "not symmetric"),
+        (lambda f: changing(f, P=[[1.0]]), "should have shape"),
+        (lambda f: changing(f, R=[[0.97]]), "the decrease of V|the bound on speed"),
+        (lambda f: changing(f, R=[[-1.0]]), "R is not positive definite"),
+        (lambda f: changing(f, tau=[first(f)["tau"][0] * 1.003]), "the bound on speed"),
+        (lambda f: changing(f, tau=[-first(f)["tau"][0]]), "should be positive"),
+        (lambda f: changing(f, tau=first(f)["tau"] * 2), "should have shape"),
+        (lambda f: changing(f, half_widths=[0.97 * first(f)["half_widths"][0]]), "half-width"),
+        (lambda f: changing(f, half_widths=[-1.0]), "should be positive"),
+        (lambda f: changing(f, rho=0.95 * first(f)["rho"]), "the decrease of V|the bound on"),
+        (lambda f: changing(f, rho=1.5), "rho should be 1"),
+        (lambda f: changing(f, rho=-0.5), "rho should be 1"),
+        (lambda f: changing(f, rho=1), "rho should be 1"),
+        (lambda f: assuming(f, kind="energy"), "for a number of samples"),
+        (lambda f: assuming(f, kind="energy", samples=9), "rho should be 1"),
+        (lambda f: assuming(f, safety_factor=0.99), "safety factor 1 or more"),
+        (lambda f: assuming(f, samples=9), "for a number of samples"),
+        (lambda f: lasting(f, 0), "whole number from 1"),
+        (lambda f: lasting(f, 2.5), "whole number"),
+        (lambda f: assuming(f, kind="peak"), "known: fading, energy"),
+        (lambda f: f | {"note": 1}, "unknown member 'note'"),
+        (lambda f: f | {"kind": "sampled"}, "expected 'tube'"),
+        (lambda f: f | {"kind": "linear"}, "is now a tube: run `nlsid funnel` again"),
+        (lambda f: changing(f, level=2**53 + 2), "whole number beyond"),
+        (lambda f: changing(f, L=[[0.0], [0.0]]), "the observer of a tube is not the policy's"),
+    ],
+)  # fmt: skip
+def test_a_forged_funnel_with_right_digests_is_rejected(
+    documents: dict[str, Json], change: object, reason: str
+) -> None:
+    assert callable(change)
+    documents["funnel"] = change(documents["funnel"])
+    with pytest.raises(CertificateRejected, match=reason):
+        decide(documents)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda p: p | {"K": (9.0 * np.array(p["K"])).tolist()}, ", the policy engaged,"),
+        (lambda p: p | {"L": (3.0 * np.array(p["L"])).tolist()}, "the observer of a tube is not"),
+        (lambda p: p | {"period": 0.0500001}, "period is not the model's"),
+        (lambda p: p | {"u": [[9.0], *p["u"][1:]]}, "outside the model's input range"),
+        (lambda p: p | {"u": []}, "a plan should have 1 to"),
+        (lambda p: p | {"u": [[0.0]] * (10**6 + 1)}, "a plan should have 1 to"),
+        (lambda p: p | {"start": [0.0]}, "should have shape"),
+        (lambda p: p | {"law": "u = 0"}, "unknown member 'law'"),
+        (lambda p: p | {"kind": "linear"}, "expected 'tube'"),
+    ],
+)  # fmt: skip
+def test_another_policy_with_right_digests_is_rejected(
+    documents: dict[str, Json], change: object, reason: str
+) -> None:
+    assert callable(change)
+    documents["policy"] = change(documents["policy"])
+    with pytest.raises(CertificateRejected, match=reason):
+        decide(bound(documents))
+
+
+def test_a_plan_is_for_a_linear_model(documents: dict[str, Json]) -> None:
+    model, funnel, proof = claim("monotone")
+    del funnel["response"], funnel["cusum"]  # these, and levels by commands, have no plan
+    first(funnel).pop("follows", None)
+    policy = documents["policy"] | {
+        "period": model["period"], "start": [0.0] * len(model["a"]), "L": first(funnel)["L"],
+        "K": [[0.0] * len(model["a"])],
+    }  # fmt: skip
+    found = bound({"model": model, "policy": policy, "funnel": funnel})
+    about = {role: proofs.binding(NAMES[role], document) for role, document in found.items()}
+    document = proofs.proof_document({"kind": "tube", "about": about}, proof)
+    with pytest.raises(CertificateRejected, match="a plan is decided for a model of kind diff"):
+        proofs.decide(document, {NAMES[role]: found[role] for role in NAMES})
+
+
+def test_a_faster_robot_with_right_digests_is_rejected(documents: dict[str, Json]) -> None:
+    documents["model"]["a"] = (1.02 * np.array(documents["model"]["a"])).tolist()
+    with pytest.raises(CertificateRejected):
+        decide(bound(documents))
+
+
+def test_a_funnel_made_for_another_policy_is_rejected(documents: dict[str, Json]) -> None:
+    documents["policy"]["K"] = [[0.0, 0.0]]
+    with pytest.raises(CertificateMismatch, match="funnel was made for another policy"):
+        decide(documents)
+
+
+@pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL, FUNNEL_PROOF])
+def test_a_changed_digit_in_any_number_of_any_file_is_rejected(
+    design_folder: Path, name: str
+) -> None:
+    original = (design_folder / name).read_text()
+    digits = [i for i, c in enumerate(original) if c in "12345678"]
+    for i in digits[:: max(1, len(digits) // 60)]:
+        mutant = original[:i] + str(int(original[i]) + 1) + original[i + 1 :]
+        (design_folder / name).write_text(mutant)
+        with pytest.raises(CertificateRejected):
+            proofs.check(design_folder / FUNNEL_PROOF)
+
+
+@pytest.mark.parametrize("name", [MODEL, POLICY, FUNNEL])
+def test_a_missing_file_is_rejected_by_name(design_folder: Path, name: str) -> None:
+    (design_folder / name).unlink()
+    with pytest.raises(CertificateMismatch, match=name):
+        proofs.check(design_folder / FUNNEL_PROOF)
+
+
+# -- the oracle ------------------------------------------------------------------------------
+
+
+def test_random_claims_are_decided_as_the_oracle_decides(design: OutputTubeDesign) -> None:
+    """Every number moved at random, a little or by its size: true and false claims."""
+    rng, decided = random.Random(3), {True: 0, False: 0}
+    for _ in range(200):
+        documents = {role: copied(getattr(design, role).document()) for role in NAMES}
+        size = 10.0 ** rng.uniform(-10, -1)
+        place: list[object] = rng.choice(places(documents, rng))
+        *path, last = place
+        inner: object = documents
+        for key in path:
+            inner = inner[key]  # type: ignore[index]
+        inner[last] *= 1 + size * rng.choice((-1, 1))  # type: ignore[index]
+        if path[-2:-1] == ["P"]:
+            first(documents["funnel"])["P"][last][path[-1]] = inner[last]  # type: ignore[index]
+        if path[:2] == ["policy", "L"]:
+            for tube in documents["funnel"]["tubes"]:
+                tube["L"] = documents["policy"]["L"]
+        documents = bound(documents)
+        truth = is_proved(documents)
+        decided[truth] += 1
+        if truth:
+            decide(documents)
+        else:
+            with pytest.raises(CertificateRejected):
+                decide(documents)
+    assert min(decided.values()) > 20, decided
+
+
+def places(documents: dict[str, Json], rng: random.Random) -> list[list[object]]:
+    """Where the numbers are."""
+    n, N = len(documents["model"]["a"]), len(documents["policy"]["u"])
+    i, j, k = rng.randrange(n), rng.randrange(n), rng.randrange(N)
+    tube: list[object] = ["funnel", "tubes", 0]
+    return [
+        ["model", "a", i], ["model", "b", rng.randrange(n + 1)], ["model", "c"],
+        ["policy", "K", 0, i], ["policy", "L", i, 0], ["policy", "start", i], ["policy", "u", k, 0],
+        [*tube, "P", i, j], [*tube, "R", 0, 0], [*tube, "level"], [*tube, "inlet"],
+        [*tube, "tau", 0], [*tube, "half_widths", 0], [*tube, "assumption", "measured"],
+        [*tube, "assumption", "safety_factor"], [*tube, "rho"], [*tube, "L", i, 0],
+    ]  # fmt: skip
+
+
+def test_exact_runs_that_keep_the_assumption_stay_in_the_half_width(
+    documents: dict[str, Json],
+) -> None:
+    rng = random.Random(0)
+    for tube in documents["funnel"]["tubes"]:
+        width, most = Fraction(tube["half_widths"][0]), Fraction(0)
+        for _ in range(20):
+            for output, E in oracle.runs(documents["model"], documents["policy"], tube, rng, 40):
+                assert Fraction(tube["level"]) >= E
+                most = max(most, abs(output))
+        assert width / 4 < most <= width
+
+
+def test_the_smallest_tube_that_is_false_is_refused(documents: dict[str, Json]) -> None:
+    """At e along the worst direction the output is tau's bound: a larger tau is false."""
+    tube = first(documents["funnel"])
+    P, rho = np.array(tube["P"]), Fraction(tube["rho"])
+    outputs = [oracle.closed(documents["model"], documents["policy"], Fraction(k))[1][0]
+               for k in (0, 1)]  # fmt: skip
+    false = []
+    for output in outputs:
+        x = [Fraction(v) for v in np.linalg.solve(P, np.array(output, dtype=float)) / tube["rho"]]
+        scaled = rho * oracle.V(oracle.matrix(tube["P"], 2, 2), x) + 1  # the direction (x, e = 1)
+        reached = sum((h * v for h, v in zip(output, x, strict=True)), Fraction(1)) ** 2 / scaled
+        # o² = reached (ρV + e²) there, so a tau above 1/reached is false.
+        false.append(float(1 / reached) * (1 + 1e-9))
+        assert Fraction(false[-1]) * reached > 1
+    tube["tau"] = [min(false)]
+    with pytest.raises(CertificateRejected, match="the bound on speed"):
+        decide(documents)
