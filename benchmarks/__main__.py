@@ -66,6 +66,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "funnel_scaling": Benchmark("funnel_scaling"),
         "heat_exchanger": Benchmark("heat_exchanger", data="exchanger"),
         "known_problems": Benchmark("known_problems"),
+        "first_try": Benchmark("first_try"),
         "kernel": Benchmark("kernel"),
         "lstep": Benchmark("lstep"),
         "monitor": Benchmark("monitor"),

@@ -95,3 +95,12 @@ Definition inside_segment (g : segment) (x : list (R -> R)) (t : R) : Prop :=
   form (P g s) z z <= rho g s.
 Definition inside (d : problem) (x : list (R -> R)) (t : R) : Prop :=
   forall g, In g (segments d) -> begins g <= t <= ends g -> inside_segment g x t.
+
+(* (x - centre)'B(x - centre) <= 1 at the end *)
+Definition in_goal (d : problem) (x : list (R -> R)) : Prop :=
+  match goal d with
+  | None => True
+  | Some (centre, B) =>
+      let z := zip Rminus (at_time x (finish d)) (map val centre) in
+      form (map (map val) B) z z <= 1
+  end.

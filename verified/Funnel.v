@@ -15,7 +15,8 @@ Record piece := Piece {
   tau : list (list Z * squares) }.
 Record witness := Witness {
   margin : num; basis : list mono; multiplier : list mono; sides : list mono;
-  pieces : list (list piece) }.
+  pieces : list (list piece);
+  goal_multiplier : num }.
 
 Definition num_eqb (a b : num) : bool :=
   andb (Z.eqb (fst a) (fst b)) (Pos.eqb (snd a) (snd b)).

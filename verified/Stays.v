@@ -366,28 +366,40 @@ Proof.
   destruct Hin as [<-|Hin]; [lra|]. destruct (IH g Hin Hl2 T2) as [B C]. cbn [hd] in B. lra.
 Qed.
 
-Theorem stays d w : check d w = true -> forall x, solution d x ->
-  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+Definition first_size (d : problem) : nat :=
+  match segments d with [] => O | g :: _ => length (nominal g) end.
+Lemma checked_segments d w : check d w = true ->
+  Forall (fun g => segment_ok (first_size d) d g = true) (segments d) /\
+  forall g, In g (segments d) -> exists ps, covered d ps = true /\
+    forallb (piece_ok d w (products (basis w)) g) ps = true.
 Proof.
-  intros H x [Cx Dx] ta t Ha Ht Hin. unfold check in H.
-  set (n := match segments d with [] => O | g :: _ => length (nominal g) end) in *.
-  apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [H1 H3].
-  apply andb_prop in H1 as [Hm Hl]. apply andb_prop in H2 as [Hlen H2].
-  apply Nat.eqb_eq in Hlen. apply num_ltb_lt in Hm. rewrite val_zero in Hm.
-  assert (Hlim : Forall proper (limits d)).
-  { apply Forall_forall. intros l Hin'. rewrite forallb_forall in H3. specialize (H3 l Hin').
-    destruct l as [[a b]|]; cbn; auto. now apply num_ltb_lt. }
-  assert (Each : forall g, In g (segments d) -> exists ps, segment_ok n d g = true /\
+  intros H. unfold check in H. fold (first_size d) in H.
+  apply andb_prop in H as [_ H]. apply andb_prop in H as [Hlen H].
+  apply Nat.eqb_eq in Hlen.
+  assert (Each : forall g, In g (segments d) -> exists ps, segment_ok (first_size d) d g = true /\
     covered d ps = true /\ forallb (piece_ok d w (products (basis w)) g) ps = true).
-  { intros g Hg. rewrite forallb_forall in H2.
+  { intros g Hg. rewrite forallb_forall in H.
     assert (G : exists ps, In (g, ps) (combine (segments d) (pieces w))).
     { clear - Hg Hlen. revert Hg Hlen. generalize (pieces w).
       induction (segments d) as [|g1 gs IH]; intros [|p ps] Hg Hlen; cbn in *; try tauto;
         try discriminate. destruct Hg as [->|Hg]; [eauto|]. destruct (IH ps Hg) as [q Hq]; eauto. }
-    destruct G as [ps G]. specialize (H2 _ G). cbn [fst snd] in H2.
-    apply andb_prop in H2 as [A B]. apply andb_prop in A as [A1 A2]. eauto. }
-  assert (Hok : Forall (fun g => segment_ok n d g = true) (segments d)).
-  { apply Forall_forall. intros g Hg. destruct (Each g Hg) as [ps [A _]]. exact A. }
+    destruct G as [ps G]. specialize (H _ G). cbn [fst snd] in H.
+    apply andb_prop in H as [A B]. apply andb_prop in A as [A1 A2]. eauto. }
+  split.
+  - apply Forall_forall. intros g Hg. destruct (Each g Hg) as [ps [A _]]. exact A.
+  - intros g Hg. destruct (Each g Hg) as [ps [_ A]]. eauto.
+Qed.
+
+Theorem stays d w : check d w = true -> forall x, solution d x ->
+  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+Proof.
+  intros H x [Cx Dx] ta t Ha Ht Hin. destruct (checked_segments d w H) as [Hok Each].
+  unfold check in H. apply andb_prop in H as [H1 _]. apply andb_prop in H1 as [H1 H3].
+  apply andb_prop in H1 as [Hm Hl]. apply num_ltb_lt in Hm. rewrite val_zero in Hm.
+  set (n := first_size d) in *.
+  assert (Hlim : Forall proper (limits d)).
+  { apply Forall_forall. intros l Hin'. rewrite forallb_forall in H3. specialize (H3 l Hin').
+    destruct l as [[a b]|]; cbn; auto. now apply num_ltb_lt. }
   assert (Times : Forall (fun g => begins g < ends g) (segments d)).
   { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
   assert (Range : forall g, In g (segments d) -> begin d <= begins g /\ ends g <= finish d).
@@ -395,7 +407,8 @@ Proof.
     unfold begin. destruct (segments d); [destruct Hg|]. exact A. }
   intros g Hg Hgt. apply (chain n d x (segments d) Hok Hl) with (ta := ta); auto.
   2:{ unfold begin in Ha. destruct (segments d); lra. }
-  apply Forall_forall. intros h Hh. destruct (Each h Hh) as [ps [A [B C]]].
+  apply Forall_forall. intros h Hh. destruct (Each h Hh) as [ps [B C]].
+  assert (A : segment_ok n d h = true) by (rewrite Forall_forall in Hok; auto).
   destruct (Range h Hh) as [R1 R2].
   assert (Hx : length x = n).
   { pose proof (segment_facts d h n A) as [_ E _ _ _ T _ _ _ _].

@@ -164,7 +164,7 @@ def coq(problem: Problem) -> str:
     out = [
         "(* Made by generate.py. The theorem is about the numbers below. *)",
         "From Coq Require Import ZArith Reals List Uint63.",
-        "From Verified Require Import Integers Forms Polynomials Positive Claim Funnel Stays Data.",
+        "From Verified Require Import Integers Forms Polynomials Positive Claim Funnel Goal Data.",
         "Import ListNotations.",
         "Open Scope Z_scope.",
     ]
@@ -230,15 +230,15 @@ def coq(problem: Problem) -> str:
     bases = (listed(map(monomial, proof.get(name, []))) for name in names)
     out.append(
         f"Definition proof := Witness {num(proof['margin'])} {' '.join(bases)}"
-        f" {listed(map(listed, by_segment))}."
+        f" {listed(map(listed, by_segment))} {num(proof.get('goal_multiplier', 0))}."
     )
     out.append(
-        "Theorem accepted : check data proof = true.\n"
+        "Theorem accepted : funnel_ok data proof = true.\n"
         "Proof. vm_cast_no_check (eq_refl true). Qed.\n"
-        "Theorem funnel : forall x, solution data x -> forall ta t,\n"
-        "  (begin data <= ta)%R -> (ta <= t <= finish data)%R ->\n"
-        "  inside data x ta -> inside data x t.\n"
-        "Proof. exact (stays data proof accepted). Qed.\n"
+        "Theorem funnel : forall x, solution data x ->\n"
+        "  forall ta, (begin data <= ta <= finish data)%R -> inside data x ta ->\n"
+        "  (forall t, (ta <= t <= finish data)%R -> inside data x t) /\\ in_goal data x.\n"
+        "Proof. exact (funnel_proved data proof accepted). Qed.\n"
         "Print Assumptions funnel."
     )
     return "\n".join(out) + "\n"

@@ -13,6 +13,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
+from bags.designs import documents
+from nlsid_core.funnels.tube import TubeFunnel
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 from tests.ros.robot import GOOD, MONITOR, Robot
 
@@ -53,6 +55,9 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
 ) -> None:
     use_domain_of_this_run(monkeypatch)
     port = free_port()
+    proved = documents.load_proved(funnel).design.funnel
+    assert isinstance(proved, TubeFunnel)
+    width = proved.half_width
     names = {"__ns": "/robot1"}
     shared = {"/robot1/odom": "/odom", "/robot1/cmd_vel": "/cmd_vel"}
     signals = {"allow_old_stamps": True, "source": "/funnel_publisher", "stale_after": 5.0}
@@ -77,7 +82,7 @@ def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
         k = GOOD[-1]
         drive_until("inside")
         assert reader.names == ["speed [m/s]"]
-        assert reader.signals[1] == pytest.approx(0.236, abs=1e-3)
+        assert reader.signals[1] == pytest.approx(width, rel=1e-4)
         assert reader.samples > 5
         spin_until(lambda: reader.verdict == "late")
         monitor.send_signal(signal.SIGSTOP)

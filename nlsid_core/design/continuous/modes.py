@@ -18,6 +18,7 @@ FLOOR = 1e-6  # every S is at least that times I, for g and q of size 1: the che
 CLEAR = 0.02  # of q's size: a q that is below -CLEAR everywhere needs no program to rule it out
 COST = 1e-6  # of the trace of S, which else has no bound where a mode hardly occurs
 TOLERANCE = 1e-7
+ROUNDING = 1e-9  # of q: what is as near to affine is
 
 
 def multipliers(
@@ -29,15 +30,25 @@ def multipliers(
     sizes = np.maximum(np.abs(q).max(axis=1), 1e-12)
     unit = q / sizes[:, None]
     S = np.tile(FLOOR * np.eye(n + 1), (count, 1, 1))
-    impossible = np.flatnonzero(unit.max(axis=1) < -CLEAR)
+    most = _largest(program, unit)
+    impossible = np.flatnonzero(most < -CLEAR)
     if len(impossible):
         chosen = int(impossible[0])
-        S[chosen, 0, 0] += 1 / -float(unit[chosen].max())
+        S[chosen, 0, 0] += 1 / -float(most[chosen])
     elif (unit < CLEAR).any():
         S += _solved(program, (g - g.mean()) / spread - 2 * FLOOR * unit.sum(axis=0), unit)
     S *= (spread / sizes)[:, None, None]
     y = np.hstack([np.ones((len(g), 1)), program.points])
     return S, np.asarray(np.einsum("ln,na,lab,nb->n", q, y, S, y))
+
+
+def _largest(program: SphereProgram | LineProgram, q: FloatArray) -> FloatArray:
+    """(L,) of each q on the whole sphere, where it is affine; else at the points."""
+    y = np.hstack([np.ones((q.shape[1], 1)), program.points])
+    affine = np.linalg.lstsq(y, q.T, rcond=None)[0]
+    exact = np.abs(y @ affine - q.T).max(axis=0) <= ROUNDING * np.abs(q).max(axis=1)
+    whole = affine[0] + np.linalg.norm(affine[1:], axis=0)
+    return np.asarray(np.where(exact, whole, q.max(axis=1)))
 
 
 def _solved(program: SphereProgram | LineProgram, g: FloatArray, q: FloatArray) -> FloatArray:

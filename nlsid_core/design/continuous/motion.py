@@ -26,9 +26,10 @@ MORE_KNOTS = 2.0  # at a time, where cubics between the knots miss the dynamics
 MAX_KNOTS = 200
 KEPT = 0.9  # of the limits: the rest is there to correct with
 GOOD = 0.5  # of the defect that a funnel accepts
-MAX_STEPS, NEWTON_STEPS = 60, 20
+MAX_STEPS, NEWTON_STEPS = 150, 20
 TRUST, SMALLEST = 1.0, 1e-7  # of the sizes of states and inputs
 PRICE = 1e2  # of a defect, over what the inputs may cost
+LOST = 1e6  # a defect of that size, relative to the states': the steps diverge
 SETTLED = 1e-10  # largest defect, relative to the states' sizes
 STALLED = 1e-5  # of the cost: less is not worth another program
 STEP = 1e-6  # of the sizes, for central differences: errors of 1e-10
@@ -249,17 +250,18 @@ class _Mesh:
         free[[0, -1], :n] = False
         scale = np.tile(1 / sizes[:n], len(z) - 1)
         for _ in range(NEWTON_STEPS):
-            d = self.defects(z).ravel() * scale
+            with np.errstate(all="ignore"):
+                d = self.defects(z).ravel() * scale
             worst = float(np.abs(d).max(initial=0.0))
-            if worst <= SETTLED:
+            if worst <= SETTLED or not worst < LOST:
                 break
             J = sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, len(z)))
             J = J.tocsc()[:, np.flatnonzero(free.ravel())]
             normal = (J @ J.T + 1e-13 * sp.eye(J.shape[0])).tocsc()
             try:
                 step = J.T @ splu(normal).solve(d)
-            except RuntimeError as error:
-                raise SolverError(f"the motion's equations are singular: {error}") from error
+            except RuntimeError:  # singular: nothing to go on from
+                break
             moved = np.zeros(z.size)
             moved[free.ravel()] = step
             z = z - moved.reshape(z.shape) * sizes

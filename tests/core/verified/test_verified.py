@@ -82,10 +82,17 @@ def limit_wider(files: Files) -> None:
     files[POLICY]["limits"][0][2] *= 2
 
 
+def goal_smaller(files: Files) -> None:
+    """By 18 % in every direction."""
+    goal = files[PROOF]["claim"]["goal"]
+    goal["P"] = [[1.5 * entry for entry in row] for row in goal["P"]]
+
+
 @needs_coq
 @pytest.mark.coq
 @pytest.mark.parametrize(
-    "forge", [rho_raised, gain_lower, multiplier_sign, piece_missing, limit_wider]
+    "forge",
+    [rho_raised, gain_lower, multiplier_sign, piece_missing, limit_wider, goal_smaller],
 )
 def test_both_kernels_refuse_a_forgery(
     forge: Callable[[Files], None], build: Path, tmp_path: Path

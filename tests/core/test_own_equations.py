@@ -1,0 +1,164 @@
+"""Funnels of equations as a user writes them: motion, design, refusals that name their cause."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.first_try import Truth, lines_of, rocket, van_der_pol
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import (
+    ContinuousTracking,
+    Goal,
+    design,
+    design_funnel,
+    integrate_nominal,
+    plan_motion,
+)
+from nlsid_core.design.thesis.soundness import simulate_boundary
+from nlsid_core.dynamics import Nominal, Rates
+from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.proofs import check
+
+PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"
+
+
+def pendulum(x: Any, u: Any) -> Any:
+    """An angle from upright in rad and its rate, and a torque."""
+    return [x[1], 9.81 * np.sin(x[0]) + u[0]]
+
+
+def upright(knots: int = 9, seconds: float = 1.0) -> Nominal:
+    """At rest."""
+    t = np.linspace(0, seconds, knots)
+    return integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[0.0, 0.0])
+
+
+def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) -> None:
+    code = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)[0]
+    told = [float(number) for number in re.findall(r"# \[(.*?)\]", code)[0].split()]
+    names: dict[str, Any] = {}
+    exec(code.replace('"lane_change"', repr(str(tmp_path))), names)
+    found = names["found"]
+    assert found.funnel.widths(0.0) == pytest.approx(told, rel=0.02)
+    assert check(tmp_path / "funnel.proof.json").margin > 0
+    truth = Truth(names["rate"], found, 0)
+    rng = np.random.default_rng(0)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    assert run.violations == 0
+    assert run.max_v > 0.9
+
+
+@pytest.mark.slow
+def test_a_rocket_lands_at_the_first_try_and_no_start_leaves() -> None:
+    rate, found = rocket()
+    assert found.funnel.widths(0.0)[0] > 0.3
+    assert lines_of(rocket) <= 20
+    rng = np.random.default_rng(0)
+    truth = Truth(rate, found, 0)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    assert run.violations == 0
+    assert found.found.proved.pieces.kappa is not None
+    assert np.ptp(np.log2(found.found.proved.pieces.kappa), axis=0).max() > 1  # it follows ρ
+
+
+def test_an_oscillator_without_an_input_is_proved() -> None:
+    _, found = van_der_pol()
+    assert (found.funnel.widths(0.0) > [0.9, 1.1]).all()
+
+
+# -- the motion ----------------------------------------------------------------------------------
+
+
+def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
+    end = [np.pi / 2, 0.0]
+    limits = [[-14.0, 14.0]]
+    found = plan_motion(pendulum, start=[0, 0], end=end, seconds=2, m=1, limits=limits)
+    gap, _, _ = found.defect(Rates.numeric(pendulum, 2, 1))
+    assert gap < 1e-3 * np.abs(found.x.derivative().control).max()
+    assert found.x.ends()[-1] == pytest.approx(end)
+    assert np.abs(found.u.ends()).max() <= 14.0
+    followed = integrate_nominal(pendulum, found.u, t=found.t, start=[0.0, 0.0])
+    assert followed.x.ends()[-1] == pytest.approx(end, abs=0.02)
+
+
+def test_what_is_no_motion_is_not_returned() -> None:
+    with pytest.raises(Infeasible, match="more seconds"):
+        plan_motion(pendulum, start=[0, 0], end=[3, 0], seconds=1, m=1, limits=[[-1, 1]])
+    with pytest.raises(DataError, match="give u"):
+        plan_motion(pendulum, start=[0, 0], end=[1, 0], seconds=1)
+    with pytest.raises(DataError, match="seconds should be above 0"):
+        plan_motion(pendulum, start=[0, 0], end=[1, 0], seconds=0, m=1)
+
+
+# -- goals, limits, weights ----------------------------------------------------------------------
+
+
+def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
+    widths = np.array([0.2, 0.5])
+    P = np.diag(widths**-2)
+    skewed = P.copy()
+    skewed[0, 1] += 4e-15
+    found = [
+        design_funnel(pendulum, upright(), goal=goal).funnel.rho
+        for goal in (widths, P, skewed, Goal(np.zeros(2), P))
+    ]
+    for rho in found[1:]:
+        assert rho == pytest.approx(found[0], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"goal": [0.2, -0.5]}, "half-widths should be positive"),
+        ({"goal": [0.2]}, "2 half-widths, or an ellipsoid's"),
+        ({"goal": [[25.0, 1.0], [0.0, 4.0]]}, "symmetric positive definite"),
+        ({"goal": [0.2, 0.5], "limits": [-1, 1]}, "limits should be rows"),
+        ({"goal": [0.2, 0.5], "uncertain": [[-1, 1]]}, "no argument w|function of some of"),
+    ],
+)
+def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
+    with pytest.raises(DataError, match=said):
+        design_funnel(pendulum, upright(), **options)
+
+
+def test_limits_are_pairs_too() -> None:
+    found = design_funnel(pendulum, upright(), goal=[0.2, 0.5], limits=[[-6, 6]])
+    assert found.policy.limits.tolist() == [[0, -6, 6]]
+
+
+# -- refusals ------------------------------------------------------------------------------------
+
+
+def refusal(rate: Any, nominal: Nominal, **options: Any) -> str:
+    with pytest.raises(Infeasible) as told:
+        design(ContinuousTracking(rate, nominal, **options))
+    return str(told.value)
+
+
+def blown(x: Any, u: Any, w: Any) -> Any:
+    """The pendulum, pushed."""
+    return [x[1], 9.81 * np.sin(x[0]) + u[0] + w[0]]
+
+
+def test_a_disturbance_that_is_too_strong_is_named() -> None:
+    text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
+    assert re.search(r"Because of the disturbance w: take a larger goal", text)
+    assert re.search(r"the disturbance w takes .* 1/s \(\d+ %\)", text)
+
+
+def test_a_shape_that_cannot_be_found_keeps_what_is_proved(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: Any, **__: Any) -> FloatArray:
+        raise Infeasible("nothing better")
+
+    monkeypatch.setattr("nlsid_core.design.continuous.design.enlarge_shape", refuse)
+    t = np.linspace(0, 1, 5)
+    rate = lambda x: [-x[0] + x[0] ** 3, -x[1]]  # noqa: E731 - a function of x alone
+    still = integrate_nominal(rate, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
+    found = design_funnel(rate, still, goal=[0.3, 0.3], shape="P")
+    assert "shape rho kept: nothing better" in found.found.history[-1][0]
+    assert found.verdict.margin > 0
