@@ -171,7 +171,8 @@ def trials(*digests: str) -> list[Json]:
 
 @pytest.mark.parametrize(
     "digest",
-    ["", "a", "sha256:" + 64 * "A", "SHA256:" + 64 * "a", "sha256:" + 63 * "a", "sha256:" + 64 * "g",
+    ["", "a", "sha256:" + 64 * "A", "SHA256:" + 64 * "a", "sha256:" + 63 * "a",
+     "sha256:" + 64 * "g",
      "sha256:" + 65 * "a", " sha256:" + 64 * "a", "sha256:" + 64 * "a" + " ", "sha512:" + 64 * "a"],
 )  # fmt: skip
 @pytest.mark.parametrize("of", ["measured_on", "designed_on"])
