@@ -1,6 +1,7 @@
 """The controller over DDS: its rate, its announcement, its limits, and all that makes it stop."""
 
 import math
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -142,7 +143,7 @@ def test_a_state_that_is_no_number_stops_it(stage: Callable[..., Stage]) -> None
     robot.expect_ramp_down("speed is nan")
 
 
-def test_another_design_in_mid_run_stops_it_and_the_same_one_again_does_not(
+def test_the_same_design_again_in_mid_run_does_not_stop_it(
     stage: Callable[..., Stage], tmp_path: Path
 ) -> None:
     robot = stage(folder=tmp_path)
@@ -153,11 +154,21 @@ def test_another_design_in_mid_run_stops_it_and_the_same_one_again_does_not(
     count = len(robot.commands)
     robot.spin_until(lambda: len(robot.commands) > count + 10)
     assert not robot.has_said("stop")
+
+
+def test_another_design_in_mid_run_stops_it(stage: Callable[..., Stage], tmp_path: Path) -> None:
+    used, other = tmp_path / "used", tmp_path / "other"
+    used.mkdir()
+    robot = stage(folder=used)
+    shutil.copytree(used, other)
     config = load_config(config_file("f1tenth.yaml"))
     assert config.funnel is not None
     wider = config.funnel.model_copy(update={"safety_factor": 2.0})
     wide = config.model_copy(update={"funnel": wider})
-    design_funnel_files(tmp_path / documents.MODEL, wide, tmp_path)
+    design_funnel_files(other / documents.MODEL, wide, other)  # a run would not outlast it
+    robot.track()
+    for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
+        shutil.copyfile(other / name, used / name)
     robot.expect_ramp_down("the design was replaced")
 
 
