@@ -14,10 +14,12 @@ import json
 import sys
 from collections.abc import Iterable
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 WORD = 2**61  # rows of factors are machine words in Coq
+SHIFT, LEVEL = 400, 16  # of powers of two, of subdivision
 
 
 class NotCovered(Exception):  # noqa: N818 - says what the second kernel does not decide
@@ -71,6 +73,14 @@ def _load(content: bytes, name: str) -> Any:
     return document
 
 
+def _kinds(documents: list[Any]) -> None:
+    """Raise NotCovered unless these are a vector field, a policy and a funnel."""
+    for document, kind in zip(documents, ("vector_field", "policy", "funnel"), strict=True):
+        continuous = kind == "vector_field" or document.get("kind") == "continuous"
+        if document.get("format") != f"nlsid/{kind}" or not continuous:
+            raise NotCovered(f"a file is not a continuous {kind}")
+
+
 def _only(members: dict[str, Any], required: str, optional: str = "") -> None:
     """Raise NotCovered unless the members are those, and no others."""
     missing = set(required.split()) - set(members)
@@ -94,6 +104,7 @@ def _bound(about: dict[str, Any], folder: Path) -> tuple[list[Any], dict[str, st
         if digests[role] != about[role]["digest"]:
             raise NotCovered(f"{name} is not the file that the proof is about")
         files.append(_load(content, name))
+    _kinds(files)
     if any(file["vector_field"] != digests["vector_field"] for file in files[1:]):
         raise NotCovered("a file names another vector field")
     if files[2]["policy"] != digests["policy"]:
@@ -103,9 +114,28 @@ def _bound(about: dict[str, Any], folder: Path) -> tuple[list[Any], dict[str, st
 
 def number(value: Any) -> Fraction:
     """The exact value of a number of a file."""
-    if type(value) is bool or not isinstance(value, int | float | str):
+    if type(value) not in (int, float):
         raise NotCovered(f"{value!r} is not a number")
     return Fraction(value)
+
+
+def rational(value: Any) -> Fraction:
+    """A number, or a text "p/q"."""
+    return Fraction(value) if type(value) is str else number(value)
+
+
+def integer(value: Any, least: int, most: int) -> int:
+    """A whole number of a file, in a range."""
+    if type(value) is not int or not least <= value <= most:
+        raise NotCovered(f"{value!r} is not a whole number from {least} to {most}")
+    return value
+
+
+def bits(value: Any) -> int:
+    """A whole number or a text of one, of a factor."""
+    if type(value) is str and value.removeprefix("-").isdecimal() and len(value) < 60:
+        value = int(value)
+    return integer(value, -WORD + 1, WORD - 1)
 
 
 class Coq:
@@ -115,7 +145,8 @@ class Coq:
         self.lines = [
             "(* Made by generate.py. The theorem is about the numbers below. *)",
             "From Coq Require Import ZArith Reals List Uint63.",
-            "From Verified Require Import Integers Forms Polynomials Positive Claim Funnel Goal Data.",
+            "From Verified Require Import Integers Forms Polynomials Positive Claim.",
+            "From Verified Require Import Funnel Goal Data.",
             "Import ListNotations.",
             "Open Scope Z_scope.",
         ]
@@ -193,7 +224,10 @@ class Writer:
 
     def num(self, value: Any) -> str:
         """A fraction of Claim.v."""
-        fraction = number(value)
+        return self.fraction(number(value))
+
+    def fraction(self, fraction: Fraction) -> str:
+        """The same."""
         to = self.to
         return to.pair(to.whole(fraction.numerator), to.variable(fraction.denominator))
 
@@ -201,11 +235,15 @@ class Writer:
         """A list of them."""
         return self.to.listed(map(self.num, values))
 
-    def monomials(self, rows: list[list[int]]) -> str:
-        """Monomials of x, each as the list of its variables."""
+    def monomials(self, rows: list[list[int]], n: int) -> str:
+        """Monomials of x (n,), distinct, each as the list of its variables."""
         to = self.to
+        if any(len(row) != n for row in rows) or len({tuple(row) for row in rows}) != len(rows):
+            raise NotCovered(f"monomials should be distinct and have {n} exponents")
         return to.listed(
-            to.listed(to.variable(i + 1) for i, e in enumerate(row) for _ in range(e))
+            to.listed(
+                to.variable(i + 1) for i, e in enumerate(row) for _ in range(integer(e, 0, 31))
+            )
             for row in rows
         )
 
@@ -221,14 +259,24 @@ class Writer:
         to, factors = self.to, []
         for factor in stated["factors"]:
             weights = stated.get("weights", [1] * len(factor))
-            rows = zip(weights, factor, strict=True)
-            factors.append(to.listed(to.pair(to.whole(int(w)), to.row(row)) for w, row in rows))
-        scale = to.whole(int(stated.get("scale", 1)))
-        return to.made("word_squares", to.whole(stated["unit"]), scale, to.listed(factors))
+            rows = []
+            for w, row in zip(weights, factor, strict=True):
+                entries = [bits(e) for e in row]
+                if not entries:
+                    raise NotCovered("a row of a factor without entries")
+                rows.append(to.pair(to.whole(bits(w)), to.row(entries)))
+            factors.append(to.listed(rows))
+        scale = to.whole(bits(stated.get("scale", 1)))
+        unit = to.whole(integer(stated["unit"], 0, SHIFT))
+        return to.made("word_squares", unit, scale, to.listed(factors))
 
-    def wholes(self, values: Iterable[int]) -> str:
-        """A list of whole numbers."""
-        return self.to.listed(map(self.to.whole, values))
+    def shifts(self, values: Iterable[Any]) -> str:
+        """Powers of two."""
+        return self.to.listed(self.to.whole(integer(e, -SHIFT, SHIFT)) for e in values)
+
+    def counts(self, values: Iterable[Any]) -> str:
+        """Exponents of a monomial."""
+        return self.to.listed(self.to.count(integer(e, 0, 7)) for e in values)
 
     def segments(self, problem: Problem) -> str:
         """Every interval between knots."""
@@ -242,14 +290,19 @@ class Writer:
             )
             for k, (t, P, rho) in enumerate(rows)
         ]
-        fields, bounds = [], []
+        fields, bounds, size = [], [], 1 + n + m + len(field["uncertain"])
         for span, piece in enumerate(field["pieces"]):
             terms = [
                 zip(equation["exponents"], equation["coefficients"], strict=True)
                 for equation in piece
             ]
+            if any(len(row) != size for equation in piece for row in equation["exponents"]):
+                raise NotCovered(f"a monomial should have {size} exponents")
+            for equation in piece:
+                if any(a >= b for a, b in pairwise(equation["exponents"])):
+                    raise NotCovered("monomials should be distinct, in increasing order")
             equations = to.listed(
-                to.listed(to.pair(to.listed(map(to.count, row)), self.num(c)) for row, c in rows)
+                to.listed(to.pair(self.counts(row), self.fraction(rational(c))) for row, c in rows)
                 for rows in terms
             )
             fields.append(to.named(f"field_{span}", equations))
@@ -296,9 +349,11 @@ class Writer:
             proof["pieces"], key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"]))
         )
         for i, piece in enumerate(order):
-            by_segment[piece["interval"]].append(to.named(f"piece_{i}", self.piece(piece)))
-        names = ("basis", "multiplier", "sides")
-        bases = [self.monomials(proof.get(name, [])) for name in names]
+            by_segment[integer(piece["interval"], 0, len(by_segment) - 1)].append(
+                to.named(f"piece_{i}", self.piece(piece))
+            )
+        names, n = ("basis", "multiplier", "sides"), problem.field["states"]
+        bases = [self.monomials(proof.get(name, []), n) for name in names]
         pieces = to.listed(map(to.listed, by_segment))
         least = self.num(proof.get("goal_multiplier", 0))
         return to.made("Witness", self.num(proof["margin"]), *bases, pieces, least)
@@ -310,19 +365,26 @@ class Writer:
         _only(piece["mu"], "shifts start end")
         rows = zip(*(piece["mu"][name] for name in ("shifts", "start", "end")), strict=True)
         lines = to.listed(
-            to.pair(to.whole(shift), to.pair(to.whole(a), to.whole(b))) for shift, a, b in rows
+            to.pair(
+                to.whole(integer(shift, -SHIFT, SHIFT)),
+                to.pair(to.whole(bits(a)), to.whole(bits(b))),
+            )
+            for shift, a, b in rows
         )
         mode = 0
         for side in piece.get("mode", []):
-            mode = 3 * mode + side + 1
+            mode = 3 * mode + integer(side, -1, 1) + 1
         tau = to.listed(
-            to.pair(self.wholes(entry["columns"]), self.squares(entry["squares"]))
+            to.pair(self.shifts(entry["columns"]), self.squares(entry["squares"]))
             for entry in piece.get("tau", [])
         )
-        place = to.whole(piece["level"]), to.whole(piece["index"])
+        level = integer(piece["level"], 0, LEVEL)
+        index = integer(piece["index"], 0, 2**level - 1)
+        vertex = integer(piece["vertex"], 0, 1023)
+        place = to.whole(level), to.whole(index), to.count(vertex), to.count(mode)
         return to.made(
-            "Piece", *place, to.count(piece["vertex"]), to.count(mode), to.made("big_mu", lines),
-            self.wholes(piece["columns"]), self.squares(piece["squares"]), tau,
+            "Piece", *place, to.made("big_mu", lines),
+            self.shifts(piece["columns"]), self.squares(piece["squares"]), tau,
         )  # fmt: skip
 
 
