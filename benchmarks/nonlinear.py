@@ -213,6 +213,9 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
         if first.y.shape[1] == 1:
             yield MonotoneClass(lags), CertifiedSem(STEPS)
         yield ImplicitClass(lags, input_degree=3), CertifiedSem(STEPS)
+        # Where commands change rarely only one delay is excited.
+        yield StateAffineClass(lags, (1,), leading_degree=1, right_degree=3), CertifiedSem(STEPS)
+        yield ImplicitClass(lags, (1,), input_degree=3), CertifiedSem(STEPS)
         if one:
             yield StateAffineClass(lags, leading_degree=2, right_degree=3), CertifiedSem(STEPS)
             half = (lags + 1) // 2

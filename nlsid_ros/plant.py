@@ -23,16 +23,19 @@ from bags.designs.documents import load_model
 from bags.signals.expressions import Expression
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
+from nlsid_core import files
 from nlsid_core.arrays import FloatArray
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.running.plants import ModelPlant, Pendulum, Plant, Satellite
+from nlsid_core.running.plants import FieldPlant, ModelPlant, Pendulum, Plant, Satellite
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "plant"
 MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
-KINDS = ("model", "pendulum", "satellite", *MUJOCO)
+KINDS = ("model", "vector_field", "pendulum", "satellite", *MUJOCO)
+FOR = "for kinds model and vector_field"
 
 
 class PlantNode(ManagedNode):
@@ -45,13 +48,21 @@ class PlantNode(ManagedNode):
         """Declare them; take the values that they have now."""
         number = partial(declare_number, self)
         self._kind = declare_text(self, "kind", "model", f"what is simulated: {', '.join(KINDS)}")
-        self._model = declare_text(self, "model", "", "model.json, for kind model")
+        what = "model.json, for kind model; vector_field.json, for kind vector_field"
+        self._model = declare_text(self, "model", "", what)
+        what = "numbers separated by commas: the state of a vector field until the first command"
+        self._state = declare_text(self, "state", "", what)
+        what = "of a vector field: topic:field paths separated by commas, all on one topic"
+        self._paths = [declare_text(self, name, "", what) for name in ("response", "command")]
         self._period = number(
-            "period", 0.01, "s between samples (pendulum, satellite)", between=(1e-3, 1.0)
+            "period",
+            0.01,
+            "s between samples (vector_field, pendulum, satellite)",
+            between=(1e-3, 1.0),
         )
         self._types = [
-            declare_text(self, "response_type", "nav_msgs/msg/Odometry", "for kind model"),
-            declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "for kind model"),
+            declare_text(self, "response_type", "nav_msgs/msg/Odometry", FOR),
+            declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", FOR),
         ]
         self._noise = number(
             "noise",
@@ -84,6 +95,13 @@ class PlantNode(ManagedNode):
             response = Expression.parse(model.y.path).path
             command = Expression.parse(model.u.path).path
             inputs, spread = 1, [self._noise]
+        elif isinstance(self._plant, FieldPlant):
+            response, command = (
+                SignalVector.parse(path.strip() for path in paths.split(","))
+                for paths in self._paths
+            )
+            inputs, spread = self._plant.inputs, [self._noise] * len(response.paths)
+            self._plant.refuse(len(response.paths), len(command.paths))
         else:
             inputs = len(self._plant.measure(np.zeros(1))) // 2
             joints = range(inputs)
@@ -105,6 +123,13 @@ class PlantNode(ManagedNode):
             if not self._model:
                 raise DataError("no model to simulate; set the parameter model")
             return ModelPlant(load_model(Path(self._model)))
+        if self._kind == "vector_field":
+            try:
+                x = np.array([float(part) for part in self._state.split(",")])
+            except ValueError as error:
+                raise DataError(f"state should be numbers, is '{self._state}'") from error
+            field = VectorField.from_document(files.load_document(self._model), source=self._model)
+            return FieldPlant(field, x, period=self._period, rng=self._rng)
         if self._kind == "pendulum":
             return Pendulum(self._period)
         if self._kind == "satellite":

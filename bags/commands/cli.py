@@ -449,7 +449,9 @@ def tolerances(
 
 @app.command()
 def live(
-    workflow: Annotated[str, typer.Argument(help="monitor, closed_loop or identify.")],
+    workflow: Annotated[
+        str, typer.Argument(help="monitor, closed_loop or identify; none: lists their arguments.")
+    ] = "",
     arguments: Annotated[
         list[str] | None,
         typer.Argument(help="NAME:=VALUE, as for `ros2 launch`; none: lists them."),
@@ -460,10 +462,14 @@ def live(
 ) -> None:
     """Start a workflow's nodes and end them together: no ROS launch needed, rclpy is."""
     from bags.chain.shipped import shipped_file
-    from bags.commands.launching import LaunchFile, in_one_process, run_together
+    from bags.commands.launching import WORKFLOWS, LaunchFile, in_one_process, run_together
 
     if importlib.util.find_spec("rclpy") is None:
         raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    if not workflow:
+        for name in WORKFLOWS:
+            typer.echo(str(LaunchFile(shipped_file("launch", f"{name}.launch.xml"))))
+        raise typer.Exit(2)
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
     commands = launch.commands(arguments or [])
     raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))

@@ -21,6 +21,7 @@ from xml.etree.ElementTree import Element
 
 from nlsid_core.errors import DataError
 
+WORKFLOWS = ("monitor", "closed_loop", "identify")  # that `nlsid live` lists
 LOOK = 0.2  # s between looks at whether all still run
 PATIENCE = 20.0  # s for a node to end when asked to
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

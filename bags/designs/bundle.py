@@ -111,7 +111,8 @@ class Bundle:
             for role, content in self.contents.items()
             if role != PROOF
         }
-        return read_design(documents, wiring=wiring)
+        proof = files.parse_document(self.contents.get(PROOF, b"{}"), source=PROOF)
+        return read_design(documents, wiring=wiring, claim=proof.get("claim"))
 
 
 class Check:

@@ -31,11 +31,13 @@ from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
 
 M = TypeVar("M", bound=Dynamics)
 P = TypeVar("P", bound=AnyPolicy | None)
 F = TypeVar("F", bound=AnyFunnel)
+CONTINUOUSLY = Held()
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,15 @@ class Wiring:
 class WiredDesign(Generic[M, P, F]):
     """The parts of a design of any kind, and where their signals are.
 
-    wiring: of a continuous funnel, None until somebody says it.
+    wiring: of a continuous funnel, None until somebody says it. held: how the proof of a continuous
+    funnel lets its policy be applied.
     """
 
     model: M
     policy: P
     funnel: F
     wiring: Wiring | None = None
+    held: Held = CONTINUOUSLY
 
     @property
     def name(self) -> str:
@@ -128,7 +132,8 @@ class WiredDesign(Generic[M, P, F]):
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
         period = self.period if isinstance(self.model, VectorField) else None
-        return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period)
+        return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period,
+                       held=self.held)  # fmt: skip
 
     def controller(self, limits: Limits, settling: float) -> Controller:
         """A controller for one run; `settling`: s to wait for a state where it may start."""
@@ -136,7 +141,13 @@ class WiredDesign(Generic[M, P, F]):
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
         return Controller(
-            self.model, self.policy, self.funnel, limits=limits, settling=settling, period=period
+            self.model,
+            self.policy,
+            self.funnel,
+            limits=limits,
+            settling=settling,
+            period=period,
+            held=self.held,
         )
 
     def _wired(self) -> Wiring:
@@ -154,11 +165,14 @@ WiredTube: TypeAlias = WiredDesign[StableModel, TubePolicy | None, TubeFunnel]
 AnyDesign: TypeAlias = SampledDesign | ContinuousDesign | WiredTube
 
 
-def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) -> AnyDesign:
+def read_design(
+    documents: Mapping[str, Json], *, wiring: Wiring | None = None, claim: Json | None = None
+) -> AnyDesign:
     """The documents `model` (or vector field), `policy` and `funnel` as what they are.
 
-    The funnel's kind decides. Raises DocumentError if one is not what it should be,
-    CertificateMismatch if they do not belong together.
+    The funnel's kind decides. claim: of its proof, which says how old an input may be. Raises
+    DocumentError if one is not what it should be, CertificateMismatch if they do not belong
+    together, DataError if samples come less often than is proved.
     """
     if "funnel" not in documents:
         raise DocumentError("a design has a funnel")
@@ -184,7 +198,10 @@ def read_design(documents: Mapping[str, Json], *, wiring: Wiring | None = None) 
         )
     model = read_model(documents["model"])
     refuse_mismatch(model, policy, funnel)
-    design: Any = WiredDesign(model, policy, funnel, wiring)
+    held = Held.of_claim(claim or {}) if isinstance(funnel, ContinuousFunnel) else Held()
+    if held.hold and wiring is not None:
+        held.refuse(wiring.period)
+    design: Any = WiredDesign(model, policy, funnel, wiring, held)
     made: AnyDesign = design
     return made
 

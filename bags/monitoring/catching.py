@@ -175,7 +175,8 @@ class Catching:
 
     trials: how many were held back. shares: of each calibration trial, the part of what the funnel
     assumes that it uses, largest first. errors: of each held-back trial, t (N,) s and y - nominal
-    (N, p). remedy: what to try where the assumption is what is wide.
+    (N, p). half_widths: of each, (N, p) where they follow the commands, else (0, p). remedy: what
+    to try where the assumption is what is wide.
     """
 
     widths: tuple[Width, ...]
@@ -184,6 +185,7 @@ class Catching:
     factor: float
     shares: tuple[tuple[str, float], ...]
     errors: tuple[tuple[FloatArray, FloatArray], ...]
+    half_widths: tuple[FloatArray, ...]
     remedy: str
 
     @property
@@ -303,6 +305,7 @@ def what_it_catches(
         factor,
         tuple(sorted(shares.items(), key=lambda entry: -entry[1])),
         tuple((run.t, run.residuals.error) for run in clean),
+        tuple(run.widths for run in clean),
         remedy,
     )
 

@@ -32,17 +32,26 @@ def catching(found: Catching) -> Figure:
 
 def _errors(axes: Axes, found: Catching, j: int) -> None:
     width = found.widths[j]
-    axes.axhspan(-width.half_width, width.half_width, color=BLUE, alpha=0.15, lw=0, label="tube")
+    following = [(t, w[:, j]) for (t, _), w in zip(found.errors, found.half_widths, strict=True)
+                 if len(w)]  # fmt: skip
+    if not following:
+        ends = -width.half_width, width.half_width
+        axes.axhspan(*ends, color=BLUE, alpha=0.15, lw=0, label="tube")
+    for number, (t, half) in enumerate(following):
+        label = None if number else "tube, as each trial's commands go"
+        axes.fill_between(t, -half, half, color=BLUE, alpha=0.08, lw=0, label=label)
     for number, (t, error) in enumerate(found.errors):
         axes.plot(t, error[:, j], color=INK, lw=0.7, alpha=0.8,
                   label=None if number else "measured - simulated, untouched")  # fmt: skip
     for sign in (-1, 1):
         axes.axhline(sign * width.range / 2, color=ORANGE, lw=LINE, ls="--",
                      label="half the range" if sign > 0 else None)  # fmt: skip
-    most = 1.15 * max(width.half_width, width.range / 2)
+    widest = width.half_width if width.most is None else width.most
+    most = 1.15 * min(max(widest, width.range / 2), 2.0 * max(width.half_width, width.range / 2))
     axes.set_ylim(-most, 1.35 * most)
     axes.set_ylabel(f"error of {width.name} [{width.unit}]", fontsize=8)
-    axes.set_title(f"half-width {width.said}: {width.part}", fontsize=9, loc="left")
+    title = f"half-width {width.said}:\n{width.part}"
+    axes.set_title(title, fontsize=9, loc="left")
     axes.legend(frameon=False, fontsize=7, loc="upper right", ncols=3)
 
 

@@ -22,8 +22,10 @@ from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found
+from bags.signals.columns import read_columns
 from bags.signals.expressions import factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from bags.signals.signal import SignalPath
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
@@ -44,6 +46,8 @@ SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 RELATED: Final = 0.3  # correlation below which command and response may be unrelated
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
+SIMULATED: Final = "/clock"
+ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 OTHERS: Final = 3  # commands that are named besides
 STALE: Final = 5.0  # periods without a response that are one too many
 
@@ -227,6 +231,28 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
             f"{names} has no header stamp: samples are paired by the times of logging, live of "
             "arrival, whose jitter becomes part of the model's error"
         )
+        pace = _pace(bag)
+        if abs(pace - 1.0) > ONE_PACE:
+            proposal.walls.append(
+                f"simulated time on {SIMULATED} runs at {pace:.3g} times the pace of the times of "
+                "logging: the model is one by the wall's clock, and a live monitor with "
+                "use_sim_time goes by the simulated one; record with `ros2 bag record "
+                "--use-sim-time`, or give commands a header"
+            )
+
+
+def _pace(bag: Bag) -> float:
+    """Simulated seconds in one of the times of logging; 1 without simulated time."""
+    if SIMULATED not in bag.topics:
+        return 1.0
+    paths = {part: SignalPath.parse(f"{SIMULATED}:clock.{part}") for part in ("sec", "nanosec")}
+    with suppress(BagError):  # of another type
+        columns = read_columns(bag, paths)[SIMULATED]
+        simulated = columns.values["sec"] + 1e-9 * columns.values["nanosec"]
+        logged = (columns.log_ns - columns.log_ns[:1]) / 1e9
+        if len(columns) > 1 and logged[-1] > 0.0:
+            return float((simulated[-1] - simulated[0]) / logged[-1])
+    return 1.0
 
 
 def _read(

@@ -11,6 +11,7 @@ from .files import Node, Rejected
 
 LONGEST = 10**12  # samples of a recording
 MAX_TRIALS = 10**5  # that one assumption was measured on, or one tube designed on
+DIGEST = re.compile(r"sha256:[0-9a-f]{64}")  # one spelling, so that a recording has one name
 WINDOW = re.compile(r"([0-9]{1,12}):([0-9]{1,12})\]")
 
 
@@ -30,8 +31,11 @@ def read_trials(trials: Node) -> list[Recorded]:
         parts = trial.members("name digest")
         parts["name"].text()
         recording, cut, samples = parts["digest"].text().partition("[")
-        if not recording:
-            raise Rejected(f"{trial.where}: a trial should have the digest of its recording")
+        if not DIGEST.fullmatch(recording):
+            raise Rejected(
+                f"{trial.where}: a trial should have the digest of its recording, sha256: and 64 "
+                "digits or letters a-f"
+            )
         if not cut:
             found.append(Recorded(recording))
             continue

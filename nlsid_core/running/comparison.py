@@ -24,6 +24,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.assumption import meter_of
+from nlsid_core.running.held import Held
 from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Level
 from nlsid_core.running.tubes import ROUNDING, assuming
@@ -305,9 +306,10 @@ class SampledComparison:
 class ContinuousComparison:
     """A measured state against the funnels of a motion in continuous time, one stage after another.
 
-    The input is held from one sample to the next, `period` s later; the proof is about a policy
-    that is applied continuously. So the sets are the proved ones, and the assumption is not
-    measured: it is said in words.
+    The input is held from one sample to the next, `period` s later; unless the proof covers that,
+    it is about a policy that is applied continuously. The sets are the proved ones either way. How
+    old inputs become is measured against the hold; other assumptions are said in words. The state
+    is inside if all that it may be, measured so, is.
     """
 
     lags = 0
@@ -318,9 +320,12 @@ class ContinuousComparison:
         policies: Sequence[ContinuousPolicy],
         funnels: Sequence[ContinuousFunnel],
         period: float,
+        held: Held,
     ) -> None:
         if not period > 0.0:
             raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+        held.refuse(period)
+        self._held = held
         for before, after in pairwise(funnels):
             if before.tf != after.t0 or before.n != after.n:
                 raise CertificateMismatch("the stages do not follow each other")
@@ -329,13 +334,15 @@ class ContinuousComparison:
         self._policies, self._funnels = tuple(policies), tuple(funnels)
         self.period, self.n, self.m = period, fields[0].n, fields[0].m
         self.last = [funnels[-1].tf]
-        held = f"the policy is applied continuously; here each input is held for {period:g} s"
         pushed = any(len(field.uncertain) for field in fields)
-        self.assuming = [held + (", and w stays in its box" if pushed else "")]
+        self.assuming = [held.assuming(period) + (", and w stays in its box" if pushed else "")]
+        self._measures = not pushed and held.hold > 0.0
         self.over = [f"{funnels[-1].tf - funnels[0].t0:g} s"]
+        self.restart()
 
     def restart(self) -> None:
-        """A new run: there is nothing to forget."""
+        """A new run."""
+        self._before = np.nan
 
     def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
         """The state (n,) and the input (m,), None if there is none."""
@@ -363,9 +370,13 @@ class ContinuousComparison:
         broken = ""
         if u is not None and when < self.last[0]:
             broken = not_the_policys(t, u, policy(when, y), [f"u{i}" for i in range(self.m)])
+        age, hold = 0.0 if np.isnan(self._before) else t - self._before, self._held.hold
+        self._before = t
+        if hold and not age <= hold * (1.0 + COMMAND_TOLERANCE):
+            broken = f"the input was held for {age:.6g} s at t = {t:g} s; proved for {hold:g} s"
         return Compared(
-            [funnel.size(when, x_bar)],
-            [np.nan],
+            [funnel.size(when, x_bar) + self._held.reach(funnel.shape(when))],
+            [age / hold if self._measures else np.nan],
             [f"x{worst}"],
             [broken],
             [tuple(nominal.tolist())],

@@ -20,6 +20,7 @@ from nlsid_core.models import DifferenceEquation
 from nlsid_core.policies.protocol import AnyPolicy
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.grid import TOLERANCE, Grid
+from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Dynamics, refuse_mismatch
 from nlsid_core.running.observer import (
     MeasuredStateObserver,
@@ -78,8 +79,9 @@ class Controller:
     the caller's then. `lead`: s from a sample to the stamp of its input, not quite a period where
     the input is that of the next sample, so that a sample off the grid still finds it in force.
 
-    model, policy, funnel, period: as for `Monitor`. Raises CertificateMismatch if the parts do not
-    belong together, DataError if the limits cut off an input of the plan.
+    model, policy, funnel, period, held: as for `Monitor`. Raises CertificateMismatch if the parts
+    do not belong together, DataError if the limits cut off an input of the plan, or if the period
+    is longer than the hold that is proved.
     """
 
     def __init__(
@@ -91,8 +93,9 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float | None = None,
+        held: Held | None = None,
     ) -> None:
-        self._follow([(model, policy, funnel)], limits, settling, period)
+        self._follow([(model, policy, funnel)], limits, settling, period, held)
 
     @classmethod
     def of_stages(
@@ -102,10 +105,11 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
+        held: Held | None = None,
     ) -> "Controller":
         """The policies of a composition, one stage after another."""
         controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period)
+        controller._follow(list(stages), limits, settling, period, held)
         return controller
 
     def _follow(
@@ -114,6 +118,7 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float | None,
+        held: Held | None,
     ) -> None:
         for parts in stages:
             refuse_mismatch(*parts)
@@ -127,6 +132,8 @@ class Controller:
         if self._continuous:
             if period is None or not period > 0.0:
                 raise DataError(f"the samples of a continuous funnel need a period: {period} s")
+            self._held = held or Held()
+            self._held.refuse(period)
             self.period, self._origin = period, float(funnel.t0)
             self._end = stages[-1][2].last - (1.0 - TOLERANCE) * period  # an input is held so long
         else:
@@ -190,6 +197,8 @@ class Controller:
         _, policy, funnel = self._stages[0]
         nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
         size = funnel.start_size(x - nominal)
+        if self._continuous:
+            size += self._held.reach(funnel.shape(self._origin))
         if size <= 1.0:
             self.k = 1 - self._observer.ahead
             self._answer(self._origin, x)

@@ -30,6 +30,7 @@ from nlsid_core.running.comparison import (
     SampledComparison,
 )
 from nlsid_core.running.grid import Grid
+from nlsid_core.running.held import Held
 from nlsid_core.running.reading import Level, Reading, Status
 from nlsid_core.running.tubes import TubeRun
 
@@ -45,7 +46,8 @@ class Monitor:
 
     model: the model, or the vector field, that the policy and the funnel were made for. u: the
     input applied from t on (the latest command with a stamp not after t); it may be None at the
-    last sample. centre: of a tube with a policy. period: s between samples, of a continuous funnel.
+    last sample. centre: of a tube with a policy. Of a continuous funnel only, period: s between
+    samples, held: how its proof lets the policy be applied (None: continuously).
 
     Tubes around a model's simulation are held for ever: see `TubeRun`. Around a plan, a run starts
     with the first sample, or at the stamp given to `restart`. It ends at the first sample that is
@@ -64,8 +66,9 @@ class Monitor:
         *,
         centre: Centre = Centre.COMMAND,
         period: float | None = None,
+        held: Held | None = None,
     ) -> None:
-        self._hold([model], [policy], [funnel], centre, period)
+        self._hold([model], [policy], [funnel], centre, period, held)
 
     @classmethod
     def of_several(
@@ -92,6 +95,7 @@ class Monitor:
         stages: Sequence[tuple[VectorField, AnyPolicy, AnyFunnel]],
         *,
         period: float,
+        held: Held | None = None,
     ) -> "Monitor":
         """The continuous funnels of a composition, one stage after another."""
         if not stages:
@@ -100,7 +104,7 @@ class Monitor:
         fields: list[Dynamics] = [field for field, _, _ in stages]
         policies: list[AnyPolicy | None] = [policy for _, policy, _ in stages]
         funnels = [funnel for _, _, funnel in stages]
-        monitor._hold(fields, policies, funnels, Centre.PROFILE, period)
+        monitor._hold(fields, policies, funnels, Centre.PROFILE, period, held)
         return monitor
 
     def _hold(
@@ -110,6 +114,7 @@ class Monitor:
         funnels: list[AnyFunnel],
         centre: Centre,
         period: float | None,
+        held: Held | None = None,
     ) -> None:
         for parts in zip(models, policies, funnels, strict=True):
             refuse_mismatch(*parts)
@@ -123,7 +128,7 @@ class Monitor:
             self._tubes = TubeRun(model, tubes)
             self.lags = self._tubes.lags
             return
-        self._comparison = _comparison(models, policies, funnels, period)
+        self._comparison = _comparison(models, policies, funnels, period, held)
         comparison = self._comparison
         self.lags = comparison.lags  # samples before an announced start that the observer needs
         self._count = len(comparison.last)
@@ -258,6 +263,7 @@ def _comparison(
     policies: list[Any],
     funnels: list[Any],
     period: float | None,
+    held: Held | None,
 ) -> Comparison:
     """The arithmetic for funnels of this kind."""
     kinds = {type(funnel) for funnel in funnels}
@@ -266,7 +272,7 @@ def _comparison(
     if kinds == {SampledFunnel} and len(funnels) == 1:
         return SampledComparison(models[0], policies[0], funnels[0])
     if kinds == {ContinuousFunnel}:
-        return ContinuousComparison(models, policies, funnels, period or math.nan)
+        return ContinuousComparison(models, policies, funnels, period or math.nan, held or Held())
     raise DataError("several funnels at once are held against tubes of one model only")
 
 

@@ -1,4 +1,4 @@
-"""Simulated robots to try the chain on: an identified model, a pendulum and a satellite."""
+"""Simulated robots to try the chain on: a model, a vector field, a pendulum and a satellite."""
 
 import math
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError
 from nlsid_core.models import DifferenceEquation
 
@@ -103,6 +104,59 @@ class Satellite:
             return np.concatenate([turning / 4.0, (torque - np.cross(omega, H * omega)) / H])
 
         self._x = integrated(rate, self._x, self.period)
+
+
+class FieldPlant:
+    """ẋ = f(t, x, u, w) of any vector field: measured x. w is drawn from its box at every sample.
+
+    It rests at x until the first input that is not zero; its time, which equations may depend on,
+    starts at t0 s then. x: (n,).
+    """
+
+    def __init__(
+        self,
+        field: VectorField,
+        x: FloatArray,
+        *,
+        period: float,
+        t0: float = 0.0,
+        rng: "np.random.Generator",
+    ) -> None:
+        if period <= 0.0 or x.shape != (field.n,) or not np.isfinite(x).all():
+            raise DataError(f"a plant of {field.n} states starts at so many numbers, not at {x}")
+        self.period, self._field, self._rng = period, field, rng
+        self._x, self._t, self._rests = x, t0, True
+        self.inputs = field.m
+
+    def refuse(self, states: int, inputs: int) -> None:
+        """DataError unless so many signals are its states and its inputs."""
+        if (states, inputs) != (self._field.n, self.inputs):
+            raise DataError(
+                f"a vector field of {self._field.n} states and {self.inputs} inputs cannot speak "
+                f"through {states} and {inputs} signals; set response and command"
+            )
+
+    def measure(self, _u: FloatArray, /) -> FloatArray:
+        """The state (n,)."""
+        return self._x
+
+    def step(self, u: FloatArray, push: FloatArray, /) -> None:
+        """One period."""
+        applied = (u + push)[None]
+        self._rests = self._rests and not applied.any()
+        if self._rests:
+            return
+        low, high = self._field.uncertain.T
+        w, count = self._rng.uniform(low, high), math.ceil(self.period / STEP)
+        for _ in range(count):
+            span, z = self._field.span(self._t), np.append(self._x, self._t)
+
+            def rate(z: FloatArray, span: int = span) -> FloatArray:
+                speed = self._field(float(z[-1]), z[None, :-1], applied, w, span=span)[0]
+                return np.append(speed, 1.0)
+
+            z = integrated(rate, z, self.period / count)
+            self._x, self._t = z[:-1], float(z[-1])
 
 
 def integrated(

@@ -27,6 +27,8 @@ from nlsid_core.design.tube import energy, innovations
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 from tests.conftest import PERIOD, synthetic_dataset
+from tests.core.kernel.tube_claims import dataset
+from tests.core.kernel.tube_claims import design as follower
 
 FACTOR = 1.5
 
@@ -224,3 +226,27 @@ def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> 
     assert len(errors.lines) == found.trials + 2
     assert len(caught.patches) == len(found.rows) * (4 + 3)
     assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in found.rows]
+
+
+def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
+    """Half-widths are those of the readings: their mean, least and most on calibration trials."""
+    made = follower("following")
+    model = made.model
+    calibration, held_back = dataset(model, 100), dataset(model, 200, 3)
+    ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
+    monitor = Monitor(model, None, made.funnel)
+    found = what_it_catches(
+        monitor, model, made.funnel.half_widths.tolist(), held_back=held_back,
+        calibration=calibration, ranges=ranges, factor=FACTOR, remedy="",
+    )  # fmt: skip
+    level, settling = made.funnel.tubes[0].follows, made.funnel.settling
+    assert level is not None
+    g = np.concatenate([level.along(trial.u)[settling:, 0] for trial in calibration])
+    expected = made.funnel.half_widths[0] * np.sqrt(g)
+    width = found.widths[0]
+    assert width.half_width == pytest.approx(expected.mean(), rel=1e-6)
+    assert width.least == pytest.approx(expected.min(), rel=1e-6)
+    assert width.most == pytest.approx(expected.max(), rel=1e-6)
+    assert "on average" in width.said
+    (errors,), _ = (part.axes for part in draw(found).subfigs)
+    assert len(errors.collections) == found.trials

@@ -78,7 +78,7 @@ def affine(train: Dataset) -> Fit[StateAffineModel]:
 def test_every_class_has_its_methods_and_together_they_are_all() -> None:
     classes = (LinearClass(2), StateAffineClass(2), CASCADE, MonotoneClass(2))
     assert methods_of(ImplicitClass())[0] is Rie
-    assert methods_of(LinearStateClass()) == (LeastSquares,)
+    assert methods_of(LinearStateClass()) == (LeastSquares, CertifiedSem)
     assert {m for c in classes for m in methods_of(c)} == set(METHODS.values())
     assert methods_of(StateAffineClass(2, lagged_degree=1))[0] is Rse
     for degrees in ((0, 1), (1, 1), (2, 0)):

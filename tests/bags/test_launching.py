@@ -7,9 +7,11 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from typer.testing import CliRunner
 
 from bags.chain.shipped import shipped_file
-from bags.commands.launching import LaunchFile
+from bags.commands.cli import app
+from bags.commands.launching import WORKFLOWS, LaunchFile
 from nlsid_core.errors import DataError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,3 +83,11 @@ def test_what_only_ros_launch_understands_is_refused(tmp_path: Path) -> None:
     path.write_text('<launch><include file="x"/><node><env name="A" value="1"/></node></launch>')
     with pytest.raises(DataError, match=r"<env>, <include> is for `ros2 launch` only"):
         LaunchFile(path)
+
+
+def test_live_without_a_workflow_lists_every_one_with_its_arguments() -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
+    done = CliRunner().invoke(app, ["live"])
+    assert done.exit_code == 2
+    for name in WORKFLOWS:
+        assert f"{name}.launch.xml are" in done.output

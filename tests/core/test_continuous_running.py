@@ -19,6 +19,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, ShapeError
 from nlsid_core.running.controller import Controller, Limits
+from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from tests.continuous_stage import stage
@@ -72,6 +73,47 @@ def test_a_reading_says_that_the_input_is_held_and_that_nothing_measures_it() ->
     )
     reading = Monitor(pushed, policy, funnel, period=HELD).update(0.0, x, policy(0.0, x))
     assert reading.assuming.endswith("held for 0.02 s, and w stays in its box")
+
+
+def test_a_proved_hold_is_measured_and_nothing_slower_is_run() -> None:
+    field, policy, funnel = stage()
+    held = Held.of_claim({"hold": 0.025})
+    monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+    for k, (t, used) in enumerate([(0.0, 0.0), (HELD, 0.8), (2.24 * HELD, 0.992)]):
+        reading = monitor.update(t, [t], policy(t, np.array([t])))
+        assert (reading.status, reading.assuming) == (
+            Status.INSIDE, "each input is at most 0.025 s old"
+        ), k  # fmt: skip
+        assert reading.assumption == pytest.approx(used)
+    monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+    for t in (0.0, 0.8 * HELD, 2.2 * HELD):  # on the grid, and the last 0.028 s apart
+        reading = monitor.update(t, [t], policy(t, np.array([t])))
+    assert reading.status is Status.ASSUMPTION_VIOLATED
+    assert "held for 0.028 s at t = 0.044 s; proved for 0.025 s" in reading.reason
+    for run in (
+        lambda: Monitor(field, policy, funnel, period=0.03, held=held),
+        lambda: Controller(field, policy, funnel, limits=LIMITS, settling=1.0, period=0.03,
+                           held=held),
+    ):  # fmt: skip
+        with pytest.raises(DataError, match=r"every 0.03 s.*inputs of at most 0.025 s"):
+            run()
+
+
+def test_a_state_that_may_be_wrong_is_inside_only_if_all_that_it_may_be_is() -> None:
+    field, policy, funnel = stage()
+    held = Held(error=np.array([0.03]))
+    for x, status in ((0.16, Status.INSIDE), (0.18, Status.OUTSIDE)):
+        monitor = Monitor(field, policy, funnel, period=HELD, held=held)
+        reading = monitor.update(0.0, [x], policy(0.0, np.array([x])))
+        assert (reading.status, x) == (status, x)
+        assert reading.margin == pytest.approx(1 - (x + 0.03) / 0.2)
+        assert reading.assuming.endswith("measured to: x0 within 0.03")
+    controller = Controller(
+        field, policy, funnel, limits=LIMITS, settling=0.05, period=HELD, held=held
+    )
+    for k in range(5):
+        controller.update(k * HELD, np.array([0.18]))
+    assert "not at the start of the plan" in controller.ended
 
 
 def test_a_push_is_outside_and_another_input_is_not_the_policys() -> None:

@@ -91,7 +91,9 @@ def test_the_publisher_refuses_what_is_not_proved(
         (tmp_path / name).write_bytes((funnel.parent / name).read_bytes())
     if damage == "forged":
         text = (tmp_path / documents.FUNNEL).read_text()
-        (tmp_path / documents.FUNNEL).write_text(text.replace('"budget": 0.0', '"budget": 0.1'))
+        forged = text.replace('"safety_factor": 1.5', '"safety_factor": 1.4')
+        assert forged != text
+        (tmp_path / documents.FUNNEL).write_text(forged)
     elif damage == "no proof":
         (tmp_path / documents.FUNNEL_PROOF).unlink()
     else:

@@ -56,7 +56,8 @@ def tube(name: str = "speed", unit: str = "m/s", n: int = 1, samples: int = 2) -
             "rho": 1, "L": policy["L"], "P": unity, "R": [[1]], "level": 0, "inlet": 0,
             "tau": [0.25], "half_widths": [2.0**-20],
             "assumption": {"kind": "energy", "samples": 2, "measured": 0, "safety_factor": 1,
-                           "measured_on": [{"name": "a", "digest": "b"}], "designed_on": []},
+                           "measured_on": [{"name": "a", "digest": "sha256:" + 64 * "b"}],
+                           "designed_on": []},
         }],
     }  # fmt: skip
     return {"model": model, "policy": policy, "funnel": funnel}

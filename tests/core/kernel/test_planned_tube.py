@@ -162,7 +162,26 @@ def test_repeated_trials_count_once_and_no_trial_measures_nothing(
 
 
 def trials(*digests: str) -> list[Json]:
-    return [{"name": f"trial {i}", "digest": digest} for i, digest in enumerate(digests)]
+    """Of recordings that are named by a letter, before a window if there is one."""
+    return [
+        {"name": f"trial {i}", "digest": f"sha256:{64 * digest[0]}{digest[1:]}"}
+        for i, digest in enumerate(digests)
+    ]
+
+
+@pytest.mark.parametrize(
+    "digest",
+    ["", "a", "sha256:" + 64 * "A", "SHA256:" + 64 * "a", "sha256:" + 63 * "a",
+     "sha256:" + 64 * "g",
+     "sha256:" + 65 * "a", " sha256:" + 64 * "a", "sha256:" + 64 * "a" + " ", "sha512:" + 64 * "a"],
+)  # fmt: skip
+@pytest.mark.parametrize("of", ["measured_on", "designed_on"])
+def test_a_recording_has_one_spelling(documents: dict[str, Json], digest: str, of: str) -> None:
+    """In capitals the same recording would be another one, and count twice."""
+    again = [{"name": "run", "digest": digest}]
+    documents["funnel"] = assuming(documents["funnel"], **{of: again})
+    with pytest.raises(CertificateRejected, match="sha256: and 64 digits or letters a-f"):
+        decide(documents)
 
 
 def fitted_to(documents: dict[str, Json], *digests: str) -> dict[str, Json]:

@@ -1,0 +1,52 @@
+"""How a proof lets a continuous policy be applied: how old its input is, how wrong its state."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import DataError
+
+ROUNDING = 1e-12  # relative, of a few hundred rounded operations
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """hold: s, how old the input is at most; 0 if the proof is about a policy that acts
+    continuously. error: (n,) bounds on how much each state is measured wrong; empty for none.
+    """
+
+    hold: float = 0.0
+    error: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of_claim(cls, claim: Json) -> "Held":
+        """What the claim of a continuous funnel says; DocumentError if it is none."""
+        hold = files.member(claim, "hold", (int, float), source="claim") if "hold" in claim else 0
+        if "error" not in claim:
+            return cls(float(hold))
+        return cls(float(hold), files.array(claim, "error", (None,), source="claim"))
+
+    def refuse(self, period: float) -> None:
+        """DataError if samples so many s apart are not covered though a hold is proved."""
+        if self.hold and period > self.hold:
+            raise DataError(
+                f"samples come every {period:g} s, and the funnel is proved for inputs of at most "
+                f"{self.hold:g} s: sample faster, or design it with hold={period:g}"
+            )
+
+    def assuming(self, period: float) -> str:
+        """What is assumed of an input that is held for a period, in words."""
+        wrong = ", ".join(f"x{i} within {e:g}" for i, e in enumerate(self.error.tolist()) if e)
+        measured = f"; measured to: {wrong}" if wrong else ""
+        if not self.hold:
+            held = f"the policy is applied continuously; here each input is held for {period:g} s"
+            return held + measured
+        return f"each input is at most {self.hold:g} s old{measured}"
+
+    def reach(self, P: FloatArray) -> float:
+        """How much an error can add to |x|_P, at most, for P (n, n); rounded up."""
+        if not len(self.error):
+            return 0.0
+        return float(np.sqrt(self.error @ np.abs(P) @ self.error)) * (1.0 + ROUNDING)
