@@ -99,10 +99,11 @@ Definition goal_ok (d : problem) (lambda : num) : bool :=
             (s_lemma lambda (level (stop g)) (shape (stop g)) B q corner)))
   | _, _ => false
   end.
-(* P is definite at every knot, as the file format wants; that is not needed below. *)
+(* P is definite at every knot, and the goal's matrix is, as the file format wants; that is not
+   needed below. *)
 Definition shapes_ok (d : problem) : bool :=
-  forallb (fun g => andb (semidefinite true (shape (start g))) (semidefinite true (shape (stop g))))
-    (segments d).
+  andb match goal d with Some (_, B) => semidefinite true B | None => true end (forallb (fun g => andb (semidefinite true (shape (start g))) (semidefinite true (shape (stop g))))
+    (segments d)).
 Definition funnel_ok (d : problem) (w : witness) : bool :=
   andb (andb (check d w) (shapes_ok d))
     (andb (Nat.ltb 0 (length (segments d))) (goal_ok d (goal_multiplier w))).

@@ -1,0 +1,53 @@
+(* second WORDS: "accepted" (status 0) or "refused" (status 1). Reads what generate.py --words writes:
+   whole numbers in a row; a list begins with its length, an option with 0 or 1. *)
+open Checker
+
+let input = Scanf.Scanning.open_in Sys.argv.(1)
+let word () = Scanf.bscanf input " %s" (fun s -> if s = "" then failwith "too short" else s)
+let whole () = Big_int_Z.big_int_of_string (word ())
+let count () = int_of_string (word ())
+let listed read =
+  let rec go n acc = if n = 0 then List.rev acc else go (n - 1) (read () :: acc) in
+  go (count ()) []
+let pair first second () = let a = first () in let b = second () in (a, b)
+let entry () : i = Obj.magic (whole ())
+
+let num () =
+  let p, q = pair whole whole () in
+  if Big_int_Z.sign_big_int q <= 0 then failwith "a denominator"; (p, q)
+let nums () = listed num
+let matrix () = listed nums
+let knot () = let time = num () in let shape = matrix () in { time; shape; level = num () }
+let equation () = listed (pair (fun () -> listed count) num)
+let segment () =
+  let start = knot () in let stop = knot () in
+  let nominal = matrix () in let feed = matrix () in
+  let gains = listed matrix in let equations = listed equation in
+  { start; stop; nominal; feed; gains; equations;
+    bounds = listed (pair count (pair num num)) }
+let maybe read () = if count () = 0 then None else Some (read ())
+let problem () =
+  let segments = listed segment in
+  let limits = listed (maybe (pair num num)) in
+  let box = listed (pair num num) in
+  { segments; limits; box; goal = maybe (pair nums matrix) () }
+let squares () =
+  let unit0 = whole () in let scale = entry () in
+  { unit0; scale; factors = listed (fun () -> listed (pair entry (fun () -> listed entry))) }
+let wholes () = listed whole
+let piece () =
+  let depth = whole () in let index = whole () in
+  let vertex = count () in let mode = count () in
+  let mu = listed (pair whole (pair entry entry)) in
+  let columns = wholes () in let gram_factors = squares () in
+  { depth; index; vertex; mode; mu; columns; gram_factors; tau = listed (pair wholes squares) }
+let witness () =
+  let margin = num () in
+  let basis = listed wholes in let multiplier = listed wholes in let sides = listed wholes in
+  let pieces = listed (fun () -> listed piece) in
+  { margin; basis; multiplier; sides; pieces; goal_multiplier = num () }
+
+let () =
+  let d = problem () in
+  let w = witness () in
+  if decide d w then print_endline "accepted" else (print_endline "refused"; exit 1)
