@@ -30,6 +30,7 @@ from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
 
+HOLD_COST = 4  # of comparing one rate with another, in products
 MAX_STATES, MAX_INPUTS, MAX_UNCERTAIN, MAX_LIMITED = 16, 16, 32, 3
 MAX_DEGREE, MAX_TIME_DEGREE, MAX_LEVEL = 7, 3, 16
 MAX_BOUNDS, MAX_KNOTS, MAX_SPANS, MAX_PIECES = 10_000, 10_000, 1000, 100_000
@@ -122,16 +123,19 @@ def decide_funnel(
     for t in field.breaks:
         if funnel.t[0] < t < funnel.t[-1] and t not in funnel.t:
             raise Rejected(f"the dynamics change at {text.exact(t)} s, which is no knot")
-    hold = _read_hold(parts, stated, field, policy, funnel)
+    work = work or Work()
+    hold = _read_hold(parts, stated, field, policy, funnel, work)
     spans = [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
-    bounds, work = [field.bounds[span] for span in spans], work or Work()
+    bounds = [field.bounds[span] for span in spans]
     _decide_valid(field, policy, funnel, bounds, hold, work)
     count = _decide_pieces(field, policy, funnel, spans, stated, margin, hold, work)
     if hold.period:
         count += _decide_rates(field, policy, funnel, spans, stated, hold, work)
     end = text.exact(funnel.t[-1])
+    # A held input remembers: only of a solution that starts inside is it always one from inside.
+    whose = "that starts in it" if hold.period else "that is in it"
     decision = Decision(
-        f"funnel: every solution that is in it at a time from {text.exact(funnel.t[0])} to {end} s "
+        f"funnel: every solution {whose} at a time from {text.exact(funnel.t[0])} to {end} s "
         f"stays in it until {end} s{goal}{_kept(field, bounds)}; {count} pieces of time decided, "
         "on its boundary V falls by at least the margin, in 1/s",
         margin,
@@ -206,8 +210,9 @@ def read_policy(node: Node, field: Field, funnel: Funnel, digests: dict[str, str
 
 
 def _read_hold(
-    parts: dict[str, Node], stated: dict[str, Node], field: Field, policy: Policy, funnel: Funnel
-) -> Hold:
+    parts: dict[str, Node], stated: dict[str, Node], field: Field, policy: Policy, funnel: Funnel,
+    work: Work,
+) -> Hold:  # fmt: skip
     """The hold and the measurement error that the claim is about, and what u is off by then.
 
     At a time in interval k the input is of a time in it or in one that ends less than a period
@@ -242,6 +247,7 @@ def _read_hold(
         while funnel.t[first + 1] <= funnel.t[k] - period:
             first += 1
         seen = range(first, k + 1)
+        work.spend(HOLD_COST * len(seen) * field.m)
         widths.append(
             [
                 period * max(rates[j][i] for j in seen) + max(shaken[j][i] for j in seen)
@@ -360,7 +366,7 @@ def _assumptions(field: Field, policy: Policy, bounds: list[Bounds], hold: Hold)
         longest = text.exact(hold.period)
         obeyed += (
             f"every {longest} s or more often: at every time, the input is the policy's for a state"
-            f" of at most {longest} s before, and not before the start"
+            f" of at most {longest} s before, and not before the solution's start"
         )
     else:
         obeyed += "continuously, with no hold and no delay"

@@ -31,6 +31,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
             stage = documents[role].document("proof", "claim proof")
             if stage["claim"].kind() != "continuous_funnel":
                 raise Rejected("a stage should claim a continuous_funnel")
+            if "hold" in stage["claim"].members("kind about", "goal hold error"):
+                raise Rejected("an input that is held into the next stage is not covered")
             decision, funnel = decide_funnel(stage["claim"], stage["proof"], read, work)
         except Rejected as refusal:
             raise type(refusal)(f"{role}: {refusal}") from refusal

@@ -6,6 +6,7 @@ Whatever g is, a bound E <= level g(k) at every sample is the tube theorem's; th
 it is known from the commands up to k is all that is needed. Source: docs/certificate_tube.md.
 """
 
+import json
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -72,17 +73,21 @@ def formula(level: CommandLevel, row: int, u: tuple[Signal, ...]) -> str:
             continue
         square = _square(term, u)
         if term.fading:
-            square = f"sum {text.exact(term.fading)}^i {square or '1'}"
+            square = f"(sum {text.exact(term.fading)}^i {square or '1'})"
         summands.append(f"{text.exact(weight)} {square}".rstrip())
-    return " + ".join(summands)
+    counted = any(
+        w and term.fading for w, term in zip(level.weights[row], level.terms, strict=True)
+    )
+    past = ", sums over the run's samples, each i samples ago" if counted else ""
+    return " + ".join(summands) + past
 
 
 def _square(term: Term, u: tuple[Signal, ...]) -> str:
     """v² in words; empty where it is 1."""
     if not term.inputs and not term.change and term.centre == 0 and term.scale == 1:
         return ""
-    product = " x ".join(u[i].name for i in term.inputs) or "1"
-    unit = Signal("", " ".join(u[i].unit for i in term.inputs if u[i].unit))
+    product = " x ".join(_plain(u[i].name) for i in term.inputs) or "1"
+    unit = Signal("", " ".join(_plain(u[i].unit) for i in term.inputs if u[i].unit))
     if term.change:
         of = f"change of {product}"
     elif term.centre:
@@ -90,3 +95,10 @@ def _square(term: Term, u: tuple[Signal, ...]) -> str:
     else:
         of = product
     return f"({of} / {unit.quantity(text.exact(term.scale))})^2"
+
+
+def _plain(word: str) -> str:
+    """A name or unit in a formula: quoted if it could be read as a part of it."""
+    return (
+        json.dumps(word) if not word.startswith('"') and any(c in word for c in "()+*^") else word
+    )

@@ -342,7 +342,7 @@ class ContinuousComparison:
 
     def restart(self) -> None:
         """A new run."""
-        self._before = np.nan
+        self._before, self._proved = np.nan, False
 
     def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
         """The state (n,) and the input (m,), None if there is none."""
@@ -370,12 +370,18 @@ class ContinuousComparison:
         broken = ""
         if u is not None and when < self.last[0]:
             broken = not_the_policys(t, u, policy(when, y), [f"u{i}" for i in range(self.m)])
-        age, hold = 0.0 if np.isnan(self._before) else t - self._before, self._held.hold
+        starts = bool(np.isnan(self._before))
+        age, hold = 0.0 if starts else t - self._before, self._held.hold
         self._before = t
+        size = funnel.size(when, x_bar) + self._held.reach(funnel.shape(when))
+        # With a hold the proof is about starts inside: what came in later has inputs from outside.
+        self._proved = self._proved or (size <= 1.0 and (starts or not hold))
+        if not self._proved:
+            broken = "the run did not start in the funnel: nothing is proved of it"
         if hold and not age <= hold * (1.0 + COMMAND_TOLERANCE):
             broken = f"the input was held for {age:.6g} s at t = {t:g} s; proved for {hold:g} s"
         return Compared(
-            [funnel.size(when, x_bar) + self._held.reach(funnel.shape(when))],
+            [size],
             [age / hold if self._measures else np.nan],
             [f"x{worst}"],
             [broken],

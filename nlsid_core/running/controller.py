@@ -105,11 +105,13 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
-        held: Held | None = None,
     ) -> "Controller":
-        """The policies of a composition, one stage after another."""
+        """The policies of a composition, one stage after another.
+
+        None has a hold: what is held into the next stage is covered by no proof.
+        """
         controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period, held)
+        controller._follow(list(stages), limits, settling, period, None)
         return controller
 
     def _follow(

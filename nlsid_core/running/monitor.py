@@ -95,16 +95,18 @@ class Monitor:
         stages: Sequence[tuple[VectorField, AnyPolicy, AnyFunnel]],
         *,
         period: float,
-        held: Held | None = None,
     ) -> "Monitor":
-        """The continuous funnels of a composition, one stage after another."""
+        """The continuous funnels of a composition, one stage after another.
+
+        None has a hold: what is held into the next stage is covered by no proof.
+        """
         if not stages:
             raise DataError("no stage to hold the state against")
         monitor = cls.__new__(cls)
         fields: list[Dynamics] = [field for field, _, _ in stages]
         policies: list[AnyPolicy | None] = [policy for _, policy, _ in stages]
         funnels = [funnel for _, _, funnel in stages]
-        monitor._hold(fields, policies, funnels, Centre.PROFILE, period, held)
+        monitor._hold(fields, policies, funnels, Centre.PROFILE, period)
         return monitor
 
     def _hold(

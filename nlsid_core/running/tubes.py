@@ -233,12 +233,14 @@ class TubeRun:
         self._follow_command(u)
         deviation = y - simulated
         level, widths = self._followed() if self._follow else (self._level, self._widths)
-        sizes = np.abs(deviation) / widths
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
+            sizes = np.abs(deviation) / widths
             spent = self._spent / level
-        if not (np.isfinite(self._spent).all() and np.isfinite(after).all()):
+        followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
+        if not (followed and np.isfinite(self._spent).all() and np.isfinite(after).all()):
             self._begin()
-            reason = f"the model's state is not finite at t = {t:g} s"
+            what = "the model's state" if followed else "the level that follows the commands"
+            reason = f"{what} is not finite at t = {t:g} s"
             if np.isfinite(simulated).all() and (sizes > 1.0).any():
                 away = Reading(
                     t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),

@@ -12,6 +12,9 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
+from nlsid_core.running.held import Held
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Status
 from tests.funnel_files import POLICY, PROOF, Files, bind, copy_of, saved
 
 HOLD, STEPS = 0.01, 10  # s; Runge-Kutta steps between samples
@@ -86,6 +89,29 @@ def test_the_claim_says_how_often_and_how_wrong(held: FunnelDesign) -> None:
     assert "applied every 0.01 s or more often" in said
     assert "measured wrong by at most: x0 by 0.002, x1 by 0.01" in said
     assert "no hold" in design(tracking()).verdict.assumptions[0]
+
+
+def test_a_hold_is_only_proved_of_what_starts_inside(held: FunnelDesign) -> None:
+    """An input that remembers a state from outside drives a solution out that has come in."""
+    assert "every solution that starts in it at a time from 0 to 1 s" in str(held.verdict)
+    assert "not before the solution's start" in str(held.verdict)
+    monitor = Monitor(held.model, held.policy, held.funnel, period=HOLD, held=Held(HOLD))
+    outside = held.funnel.nominal(0.0) + np.array([2.0, 0.0])
+    said = [monitor.update(0.0, outside, held.policy(0.0, outside))]
+    for k in range(1, 5):
+        x = held.funnel.nominal(k * HOLD)
+        said.append(monitor.update(k * HOLD, x, held.policy(k * HOLD, x)))
+    assert Status.INSIDE not in {reading.status for reading in said}
+    assert all("did not start in the funnel" in reading.reason for reading in said)
+
+
+def test_an_input_is_not_held_from_stage_to_stage(files: Files) -> None:
+    bind(files)
+    about = {stage: proofs.binding(PROOF, files[PROOF]) for stage in ("stage1", "stage2")}
+    claim = {"kind": "funnel_composition", "about": about}
+    document = proofs.proof_document(claim, {"multipliers": [1.0]})
+    with pytest.raises(CertificateRejected, match="stage1: an input that is held into the next"):
+        proofs.decide(document, files)
 
 
 def test_holding_costs_room(held: FunnelDesign) -> None:

@@ -125,6 +125,19 @@ def test_an_assumption_that_follows_is_kept_by_the_calibration_trials_and_broken
         assert bool(bad) != kept
 
 
+def test_a_level_that_overflows_starts_a_new_run_and_is_never_inside() -> None:
+    """v² is infinite in float64, and would be for ever where it fades."""
+    made = design("following")
+    recorded = dataset(MODELS["following"](), 100, 1).trajectories[0]
+    fading = CommandLevel((Term((0,), scale=1e-160, fading=0.9),), np.array([[1e-300]]))
+    tubes = tuple(replace(tube, follows=fading) for tube in made.funnel.tubes)
+    monitor = Monitor(made.model, None, replace(made.funnel, tubes=tubes, response=None))
+    rows = zip(recorded.t.tolist(), recorded.y + 100.0, recorded.u + 1.0, strict=True)
+    said = [monitor.update(t, y, u) for t, y, u in rows]
+    assert {reading.status for reading in said} == {Status.UNKNOWN}
+    assert any("the level that follows the commands is not finite" in r.reason for r in said)
+
+
 def test_a_shift_that_breaks_no_assumption_raises_the_alarm_and_only_that() -> None:
     """A bias of a deviation: CUSUM adds it up; its first alarm is a function of what came."""
     made = design("linear")

@@ -66,11 +66,12 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
     assert " sqrt(g) for ever" in said[0]
     assert " g after every sample, E+ = " in said[2]
     assert (
-        f", g = 0.25 + 3 (({name} - 0.5{unit}) / 2{unit})^2 + 7.5 sum 0.9^i "
-        f"(change of {name} / 1.5{unit})^2 (largest of 5 distinct trials" in said[2]
+        f", g = 0.25 + 3 (({name} - 0.5{unit}) / 2{unit})^2 + 7.5 (sum 0.9^i "
+        f"(change of {name} / 1.5{unit})^2), sums over the run's samples, each i samples ago "
+        f"(largest of 5 distinct trials" in said[2]
     )
     assert said[3].startswith("  assuming output error: |speed - simulated| / (")
-    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 sum 0.9^i (change of {name}" in said[3]
+    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 (sum 0.9^i (change of {name}" in said[3]
     assert "probability at most 1/6)" in said[3]
 
 
