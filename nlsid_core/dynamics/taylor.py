@@ -438,6 +438,9 @@ class _Symbol:
     def square(self) -> "_Symbol":
         return self._power(2)
 
+    def __float__(self) -> float:
+        raise TypeError("functions of `math` take numbers only: take NumPy's, such as np.sin")
+
     def __neg__(self) -> "_Symbol":
         return _Symbol(None if self.p is None else -self.p, self.uses)
 

@@ -115,6 +115,8 @@ class VectorField:
         given = tuple(inspect.signature(function).parameters)
         if not given or not set(given) <= set(ARGUMENTS):
             raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        if len(bounds) and "w" not in given:
+            raise DataError("uncertain has rows, but the dynamics have no argument w")
         sizes = {"t": 1, "x": n, "u": m, "w": len(bounds)}
 
         def called(*vectors: Any) -> Any:

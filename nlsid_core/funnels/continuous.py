@@ -15,6 +15,8 @@ from nlsid_core.funnels.factor import STEPS, UNIT, factor_of, rounding_of
 
 FORMAT, KIND = "nlsid/funnel", "continuous"
 
+ROUNDING = 1e-12  # by which a time may miss the ends: 0.1 added up ten times misses 1
+
 
 @dataclass(frozen=True, eq=False)
 class ContinuousFunnel:
@@ -213,9 +215,11 @@ class ContinuousFunnel:
         files.write_document(path, self.document())
 
     def _inside(self, t: float) -> float:
-        if not self.t0 <= t <= self.tf:
-            raise DataError(f"t = {t:g} s; the funnel is defined from {self.t0:g} to {self.tf:g} s")
-        return t
+        """The time t, or the end that it misses by rounding."""
+        nearest = min(max(t, self.t0), self.tf)
+        if not abs(t - nearest) <= ROUNDING * (1.0 + abs(nearest)):
+            raise DataError(f"t = {t!r} s; the funnel is defined from {self.t0:g} to {self.tf:g} s")
+        return nearest
 
     def _states(self, X: ArrayLike) -> FloatArray:
         X = np.asarray(X, dtype=np.float64)

@@ -1,5 +1,6 @@
 """Funnels of equations as a user writes them: motion, design, refusals that name their cause."""
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from nlsid_core.design import (
 )
 from nlsid_core.design.thesis.soundness import simulate_boundary
 from nlsid_core.dynamics import Nominal, Rates
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.proofs import check
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto-funnels.md"
@@ -117,6 +118,7 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
         ({"goal": [[25.0, 1.0], [0.0, 4.0]]}, "symmetric positive definite"),
         ({"goal": [0.2, 0.5], "limits": [-1, 1]}, "limits should be rows"),
         ({"goal": [0.2, 0.5], "uncertain": [[-1, 1]]}, "no argument w|function of some of"),
+        ({"goal": [0.2, 0.5], "hold": 50.0}, "the hold of 50 s is longer than the motion"),
     ],
 )
 def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
@@ -162,3 +164,19 @@ def test_a_shape_that_cannot_be_found_keeps_what_is_proved(
     found = design_funnel(rate, still, goal=[0.3, 0.3], shape="P")
     assert "shape rho kept: nothing better" in found.found.history[-1][0]
     assert found.verdict.margin > 0
+
+
+def test_bounds_of_a_w_that_a_polynomial_does_not_have_are_refused() -> None:
+    def falls(x: Any, u: Any) -> Any:
+        return [x[1], x[0] - x[0] ** 3 / 6 + u[0]]
+
+    with pytest.raises(DataError, match="no argument w"):
+        design_funnel(falls, upright(), goal=[0.2, 0.5], uncertain=[[-1, 1]])
+
+
+def test_functions_of_math_are_refused_with_what_to_take() -> None:
+    def falls(x: Any, u: Any) -> Any:
+        return [x[1], math.sin(x[0]) + u[0]]
+
+    with pytest.raises(NlsidError, match=r"take NumPy's, such as np\.sin"):
+        design_funnel(falls, upright(), goal=[0.2, 0.5])

@@ -198,7 +198,9 @@ def _found(
         free = _free(setting, progress)
     hold = setting.hold
     assert hold is not None
-    periods = hold.tried()
+    periods, span = hold.tried(), float(setting.policy.t[-1] - setting.policy.t[0])
+    if min(periods) > span:
+        raise DataError(f"the hold of {min(periods):g} s is longer than the motion of {span:g} s")
     for period in periods:
         try:
             found = _held(setting, replace(hold, period=period), free, progress)
