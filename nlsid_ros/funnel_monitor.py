@@ -254,7 +254,7 @@ class FunnelMonitor(ManagedNode):
         try:
             judged = watch.message(topic, stamp_ns, message)
         except BagError as error:
-            self._publish(watch.missing(str(error)))
+            self._publish(watch.unreadable(topic, stamp_ns, str(error)))
             return
         self._publish(judged)
         if not responds:

@@ -156,6 +156,13 @@ class Watch:
         self._newest_ns = max(self._newest_ns, stamp_ns)
         return self.missing(reason)
 
+    def unreadable(self, topic: str, stamp_ns: int, reason: str) -> list[Stamped]:
+        """A message that cannot be read: unknown from here on; a command is not the one before."""
+        said: list[Stamped] = []
+        if topic not in self.pairing.response_topics:
+            said = self._judge(self.pairing.take(stamp_ns, self.pairing.unknown(topic)))
+        return [*said, *self.missing(reason)]
+
     def _judge(self, samples: Sequence[Sample]) -> list[Stamped]:
         judged = []
         for sample in samples:

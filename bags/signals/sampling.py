@@ -152,6 +152,10 @@ class Sampler:
         """
         return {k: self._signals[k].path.value(message) for k in self._on[topic]}
 
+    def unknown(self, topic: str) -> dict[int, float]:
+        """What `numbers` gives for a message that cannot be read: NaN of each of its signals."""
+        return dict.fromkeys(self._on[topic], math.nan)
+
     def take(self, stamp_ns: int, numbers: Mapping[int, float]) -> list[Sample]:
         """Take numbers of one message as `numbers` gives them; the samples certain now."""
         for k, value in numbers.items():

@@ -118,7 +118,10 @@ def test_a_push_is_seen_and_only_where_it_acts() -> None:
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
-        ({"kind": "unicycle"}, "it should be one of model, pendulum, satellite, mujoco_pendulum"),
+        (
+            {"kind": "unicycle"},
+            "it should be one of model, vector_field, pendulum, satellite, mujoco_pendulum",
+        ),
         ({"kind": "model"}, "set the parameter model"),
         ({"kind": "pendulum", "push_input": 1}, "pendulum has 1 inputs"),
     ],
