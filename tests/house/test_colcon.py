@@ -25,6 +25,7 @@ EXECUTABLES = {
     "plant",
     "tracking_controller",
     "trajectory_recorder",
+    "viewer",
 }
 
 pytestmark = [
