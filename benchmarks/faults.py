@@ -46,6 +46,7 @@ from benchmarks.machine import describe
 from benchmarks.processes import isolate, node, python
 from nlsid_core import files
 from nlsid_core.errors import NlsidError
+from nlsid_core.progress import silent
 from nlsid_ros import qos
 
 PERIOD_NS = 25_000_000
@@ -544,7 +545,7 @@ def run(folder: Path, only: str = "") -> Iterator[Seen]:
     made = []
     for name, factor in (("good", 1.5), ("other", 2.0)):
         out = folder / name
-        identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+        identify_bags(f1tenth(), config, out, progress=silent)
         assert config.funnel is not None
         wider = config.funnel.model_copy(update={"safety_factor": factor})
         design_funnel_files(out / MODEL, config.model_copy(update={"funnel": wider}), out)
