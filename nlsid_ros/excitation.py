@@ -30,7 +30,7 @@ from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.messages import SignalMessage
+from nlsid_ros.messages import OTHERS, ZERO, SignalMessage
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "excitation"
@@ -54,6 +54,7 @@ class Excitation(ManagedNode):
                 declare_text(self, "command", "/cmd_vel:twist.linear.x", "signal published")
             ),
             declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "its type"),
+            declare_text(self, "others", ZERO, f"its fields that are not the signal: {OTHERS}"),
         )
         self._bag = declare_text(self, "bag", "", "for kind replay: the bag whose command is sent")
         self._period = number("period", 0.025, "s between commands", between=(1e-3, 10.0))
@@ -131,6 +132,7 @@ class Excitation(ManagedNode):
             self.signal_topic(self._command.path.topic),
             qos.command(self._period),
         )
+        self._command.listen(self)
         self._experiment = self.create_publisher(String, "~/experiment", qos.DOCUMENT)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._bags = {
@@ -160,6 +162,9 @@ class Excitation(ManagedNode):
                 self._still -= 1
                 if not self._still:
                     self._close_bag()
+            return
+        if lacking := self._command.lacking():
+            self._fail(lacking)
             return
         self._input = float(self._once[self._next])
         self._send(self._start_ns + self._next * round(self._period * 1e9))
@@ -252,6 +257,8 @@ class Excitation(ManagedNode):
     def _on_start(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         if self._busy:
             answer.message = "it runs already"
+        elif lacking := self._command.lacking():
+            answer.message = lacking
         elif not all(client.service_is_ready() for client in self._bags.values()):
             answer.message = f"there is no recorder {self._recorder}; start it with at_once:=false"
         else:

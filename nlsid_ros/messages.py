@@ -1,34 +1,103 @@
 """The numbers of signals into a stamped message of their topic's type."""
 
-from typing import Any
+import json
+import math
+import re
+import time
+from copy import deepcopy
+from typing import Any, Final
 
 import numpy as np
 from rclpy.clock import Clock
 
 from bags.recordings.message_types import is_stamped
-from bags.signals.signal import SignalPath
+from bags.signals.signal import SignalPath, numeric_paths
 from bags.signals.vector import SignalVector
 from nlsid_core.arrays import ArrayLike
 from nlsid_core.errors import BagError
+from nlsid_ros import qos
 from nlsid_ros.message_classes import installed_types, message_class
+from nlsid_ros.running import ManagedNode
+
+ZERO: Final = "zero"
+REFUSED: Final = "refused"
+OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
+OTHERS_PATIENCE: Final = 1.0  # s without a message on that topic
+SAID: Final = 6  # fields that are named
 
 
 class SignalMessage:
     """Makes messages of `msgtype` that carry numbers at `path`, e.g. a commanded speed.
 
-    Raises BagError if the type has no header stamp or no number there.
+    others: what all other fields are: `zero`; `refused`, if there may be none; a JSON object of
+    fields; or a topic of the same type, whose last message they are of (`listen`). Raises BagError
+    if the type has no header stamp or no number there, or `others` does not fit it.
     """
 
-    def __init__(self, path: SignalPath | SignalVector, msgtype: str) -> None:
-        path.check(msgtype, installed_types(msgtype))
-        if not is_stamped(msgtype, installed_types(msgtype)):
+    def __init__(self, path: SignalPath | SignalVector, msgtype: str, others: str = ZERO) -> None:
+        types = installed_types(msgtype)
+        path.check(msgtype, types)
+        if not is_stamped(msgtype, types):
             raise BagError(f"{msgtype} has no header stamp, so {path} could not be paired")
         self.path, self.kind = path, message_class(msgtype)
         self._paths = path.paths if isinstance(path, SignalVector) else (path,)
+        mine = {_plain(p) for p in self._paths}
+        self.rest = [
+            name
+            for name, *_ in numeric_paths(msgtype, types)
+            if _plain(name) not in mine and "[" not in name and not name.startswith("header.")
+        ]
+        self._base: Any = None
+        self._topic, self._heard = "", -math.inf
+        if others == REFUSED:
+            if self.rest:
+                raise BagError(
+                    f"{msgtype} has fields that are not the signal ({self.rest_said}); say what "
+                    f"they are: others {OTHERS}"
+                )
+        elif others.startswith("{"):
+            self._base = self.kind()
+            try:
+                _fill(self._base, json.loads(others))
+            except (ValueError, TypeError, AttributeError, AssertionError) as error:
+                raise BagError(f"others, fields of {msgtype}: {error}") from error
+        elif others.startswith("/"):
+            if others == path.topic:
+                raise BagError(f"others is {others}, which the commands themselves are sent to")
+            self._topic = others
+        elif others != ZERO:
+            raise BagError(f"others is '{others}'; it should be {OTHERS}")
+        self.is_zero = others == ZERO and bool(self.rest)
+
+    @property
+    def rest_said(self) -> str:
+        """The fields that are not the signal, for people."""
+        more = f" and {len(self.rest) - SAID} more" if len(self.rest) > SAID else ""
+        return ", ".join(self.rest[:SAID]) + more
+
+    def listen(self, node: ManagedNode) -> None:
+        """Take the other fields from the topic that was named, or say that they are zero."""
+        if self._topic:
+            topic = node.signal_topic(self._topic)
+            node.create_subscription(self.kind, topic, self._on_other, qos.SENSOR)
+        elif self.is_zero:
+            node.get_logger().warning(
+                f"published as zero beside {self.path}: {self.rest_said} (parameter others: "
+                f"{OTHERS})"
+            )
+
+    def _on_other(self, message: Any) -> None:
+        self._base, self._heard = message, time.monotonic()
+
+    def lacking(self) -> str:
+        """Why the other fields are not known, empty if they are."""
+        if not self._topic or time.monotonic() - self._heard <= OTHERS_PATIENCE:
+            return ""
+        return f"nothing on {self._topic} for {OTHERS_PATIENCE:g} s, which has the other fields"
 
     def make(self, stamp_ns: int, values: ArrayLike) -> Any:
-        """A message stamped `stamp_ns`; all that is not the signal is zero."""
-        message = self.kind()
+        """A message stamped `stamp_ns`; all that is not the signal is as `others` says."""
+        message = self.kind() if self._base is None else deepcopy(self._base)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
         for path, value in zip(
             self._paths, np.broadcast_to(values, len(self._paths)).tolist(), strict=True
@@ -36,6 +105,24 @@ class SignalMessage:
             _make_room(path, message)
             path.assign(message, value)
         return message
+
+
+def _plain(path: SignalPath | str) -> str:
+    """A field without its topic and indices."""
+    return re.sub(r"\[[^]]*\]", "", str(path).rpartition(":")[2])
+
+
+def _fill(message: Any, content: dict[str, Any]) -> None:
+    """Take fields of a JSON object; ValueError, TypeError or AssertionError if one does not fit."""
+    known = message.get_fields_and_field_types()
+    for name, value in content.items():
+        if name not in known:
+            raise ValueError(f"there is no '{name}'; there are: {', '.join(known)}")
+        part = getattr(message, name)
+        if isinstance(value, dict):
+            _fill(part, value)
+        else:
+            setattr(message, name, float(value) if isinstance(part, float) else value)
 
 
 def _make_room(path: SignalPath, message: Any) -> None:

@@ -5,6 +5,7 @@ import signal
 import socket
 import threading
 import traceback
+from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -43,6 +44,7 @@ class Declared(NamedTuple):
     description: str
     between: tuple[float, float] | None
     tunable: bool
+    several: bool = False
 
 
 class PlainNode(Node):
@@ -296,16 +298,17 @@ def declare(
     *,
     between: tuple[float, float] | None = None,
     tunable: bool = False,
+    several: bool = False,
 ) -> Value:
     """Declare a parameter with its description and range, once, and return its value.
 
     Of a ManagedNode it can be changed while the node is unconfigured, and while it runs only if
-    `tunable`: `ManagedNode.tune` is told then.
+    `tunable`: `ManagedNode.tune` is told then. several: a list of numbers is taken, too.
 
     The default's type is the parameter's, and 2 is taken where 2.0 is meant. Raises DataError if
     the value given has another type or is out of range.
     """
-    declared = Declared(name, default, description, between, tunable)
+    declared = Declared(name, default, description, between, tunable, several)
     if node.has_parameter(name):
         return _as_meant(declared, node.get_parameter(name).value)
     is_fixed = not isinstance(node, ManagedNode)
@@ -332,6 +335,12 @@ def _as_meant(declared: Declared, given: Any) -> Value:
     if not isinstance(declared.default, float):
         return value
     what = f"parameter {declared.name} ({declared.description})"
+    if declared.several and isinstance(given, array | list | tuple) and len(given):
+        return [_a_number(declared, what, each) for each in given]
+    return _a_number(declared, what, given)
+
+
+def _a_number(declared: Declared, what: str, given: Any) -> float:
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise DataError(f"{what}: {given!r} is not a number")
     if declared.between is not None and not declared.between[0] <= given <= declared.between[1]:

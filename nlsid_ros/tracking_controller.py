@@ -38,7 +38,7 @@ from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.message_classes import installed_types, message_class
-from nlsid_ros.messages import SignalMessage, frame_of, off_clock, stamp_ns_of
+from nlsid_ros.messages import OTHERS, ZERO, SignalMessage, frame_of, off_clock, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
@@ -75,10 +75,14 @@ class TrackingController(ManagedNode):
         what = "s without a response, or from its stamp to this node's clock: stop"
         number("stale_after", 0.1, what, between=(0.001, 60.0))
         number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
-        number("lowest", 0.0, "least input", between=(-BIG, BIG))
-        number("highest", 0.0, "greatest input; must be set", between=(-BIG, BIG))
-        number("stop_at", 0.0, "input of a robot at rest", between=(-BIG, BIG))
-        number("stop_rate", 1.0, "fastest change while stopping, 1/s", between=(1e-6, BIG))
+        limit = partial(declare, self, tunable=True, several=True)
+        limit("lowest", 0.0, "least input, or a list for each input", between=(-BIG, BIG))
+        limit("highest", 0.0, "greatest input, or a list; must be set", between=(-BIG, BIG))
+        limit("stop_at", 0.0, "input of a robot at rest, or a list", between=(-BIG, BIG))
+        what = "fastest change while stopping, 1/s, or a list"
+        limit("stop_rate", 1.0, what, between=(1e-6, BIG))
+        what = f"fields of the commands that are not the input: {OTHERS}"
+        self._others = declare_text(self, "others", ZERO, what)
         what = "s until a robot that is stopped is at rest, faster than stop_rate if need be"
         number("stop_within", 5.0, what, between=(0.01, 60.0))
         self._watched = bool(
@@ -100,7 +104,7 @@ class TrackingController(ManagedNode):
         if self._controller is not None or self._stopping:
             raise DataError("a run is on; stop it first")
         limits = Limits(**{name: values[name] for name in LIMITS})
-        if limits.lowest == limits.highest:
+        if np.any(np.equal(limits.lowest, limits.highest)):
             raise DataError("no room between lowest and highest; set the limits of the input")
         self._limits, self._settling = limits, values["settling"]
         self._stale_after, self._stop_within = values["stale_after"], values["stop_within"]
@@ -158,11 +162,12 @@ class TrackingController(ManagedNode):
         """Take a design, but never in the middle of a run: stop that first."""
         response, command = design.response, design.command
         response.check(self._response_type, installed_types(self._response_type))
-        message = SignalMessage(command, self._command_type)
+        message = SignalMessage(command, self._command_type, self._others)
         if self._controller is not None or self._stopping:
             self._halt("the design was replaced")
         if self._design is None:
             self._command = message
+            message.listen(self)
             self._commands = self.create_publisher(
                 message.kind, self.signal_topic(message.path.topic), qos.command(design.period)
             )
@@ -187,6 +192,9 @@ class TrackingController(ManagedNode):
             return self._funnel.state
         if self._controller is not None or self._stopping:
             return "a run is on"
+        assert self._command is not None
+        if lacking := self._command.lacking():
+            return lacking
         try:
             self._controller = self._design.controller(self._limits, self._settling)
         except NlsidError as error:
@@ -273,12 +281,15 @@ class TrackingController(ManagedNode):
         if self._controller is None or self._first_ns is None:
             return
         assert self._design is not None
+        assert self._command is not None
         now = time.monotonic()
         unsent = 2.0 * (self._stale_after + self._design.period)
         if now - self._heard > self._stale_after:
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")
+        elif lacking := self._command.lacking():
+            self._halt(lacking)
         elif self._is_unwatched(now):
             self._halt(f"{self._monitor} has judged nothing for {self._monitor_patience:g} s")
 
@@ -309,8 +320,8 @@ class TrackingController(ManagedNode):
         self._next.cancel()
         self._due.clear()
         self._stopping = reason
-        away = float(np.max(np.abs(np.subtract(self._input, self._limits.stop_at))))
-        rate = max(self._limits.stop_rate, away / self._stop_within)
+        away = np.abs(np.subtract(self._input, self._limits.stop_at))
+        rate = np.maximum(self._limits.stop_rate, float(np.max(away)) / self._stop_within)
         self._ramp = replace(self._limits, stop_rate=rate)
         self._tell(f"stopping: {reason}")
         self._step.timer_period_ns = round(self._design.period * 1e9)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import welch
 
 from bags.chain.config import Config
-from bags.chain.steps import Trials, read_trials
+from bags.chain.steps import USELESS, Trials, read_trials
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
@@ -33,8 +33,10 @@ from nlsid_core.progress import silent
 from nlsid_core.running.grid import TOLERANCE
 
 LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
-FEW_LAGS: Final = (1, 2, 3)  # tried with several signals,
-DEGREES: Final = (1, 2, 3)  # with these degrees in the inputs
+FEW_LAGS: Final = (1, 2, 3)  # tried with several signals, the inputs at all delays or at one,
+DEGREES: Final = (1, 2, 3, 4)  # with these degrees in the inputs
+MOST_TERMS: Final = 150  # of a polynomial in the inputs that is tried
+CALIBRATED_FROM: Final = 3  # bags besides the test's: every second of them scales the tube
 TRIED_ITERATIONS: Final = 8  # of the robust simulation error, enough to tell lags apart
 LAGS_BETTER: Final = 0.98  # of the error that more lags have to reach
 ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they come
@@ -49,6 +51,7 @@ RELATED: Final = 0.3  # correlation below which command and response may be unre
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
+SHOWN: Final = 4  # of the classes that were tried
 OTHERS: Final = 3  # commands that are named besides
 STALE: Final = 5.0  # periods without a response that are one too many
 
@@ -400,6 +403,15 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
     elif len(names) > 1:
         proposal.content["split"] = {"test": names[-1:]}
         proposal.why["test"] = f"the last of {len(names)} bags"
+    if len(names) > 1:
+        split = proposal.content["split"]
+        others = [name for name in names if name not in split["test"]]
+        if len(others) >= CALIBRATED_FROM:
+            split["calibration"] = others[1::2]
+            proposal.why["calibration"] = (
+                "every second of the others: a trial like them is flagged with a probability of "
+                f"at most 1/{len(others) // 2 + 1} at safety_factor 1"
+            )
     else:
         proposal.content["split"] = {"share": SHARE}
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
@@ -468,11 +480,7 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
     where = "on what they were fitted to" if alone else "on trials held back"
     proposal.why["lags"] = f"proved models simulated {where} are off by {said}"
     if best > POOR:
-        proposal.walls.append(
-            f"no number of lags simulates {where.removeprefix('on ')} with less than {best:.3g} % "
-            "error: the tube will be wide; another pair of signals, or more of them, may say more"
-            + _others(proposal, found)
-        )
+        proposal.walls.append(_poor(best, where.removeprefix("on ")) + _others(proposal, found))
 
 
 def _others(proposal: Proposal, found: Found) -> str:
@@ -486,31 +494,58 @@ def _others(proposal: Proposal, found: Found) -> str:
 
 
 def _say_degree(proposal: Proposal, train: Dataset) -> None:
-    """Lags and degree in the inputs of a class for several, by trials held back."""
+    """Lags, delays and degree in the inputs of a class for several, by trials held back."""
     section = proposal.content["identification"]
     ranges = tuple((float(low), float(high)) for low, high in section["input_range"])
     names = train.names
     held_back = list(names[1::3]) or list(names[:1])
     fitted = train if len(held_back) == len(names) else train.without(held_back)
-    known: dict[tuple[int, int], float] = {}
+    known: dict[StateAffineClass, float] = {}
     for lags, degree in product(FEW_LAGS, DEGREES):
-        with suppress(NlsidError):
-            fit = identify(
-                fitted, StateAffineClass(lags, right_degree=degree, input_range=ranges),
-                method=LeastSquares(), comparators=(), test=train.select(held_back),
-                allow_unproved=True,
-            )  # fmt: skip
-            error = float(fit.errors["test"]["least_squares"])
-            if math.isfinite(error):
-                known[lags, degree] = error
+        for delays in (None, *((k,) for k in range(1, lags + 1))):
+            tried = StateAffineClass(lags, delays, right_degree=degree, input_range=ranges)
+            if _terms(tried) > MOST_TERMS:
+                continue
+            with suppress(NlsidError):
+                fit = identify(
+                    fitted, tried, method=LeastSquares(), comparators=(),
+                    test=train.select(held_back), allow_unproved=True,
+                )  # fmt: skip
+                error = float(fit.errors["test"]["least_squares"])
+                if math.isfinite(error):
+                    known[tried] = error
     if not known:
         return
     best = min(known.values())
-    lags, degree = next(key for key, error in known.items() if error * LAGS_BETTER <= best)
-    section |= {"lags": lags, "right_degree": degree}
-    said = ", ".join(f"{key[0]} and {key[1]}: {error:.3g} %" for key, error in known.items())
-    proposal.why["lags"] = f"least squares on trials held back, lags and right_degree: {said}"
+    good = min((c for c, error in known.items() if error * LAGS_BETTER <= best),
+               key=lambda c: c.lags + _terms(c))  # fmt: skip
+    section |= {"lags": good.lags, "right_degree": good.right_degree}
+    if good.delays is not None:
+        section["delays"] = list(good.delays)
+        proposal.why["delays"] = "as the lags"
+    shown = sorted(known.items(), key=lambda item: item[1])[:SHOWN]
+    said = ", ".join(
+        f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.right_degree}: {error:.3g} %"
+        for c, error in shown
+    )
+    proposal.why["lags"] = f"least squares on trials held back; lags, delays, right_degree: {said}"
     proposal.why["right_degree"] = "as the lags"
+    if best > POOR:
+        proposal.walls.append(_poor(best, "trials held back"))
+
+
+def _terms(tried: StateAffineClass) -> int:
+    """Of the polynomial in the inputs."""
+    window = len(tried.window(len(tried.input_range or ())))
+    return math.comb(window + tried.right_degree, tried.right_degree)
+
+
+def _poor(best: float, where: str) -> str:
+    refused = f"; identification refuses a model above {USELESS:g} %" if best > USELESS else ""
+    return (
+        f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
+        f"will be wide{refused}; another pair of signals, or more of them, may say more"
+    )
 
 
 def _say_funnel(proposal: Proposal) -> None:

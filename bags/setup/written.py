@@ -45,7 +45,7 @@ def _section(
                 pairs = ", ".join(f"{k}: {_flow(v)}" for k, v in entry.items())
                 yield f"{indent}  - {{{pairs}}}"
         else:
-            yield f"{indent}{key}: {_flow(value)}"
+            yield from _wrapped(f"{indent}{key}: {_flow(value)}", f"{indent}  ", value)
 
 
 def _options(content: Mapping[str, Any]) -> dict[str, Key]:
@@ -64,6 +64,16 @@ def _comment(text: str, indent: str = "") -> Iterator[str]:
     yield from textwrap.wrap(
         plain, WIDTH, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}#   "
     )
+
+
+def _wrapped(line: str, indent: str, value: Any) -> Iterator[str]:
+    """A list goes on in the next line."""
+    if not isinstance(value, list):
+        yield line
+    else:
+        yield from textwrap.wrap(
+            line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        )
 
 
 def _flow(value: Any) -> str:

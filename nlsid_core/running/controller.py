@@ -7,7 +7,7 @@ acts. Of the other kinds input k answers sample k and has the period to get ther
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,26 +32,40 @@ from nlsid_core.running.observer import (
 Input = TypeVar("Input", float, FloatArray)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Limits:
     """lowest, highest: of the input, in its unit; stop_rate: its fastest change while stopping, in
-    unit/s; stop_at: the input of a robot at rest.
+    unit/s; stop_at: the input of a robot at rest. Each is one number, or one for each input (m,).
 
     Raises DataError unless lowest <= stop_at <= highest and stop_rate > 0.
     """
 
-    lowest: float
-    highest: float
-    stop_rate: float
-    stop_at: float = 0.0
+    lowest: float | FloatArray
+    highest: float | FloatArray
+    stop_rate: float | FloatArray
+    stop_at: float | FloatArray = 0.0
 
     def __post_init__(self) -> None:
-        sound = self.lowest <= self.stop_at <= self.highest and math.isfinite(self.stop_at)
-        if not sound or not self.stop_rate > 0.0:
+        for field in fields(self):
+            given = np.asarray(getattr(self, field.name), dtype=np.float64)
+            object.__setattr__(self, field.name, given if given.ndim else float(given))
+        if len({np.shape(value) for value in self._each()} - {()}) > 1:
+            raise DataError("limits: give one number, or as many of each as there are inputs")
+        inside = np.logical_and(self.lowest <= self.stop_at, self.stop_at <= self.highest)
+        if not (np.all(inside) and np.isfinite(self.stop_at).all() and np.all(self.stop_rate > 0)):
             raise DataError(
                 f"limits: {self.stop_at} should be in [{self.lowest}, {self.highest}], "
                 f"stop_rate {self.stop_rate} positive"
             )
+
+    def refuse(self, inputs: int) -> None:
+        """DataError unless they are for so many inputs."""
+        for value in self._each():
+            if np.shape(value) not in ((), (inputs,)):
+                raise DataError(f"limits for {np.size(value)} inputs; the design has {inputs}")
+
+    def _each(self) -> list[float | FloatArray]:
+        return [getattr(self, field.name) for field in fields(self)]
 
     def clip(self, u: Input) -> Input:
         """The nearest input that is allowed; of several, each."""
@@ -61,8 +75,9 @@ class Limits:
     def towards_stop(self, u: Input, dt: float) -> Input:
         """The input dt s later on the way to `stop_at`."""
         step = self.stop_rate * dt
-        nearer: Input = u + np.clip(self.stop_at - u, -step, step)
-        return self.clip(nearer)
+        nearer: Any = u + np.clip(self.stop_at - u, -step, step)
+        allowed: Input = self.clip(nearer)
+        return allowed
 
     def at_rest(self, u: Input) -> bool:
         """Whether every input is where a robot at rest has it."""
@@ -144,6 +159,7 @@ class Controller:
         self._observer = _observer(model, policy)
         self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
         for _, planned, _ in stages:
+            limits.refuse(np.size(planned.planned[0]))
             self._refuse_cut(planned.planned)
         self.ended = ""
         self.k = -1
@@ -239,9 +255,14 @@ class Controller:
         cut = planned[self.limits.clip(planned) != planned]
         if len(cut):
             raise DataError(
-                f"the plan's input {float(cut[0]):g} is beyond the limits [{self.limits.lowest:g}, "
-                f"{self.limits.highest:g}]: what they cut off is not what was proved"
+                f"the plan's input {float(cut[0]):g} is beyond the limits "
+                f"{_interval(self.limits)}: what they cut off is not what was proved"
             )
+
+
+def _interval(limits: Limits) -> str:
+    ends = np.broadcast_arrays(np.atleast_1d(limits.lowest), limits.highest)
+    return ", ".join(f"[{low:g}, {high:g}]" for low, high in zip(*ends, strict=True))
 
 
 def _observer(model: Any, policy: Any) -> Observer:

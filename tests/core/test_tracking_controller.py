@@ -95,6 +95,12 @@ def test_limits_that_cut_off_the_plan_are_refused_before_anything_moves() -> Non
         design().controller(Limits(lowest=-0.1, highest=0.1, stop_rate=1.0), 1.0)
 
 
+def test_limits_of_another_number_of_inputs_are_refused_before_anything_moves() -> None:
+    two = Limits(lowest=np.array([-9.0, -9.0]), highest=9.0, stop_rate=1.0)
+    with pytest.raises(DataError, match="limits for 2 inputs; the design has 1"):
+        design().controller(two, 1.0)
+
+
 def test_an_input_that_the_limits_would_cut_is_not_sent_and_ends_the_run() -> None:
     made = design()
     highest = float(np.abs(made.policy.u).max())

@@ -1,0 +1,103 @@
+"""Fields of a command that are not the signal: never zero without a word, and limits per input."""
+
+import re
+import time
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
+
+from geometry_msgs.msg import TwistStamped
+from std_srvs.srv import Trigger
+
+from bags.signals.signal import SignalPath
+from bags.signals.vector import SignalVector
+from nlsid_core.errors import BagError
+from nlsid_ros import qos
+from nlsid_ros.messages import SignalMessage
+from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+
+pytestmark = ros_test
+
+TWIST = "geometry_msgs/msg/TwistStamped"
+SPEED = SignalPath.parse("/cmd_vel:twist.linear.x")
+PLAYED: dict[str, object] = {
+    "kind": "steps", "hold": 0.2, "period": 0.02, "duration": 5.0, "pause": 0.0,
+    "lowest": 0.1, "highest": 0.4, "slew": 5.0, "fade": 0.1, "rest": 0.1,
+}  # fmt: skip
+
+
+def test_the_other_fields_are_as_the_template_says() -> None:
+    made = SignalMessage(
+        SPEED, TWIST, '{"twist": {"angular": {"z": 1}}, "header": {"frame_id": "b"}}'
+    )
+    message = made.make(5, 0.25)
+    assert (message.twist.linear.x, message.twist.angular.z) == (0.25, 1.0)
+    assert (message.header.frame_id, message.header.stamp.nanosec) == ("b", 5)
+    assert not made.lacking()
+
+
+@pytest.mark.parametrize(
+    ("others", "said"),
+    [
+        ("refused", "fields that are not the signal (twist.linear.y, twist.linear.z, twist.ang"),
+        ('{"twist": {"turn": 1}}', "there is no 'turn'; there are: linear, angular"),
+        ('{"twist": {"angular": {"z": "fast"}}}', "could not convert string to float"),
+        ("{", "others, fields of geometry_msgs/msg/TwistStamped: "),
+        ("/cmd_vel", "which the commands themselves are sent to"),
+        ("none", "others is 'none'; it should be zero, refused"),
+    ],
+)  # fmt: skip
+def test_others_that_do_not_fit_are_refused_by_name(others: str, said: str) -> None:
+    with pytest.raises(BagError, match=re.escape(said)):
+        SignalMessage(SPEED, TWIST, others)
+
+
+def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:
+    paths = [f"/u:twist.{part}.{axis}" for part in ("linear", "angular") for axis in "xyz"]
+    whole = SignalMessage(SignalVector.parse(paths), TWIST, "refused")
+    assert whole.make(0, [1, 2, 3, 4, 5, 6]).twist.angular.z == 6.0
+
+
+def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps of speed while another node steers; when that one stops, the robot goes to rest."""
+    use_domain_of_this_run(monkeypatch)
+    sent: list[TwistStamped] = []
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process("nlsid_ros.excitation", others="/teleop", **PLAYED),
+    ):
+        node.create_subscription(TwistStamped, "/cmd_vel", sent.append, qos.STREAM)
+        steering = node.create_publisher(TwistStamped, "/teleop", qos.STREAM)
+        start = node.create_client(Trigger, "/excitation/start")
+        spin_until(start.service_is_ready)
+        spin_until(lambda: node.count_subscribers("/teleop") == 1)
+        refused = start.call_async(Trigger.Request())
+        spin_until(refused.done)
+        assert refused.result().message == (
+            "nothing on /teleop for 1 s, which has the other fields"
+        )
+        message = TwistStamped()
+        message.twist.linear.x, message.twist.angular.z = 9.0, 0.7
+        timer = node.create_timer(0.1, lambda: steering.publish(message))
+        settled = time.monotonic() + 0.5
+        spin_until(lambda: time.monotonic() > settled)
+        asked = start.call_async(Trigger.Request())
+        spin_until(asked.done)
+        assert asked.result().success
+        spin_until(lambda: len(sent) > 50)
+        timer.cancel()
+        quiet = [0, time.monotonic()]
+
+        def ended() -> bool:
+            if len(sent) != quiet[0]:
+                quiet[:] = [len(sent), time.monotonic()]
+            return time.monotonic() - quiet[1] > 1.0
+
+        spin_until(ended)
+    assert {each.twist.angular.z for each in sent} == {0.7}
+    assert max(each.twist.linear.x for each in sent) <= 0.4
+    assert len(sent) < 5.0 / 0.02, "it stopped before its end"
+    assert sent[-1].twist.linear.x == 0.1, "at rest"
