@@ -1,6 +1,7 @@
-"""`identify_cells`: a cascade of contracting scalar cells that saturate and flow over, as a network.
+"""`identify_cells`: contracting scalar cells in a row, that saturate and flow over, as a network.
 
-    z_i = φ_i(x_i) + g_i(x_{i-1}) + γ_i (z_{i-1} - m_{i-1})₊ + b_i·u,   x_i⁺ = min(z_i, m_i),   y = x_c
+    z_i = φ_i(x_i) + g_i(x_{i-1}) + γ_i (z_{i-1} - m_{i-1})₊ + b_i·u,
+    x_i⁺ = min(z_i, m_i),   y = x_c
 φ_i, g_i are linear between equally spaced knots. Slopes of φ_i in [0, ρ] make every such cascade
 stable: V = Σ w^i Δx_i² decreases at a rate near ρ for a small w, what a cell gets from those before
 it being bounded. Inside these bounds the simulation error is minimised, x(0) of every trial free,
@@ -30,7 +31,7 @@ POLES = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)  # of the cells, at
 TOPS = (1.0, 0.9, 0.75)  # quantiles of a hidden state at which it flows over, at the start
 STARTS, KEPT = 3, 2  # combinations of poles; minima that are refined
 START_SAMPLES, START_STEPS, START_INTERVALS = 5000, 20, 2
-STEPS, TOLERANCE = 150, 1e-6
+TOLERANCE = 1e-6
 DIVERGED = 1e6  # a state in spreads: what the minimiser should not visit
 
 
@@ -158,8 +159,9 @@ class Cascade:
         used = np.r_[0:shared, own : own + cells]
         column = np.full(size, -1)
         column[used] = np.arange(len(used))
-        before = after = np.zeros((0, 0))
-        hinges_before = slope_before = over_before = np.zeros(0)
+        before: FloatArray = np.zeros((0, 0))
+        after, hinges_before, over_before = before, before, np.zeros(0)
+        interval_before = np.zeros(0, dtype=int)
         for i, cell in enumerate(self.places()):
             k = np.clip((x[:, i] - self.knots[i, 0]) * K / np.ptp(self.knots[i]), 0, K - 1)
             index = k.astype(int)
@@ -170,7 +172,7 @@ class Cascade:
             direct[:, cell["b"]] = trial.u
             if i:
                 direct[:, cell["g"]] = hinges_before
-                direct += self.g[i][slope_before][:, None] * before
+                direct += self.g[i][interval_before][:, None] * before
                 if "gamma" in cell:
                     flows = over_before > 0.0
                     direct[:, cell["gamma"]] = np.maximum(over_before, 0.0)[:, None]
@@ -189,19 +191,19 @@ class Cascade:
             if "top" in cell:
                 after[:, cell["top"]] -= 1.0
             over_before = z[:, i] - self.top[i]
-            before, hinges_before, slope_before = moved, hinges, index
+            before, hinges_before, interval_before = moved, hinges, index
         J = np.zeros((N, size))
         J[:, used] = before
         return J
 
 
 def identify_cells(
-    train: Dataset, model_class: CellClass, *, transient: int = 0, slowest: float
+    train: Dataset, model_class: CellClass, *, transient: int = 0, slowest: float, steps: int
 ) -> tuple[CellNetwork, StabilityProof, tuple[Step, ...]]:
     """A `CellNetwork` by simulation error, proved stable, and the rms errors of the search's steps.
 
-    slowest: slope of φ_i, at most. Raises ShapeError for several outputs, DataError on too little
-    or constant data, Infeasible if the minimum found has no proof.
+    slowest: slope of φ_i, at most. steps: from each start, at most. Raises ShapeError for several
+    outputs, DataError on too little or constant data, Infeasible if the minimum found has no proof.
     """
     data = [(t.u, t.y) for t in train]
     if data[0][1].shape[1] != 1:
@@ -223,25 +225,25 @@ def identify_cells(
         for u, y in data
     ]
     short = _shortened(trials)
-    tried, steps = [], []
+    tried, done = [], []
     for poles in _best_poles(short, model_class.cells, slowest):
         hidden = model_class.cells - 1 if model_class.saturation else 0
         for tops in product(TOPS, repeat=hidden):
             start = _start(short, poles, tops, model_class)
             tried.append(_minimised(start, short, model_class, slowest, START_STEPS))
             named = ", ".join(f"{pole:g}" for pole in poles)
-            steps.append(Step(f"poles {named}, tops {tops}", scales[3] * tried[-1][0]))
+            done.append(Step(f"poles {named}, tops {tops}", scales[3] * tried[-1][0]))
     found = []
     for _, cascade in sorted(tried, key=lambda entry: entry[0])[:KEPT]:
         wide = _with_trials(cascade, short, trials)
         finer = _with_intervals(wide, trials, model_class.intervals)
-        found.append(_minimised(finer, trials, model_class, slowest, STEPS))
-        steps.append(Step(f"{model_class.intervals} intervals", scales[3] * found[-1][0]))
+        found.append(_minimised(finer, trials, model_class, slowest, steps))
+        done.append(Step(f"{model_class.intervals} intervals", scales[3] * found[-1][0]))
     model = _network(min(found, key=lambda entry: entry[0])[1], scales, train, model_class)
     proof = prove_stability(model)
     if proof is None:
         raise Infeasible("no proof for the minimum found; try fewer cells or a smaller max_rate")
-    return model, proof, tuple(steps)
+    return model, proof, tuple(done)
 
 
 def _hinges(knots: FloatArray, x: FloatArray) -> FloatArray:
@@ -316,7 +318,7 @@ def _filtered(u: FloatArray, poles: Sequence[float]) -> list[FloatArray]:
 
 
 def _gains(trials: Sequence[Trial], poles: Sequence[float]) -> tuple[float, FloatArray]:
-    """(mean squared error, gains (q + 1,)) of the linear cascade with these poles and a constant."""
+    """(mean squared error, gains (q + 1,)) of the linear cascade with these poles, and offset."""
     columns = np.concatenate([_filtered(trial.u, poles)[-1] for trial in trials])
     columns = np.column_stack([columns, np.ones(len(columns))])
     y = np.concatenate([trial.y for trial in trials])
@@ -324,9 +326,7 @@ def _gains(trials: Sequence[Trial], poles: Sequence[float]) -> tuple[float, Floa
     return float(np.mean((columns @ gains - y) ** 2)), gains
 
 
-def _best_poles(
-    trials: Sequence[Trial], cells: int, slowest: float
-) -> list[tuple[float, ...]]:
+def _best_poles(trials: Sequence[Trial], cells: int, slowest: float) -> list[tuple[float, ...]]:
     """The combinations of poles whose linear cascades fit best."""
     allowed = [pole for pole in POLES if pole < slowest] or [0.5 * slowest]
     combinations = list(combinations_with_replacement(allowed, cells))

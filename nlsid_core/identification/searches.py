@@ -12,6 +12,7 @@ from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
+from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import (
@@ -79,6 +80,7 @@ from nlsid_core.identification.trail import Task, Trail
 from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -191,6 +193,22 @@ def block_cascade(
         return found.model, found.proof
 
     trail.add_proved(Sem, search)
+    return trail
+
+
+def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwork]:
+    """Scalar states in a row that contract, saturate and flow over; one output."""
+    trail: Trail[CellNetwork] = Trail(task, lambda _: None, f"training error, rms [{_unit(train)}]")
+
+    def search(method: CertifiedSem) -> tuple[CellNetwork, Proof]:
+        model, proof, steps = identify_cells(
+            train, model_class, transient=task.transient, slowest=task.searched_rate,
+            steps=method.iterations,
+        )  # fmt: skip
+        trail.history = History(trail.history.value, steps)
+        return model, proof
+
+    trail.add_proved(CertifiedSem, search)
     return trail
 
 
@@ -369,6 +387,7 @@ OFFERS: dict[type, Offer] = {
         (LeastSquares, Rie, FirstRse, Rse),
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
+    CellClass: Offer(cells, (CertifiedSem,), ()),
     MonotoneClass: Offer(
         monotone,
         (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, objects, signals
 
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
@@ -196,17 +196,10 @@ class CellNetwork:
         kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
-        maps = files.member(document, "maps", list, source=source)
+        maps = objects(document, "maps", source=source)
         arrays = {
             key: files.array(document, key, (None, None), source=source)
             for key in ("into", "next", "output")
-        }
-        signals = {
-            key: tuple(
-                Signal.from_document(signal, source=f"{source} {key}")
-                for signal in files.member(document, key, list, source=source)
-            )
-            for key in ("y", "u")
         }
         bags = files.member(document, "bags", list, source=source)
         return cls(
@@ -220,7 +213,8 @@ class CellNetwork:
             start=files.array(document, "start", (None,), source=source),
             start_samples=files.member(document, "start_samples", int, source=source),
             period=files.number(document, "period", source=source),
-            **signals,
+            y=signals(document, "y", source=source),
+            u=signals(document, "u", source=source),
             training=files.member(document, "training", str, source=source),
             bags=tuple(files.named_digests(bags, source=source)),
         )
