@@ -11,7 +11,6 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json
@@ -20,6 +19,7 @@ from nlsid_core.models.signal import FORMAT, Signal, objects, signals
 
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
+START_STEPS, FIRST_DAMPING, DIFFERENCE = 40, 1e-3, 1e-7
 PRIOR = 1e-3  # weight of the usual start beside one measured sample, both in their spreads
 
 
@@ -151,14 +151,30 @@ class CellNetwork:
         return y + self.output[:, -1], kept[:, m:]
 
     def start_from(self, y: FloatArray, u: FloatArray) -> FloatArray:
-        """x(0) by least squares on the outputs y (k, p) under u (k, q), near the usual start."""
+        """x(0) by least squares on the outputs y (k, p) under u (k, q), near the usual start.
+
+        Levenberg-Marquardt steps with differences, which are exact where no knot is passed.
+        """
         spread = np.maximum(np.std(y, axis=0), np.abs(self.output[:, len(self.maps) : -1]).max())
 
         def residual(x: FloatArray) -> FloatArray:
             error = (self.states(u, x)[0] - y) / spread
             return np.concatenate([error.ravel(), PRIOR * (x - self.start)])
 
-        return np.asarray(least_squares(residual, self.start, method="trf", max_nfev=50).x)
+        x, damping = np.array(self.start), FIRST_DAMPING
+        r, moves = residual(x), DIFFERENCE * np.eye(len(x))
+        for _ in range(START_STEPS):
+            J = np.column_stack([(residual(x + move) - r) / DIFFERENCE for move in moves])
+            normal = J.T @ J
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
+            after = residual(x + step)
+            better = after @ after < r @ r
+            damping *= 0.1 if better else 10.0
+            if better:
+                x, r = x + step, after
+            if np.abs(step).max() < DIFFERENCE * (1.0 + np.abs(x).max()):
+                break
+        return x
 
     def simulate(self, u: ArrayLike, y_start: ArrayLike) -> FloatArray:
         """Outputs (N, p) for inputs u (N, q), from the state that the first outputs y_start show.
