@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
@@ -122,16 +123,15 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
             thetas.insert(0, reflected(last.theta, radius))
             if not stable:
                 thetas.append(last.theta)
-        models = []
-        for theta in thetas:
+
+        def reached(theta: FloatArray) -> DifferenceEquation | None:
             start = regression.model(theta, SimulationError(regression.rows).at(theta).p)
-            if not stable or prove_stability(start) is not None:
-                models.append(
-                    minimise_simulation_error(regression, start, stable=stable, radius=radius)
-                )
-        if not models:
-            raise Infeasible("no start of the search has a proof of stability")
-        return min(models, key=lambda model: simulation_percent(model, train))
+            if stable and prove_stability(start) is None:
+                return None
+            return minimise_simulation_error(regression, start, stable=stable, radius=radius)
+
+        found = (_tried(theta.copy, reached) for theta in thetas)
+        return _least_error([model for model in found if model is not None], train)
 
     trail.add(Sem, lambda _: minimised(Rse().iterations, stable=False))
     trail.add(CertifiedSem, lambda method: minimised(method.iterations, stable=True))
@@ -275,15 +275,15 @@ def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | No
     """What a search makes of a start; None if there is no start, or it leads to nothing."""
     try:
         return minimised(start())
-    except (DataError, SolverError) as reason:
+    except (DataError, SolverError, LinAlgError) as reason:
         log.info("no model from this start: %s", reason)
         return None
 
 
 def _least_error(models: Sequence[T], train: Dataset) -> T:
-    """The proved model that simulates the training data best; Infeasible if there is none."""
+    """The model that simulates the training data best; Infeasible if there is none."""
     if not models:
-        raise Infeasible("no start of the search leads to a model with a proof of stability")
+        raise Infeasible("no start of the search leads to a model that can be used")
     return min(models, key=lambda model: simulation_percent(model, train))
 
 
