@@ -1,6 +1,6 @@
 """The chain's offline steps: each takes files, returns what it made, and writes it whole or not."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
@@ -24,10 +24,9 @@ from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
+from nlsid_core.progress import Progress, part, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,17 +119,9 @@ def write_identified(
     return Identified(fit, trials, tuple(written))
 
 
-def part(progress: Progress, start: float, end: float) -> Progress:
-    """Progress of a part of the work that begins at `start` and ends at `end`."""
-    return lambda what, fraction: progress(what, start + (end - start) * fraction)
-
-
 def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> Trials:
     """The trials of the configured signals on the configured grid, by what they are for."""
-    dataset = read_signals_of(
-        bags, config, progress=lambda done, total: progress("reading bags", done / total)
-    )
-    return by_use(dataset, config)
+    return by_use(read_signals_of(bags, config, progress=progress), config)
 
 
 def read_signals_of(
@@ -138,7 +129,7 @@ def read_signals_of(
     config: Config,
     *,
     names: Sequence[str] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> Dataset:
     """The configured signals of bags on the configured grid, with the configured names and units.
 
@@ -243,9 +234,9 @@ def cut(
             raise DataError(
                 f"{trial.name}: {share:g} of {len(trial.t)} samples, at least 2 of each"
             )
-        for part, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
+        for half, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
             y, u = trial.y[rows], trial.u[rows]
-            part.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
+            half.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
     return Trials(
         Dataset(tuple(parts[0])),
         Dataset(tuple(parts[1])),

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -20,9 +20,9 @@ from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import Progress, silent
 
 DEATHS: Final = 3  # of the worker that reads a bag; from the second time on, of that bag alone
-Progress = Callable[[str, float], None]
 
 
 class Task(Protocol):
@@ -60,7 +60,7 @@ def ask(
     manifest: Manifest,
     *,
     strict: bool = False,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> list[Answer]:
     """The answers in the order of `bags` (by name), whoever gave them and whenever they came.
 

@@ -11,13 +11,14 @@ from importlib.metadata import version
 from pathlib import Path
 
 from bags.chain.config import Config
-from bags.chain.steps import Identified, by_use, identify_trials, part, read_signals_of
+from bags.chain.steps import Identified, by_use, identify_trials, read_signals_of
 from bags.chain.training import decoded, encoded
 from bags.fleet.manifest import Manifest
-from bags.fleet.run import Answer, Progress, ask
+from bags.fleet.run import Answer, ask
 from bags.fleet.workers import Workers
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.progress import Progress, part, silent
 
 MANIFEST = "fleet.sqlite"
 
@@ -55,7 +56,7 @@ def identify_fleet(
     *,
     workers: Workers,
     strict: bool = False,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> FleetIdentified:
     """`identify_bags` of bags by name, read by workers; what they read is kept in OUT/fleet.sqlite.
 

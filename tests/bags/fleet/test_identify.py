@@ -19,6 +19,7 @@ from bags.fleet.trials import MANIFEST, identify_fleet
 from bags.fleet.workers import Workers
 from bags.samples import f1tenth
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import silent
 from tests.bags.fleet.conftest import Bucket
 from tests.bags.fleet.deadly import Deadly
 from tests.bags.fleet.storage import drive
@@ -33,10 +34,6 @@ split: {test: ["*_0"]}
 identification: {lags: 2, method: rse_first}
 """
 FILES = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
-
-
-def quiet(_: str, __: float) -> None:
-    """No progress."""
 
 
 @pytest.fixture
@@ -55,7 +52,7 @@ def fleet(folder: Path, count: int = 6) -> Path:
 def run(bags: Path, config: Path, out: Path, workers: Workers = Workers(), strict: bool = False):  # type: ignore[no-untyped-def]  # noqa: B008
     return identify_fleet(
         named_bags([bags]), load_config(config), out,
-        workers=workers, strict=strict, progress=quiet,
+        workers=workers, strict=strict,
     )  # fmt: skip
 
 
@@ -85,10 +82,10 @@ def test_the_result_is_the_same_to_the_bit_whoever_reads(tmp_path: Path, config:
 def test_a_fleet_of_one_folder_gives_what_identify_gives(tmp_path: Path) -> None:
     config = load_config(Path("config/f1tenth.yaml"))
     bags = f1tenth()
-    identify_bags(bags, config, tmp_path / "alone", progress=quiet)
+    identify_bags(bags, config, tmp_path / "alone", progress=silent)
     identify_fleet(
         {path.name: path for path in bags}, config, tmp_path / "fleet",
-        workers=Workers(), progress=quiet,
+        workers=Workers(),
     )  # fmt: skip
     assert contents(tmp_path / "alone") == contents(tmp_path / "fleet")
 
@@ -161,9 +158,7 @@ def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Pat
         bags[name] = tmp_path / name
         bags[name].write_text(name)
     with Manifest(tmp_path / MANIFEST) as manifest:
-        answers = ask(
-            Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest, progress=quiet
-        )
+        answers = ask(Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest)
     assert [a.name for a in answers] == list("abcdef")
     assert [a.name for a in answers if a.reason] == ["c"]
     assert "its worker died" in answers[2].reason
@@ -211,6 +206,6 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
             return f"{bag.name} {name}".encode()
 
     with Manifest(None) as manifest:
-        (answer,) = ask(Name(), bags, Workers(), manifest, progress=quiet)
+        (answer,) = ask(Name(), bags, Workers(), manifest)
     assert isinstance(answer, Answer)
     assert (answer.content, answer.requests, answer.kept) == (b"a.mcap a", 0, False)
