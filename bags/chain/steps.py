@@ -1,6 +1,6 @@
 """The chain's offline steps: each takes files, returns what it made, and writes it whole or not."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -23,10 +23,9 @@ from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
+from nlsid_core.progress import Progress, part
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +113,6 @@ def write_identified(
     return Identified(fit, trials, tuple(written))
 
 
-def part(progress: Progress, start: float, end: float) -> Progress:
-    """Progress of a part of the work that begins at `start` and ends at `end`."""
-    return lambda what, fraction: progress(what, start + (end - start) * fraction)
-
-
 def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> Trials:
     """The trials of the configured signals on the configured grid, by what they are for."""
     responses, excitations = config.signals.response, config.signals.excitation
@@ -133,7 +127,7 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
         hold=config.grid.hold,
         split_gaps=config.grid.split_gaps,
         definitions=read_definitions(config.definitions),
-        progress=lambda done, total: progress("reading bags", done / total),
+        progress=progress,
     )
     labelled = _labelled(dataset, responses, excitations)
     if config.split.share is not None:
@@ -215,9 +209,9 @@ def cut(
             raise DataError(
                 f"{trial.name}: {share:g} of {len(trial.t)} samples, at least 2 of each"
             )
-        for part, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
+        for half, rows in zip(parts, (slice(None, -count), slice(-count, None)), strict=True):
             y, u = trial.y[rows], trial.u[rows]
-            part.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
+            half.append(replace(trial, t=trial.t[: len(y)], y=y, u=u))
     return Trials(
         Dataset(tuple(parts[0])),
         Dataset(tuple(parts[1])),

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -27,6 +27,7 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
 from nlsid_core.files import canonical
+from nlsid_core.progress import Progress, silent
 from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
@@ -282,7 +283,7 @@ def read_dataset(
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = silent,
 ) -> Dataset:
     """The signals (see `bags.signals.expressions`) of several bags, one trajectory a bag.
 
@@ -298,9 +299,8 @@ def read_dataset(
     trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
     are no repeats, and `skipped_samples` counts what is in none of them. definitions: of message
     types that the bags do not define (`bags.recordings.definitions`). executor:
-    reads bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)`
-    is called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectories` and
-    `Dataset` do.
+    reads bags in parallel (threads, processes, a Dask client's executor). progress: called after
+    each bag. Raises BagError and DataError as `read_signals`, `to_trajectories` and `Dataset` do.
     """
     paths = [Path(bag) for bag in bags]
     names = list(map(trial_name, paths))
@@ -323,8 +323,7 @@ def read_dataset(
     found = (map if executor is None else executor.map)(read, paths, names)
     for done, trials in enumerate(found, start=1):
         trajectories += trials
-        if progress is not None:
-            progress(done, len(paths))
+        progress("reading bags", done / len(paths))
     return Dataset(tuple(trajectories))
 
 

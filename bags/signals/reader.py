@@ -11,11 +11,12 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.signals.columns import Columns, Progress, expand_paths, read_columns
+from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.timing import without_duplicates
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 HEADER_STAMP: Final = "header stamp"
 LOG_TIME: Final = "log time"
@@ -55,7 +56,7 @@ def read_signals(
     unfinished: bool = False,
     gaps_in: Sequence[str] = (),
     definitions: Mapping[str, Definition] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Samples]:
     """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
 

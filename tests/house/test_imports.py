@@ -26,7 +26,7 @@ BANDS = {
     "run": {"running"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs", "designs"},
-    "base": {"errors", "arrays", "files", "options"},
+    "base": {"errors", "arrays", "files", "options", "progress"},
     "kernel": {"kernel"},
 }
 BELOW = {
