@@ -346,7 +346,9 @@ def makes_sense(oracle: "Oracle") -> bool:
         and all(len(row) == first + w and sum(row) <= 7 for row in rows)
         and all(type(e) is int and e >= 0 for row in rows for e in row)
         and all(max(row[first:], default=0) <= 1 for row in rows)
-        and all(a < b for span in field["pieces"] for e in span for a, b in pairwise(e["exponents"]))
+        and all(
+            a < b for span in field["pieces"] for e in span for a, b in pairwise(e["exponents"])
+        )
         and all(row[0] in range(n + m) for row in field["valid"])
         and len(limited) <= 3
         and len(set(limited)) == len(limited)
@@ -532,7 +534,7 @@ def holds(oracle: "Oracle", piece: Document, *, rates: bool) -> bool:
 
 
 @lru_cache(maxsize=50_000)
-def _holds(shared: str, stated: str, rates: bool) -> bool:  # noqa: FBT001 - of a cache
+def _holds(shared: str, stated: str, rates: bool) -> bool:
     """`holds`, once for the same piece of the same proof about the same files."""
     oracle, piece = Oracle(*json.loads(shared)), json.loads(stated)
     n = oracle.n
@@ -543,7 +545,7 @@ def _holds(shared: str, stated: str, rates: bool) -> bool:  # noqa: FBT001 - of 
         part = P(n, {tuple(key): value})
         by_power[power_of_s] = by_power.get(power_of_s, P(n)) + part
     c = [by_power.get(i, P(n)) for i in range(max(by_power, default=0) + 1)]
-    stated = degree_of(claimed(piece, Degree(1), [Degree(0)] * n))
+    formal = degree_of(claimed(piece, Degree(1), [Degree(0)] * n))
     witness = {key: piece[key] for key in ("columns", "squares")}
-    left = left_over(c, witness | {"basis": oracle.proof["basis"]}, stated)
+    left = left_over(c, witness | {"basis": oracle.proof["basis"]}, formal)
     return left is not None and left.get((0,) * n, 0) > 0

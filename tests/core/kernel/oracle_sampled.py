@@ -85,7 +85,10 @@ def implicit_next(
 
 def monomial(point: Vector, exponents: list[int]) -> Fraction:
     """Π point^exponents."""
-    return prod((p**e for p, e in zip(point, exponents, strict=True) if e), start=Fraction(1))
+    result = Fraction(1)
+    for p, e in zip(point, exponents, strict=True):
+        result = result * p**e if e else result
+    return result
 
 
 def squares_at(entry: Json, basis: list[list[int]], point: Vector) -> Fraction:
@@ -99,8 +102,10 @@ def squares_at(entry: Json, basis: list[list[int]], point: Vector) -> Fraction:
     weights, total = part.get("weights", [1] * len(factor)), Fraction(0)
     for weight, row in zip(weights, factor, strict=True):
         used = monomials[len(monomials) - len(row) :]
-        total += Fraction(weight) * dot([Fraction(a) for a in row], used) ** 2
-    return total * (Fraction(1, 4) ** part["unit"] / Fraction(part.get("scale", 1)))
+        line = dot([Fraction(a) for a in row], used)
+        total = total + Fraction(weight) * line**2
+    below: Fraction = Fraction(part.get("scale", 1)) * 4 ** part["unit"]
+    return total / below
 
 
 def dot(a: Vector, b: Vector) -> Fraction:
@@ -258,7 +263,7 @@ def makes_sense(model: Json, policy: Json, funnel: Json) -> bool:
         and 1 <= n <= 16
         and 1 <= p <= 16
         and not (implicit and n % 2)
-        and 1 <= N
+        and N >= 1
         and N * n**3 <= 10**6
         and len({tuple(row) for row in rows}) == len(rows) >= 1
         and all(len(row) == n + p for row in rows)
@@ -356,7 +361,7 @@ def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
     model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
     n, implicit, form = len(model["x"]), is_implicit(model), funnel["assumption"]["form"]
     d = n // 2 if implicit else 0
-    y = [P.variable(n + d, i) for i in range(n + d)]
+    y: Any = [P.variable(n + d, i) for i in range(n + d)]
     S, S_next = (fractions(funnel["S"][i]) for i in (k, k + 1))
     T, A = fractions(step["T"]), fractions(funnel["A"][k])
     bound = Fraction(funnel["assumption"]["bound"])
