@@ -161,13 +161,13 @@ Lemma at_row row M z : at_ (row :: M) z = dot (map val row) z :: at_ M z.
 Proof. reflexivity. Qed.
 Lemma at_madd A : forall B q z, dot q (at_ (madd A B) z) = dot q (at_ A z) + dot q (at_ B z).
 Proof.
-  induction A as [|a A IH]; intros [|b B] q z; cbn [madd]; rewrite ?at_row; cbn [at_ vals mul map];
+  induction A as [|a A IH]; intros [|b B] q z; cbn [madd]; rewrite ?at_row; cbn [at_ vals image map];
     rewrite ?dot_nil_r; try ring.
   destruct q as [|q0 q]; cbn [dot]; [ring|]. rewrite dot_vadd, IH. ring.
 Qed.
 Lemma at_vscale c M : forall q z, dot q (at_ (map (vscale c) M) z) = val c * dot q (at_ M z).
 Proof.
-  induction M as [|row M IH]; intros q z; cbn [map]; rewrite ?at_row; cbn [at_ vals mul map];
+  induction M as [|row M IH]; intros q z; cbn [map]; rewrite ?at_row; cbn [at_ vals image map];
     rewrite ?dot_nil_r; [ring|].
   destruct q as [|q0 q]; cbn [dot]; [ring|]. rewrite dot_vscale, IH. ring.
 Qed.

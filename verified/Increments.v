@@ -40,11 +40,11 @@ Proof.
   induction a as [|x a IH]; intros [|w z]; cbn [vscale map dot]; try ring.
   unfold vscale in IH. rewrite val_mul, IH. ring.
 Qed.
-Definition at_ (rows : matrix) (z : list R) : list R := mul (vals rows) z.
+Definition at_ (rows : matrix) (z : list R) : list R := image (vals rows) z.
 Lemma dot_combination a : forall rows z,
   dot (map val (combination a rows)) z = dot (map val a) (at_ rows z).
 Proof.
-  induction a as [|c a IH]; intros [|row rows] z; cbn [combination map dot at_ vals mul]; auto.
+  induction a as [|c a IH]; intros [|row rows] z; cbn [combination map dot at_ vals image]; auto.
   rewrite dot_vadd, dot_vscale, IH. reflexivity.
 Qed.
 Lemma form_outer a : forall b z,
@@ -95,7 +95,7 @@ Lemma dot_zeros k : forall z, dot (map val (repeat nzero k)) z = 0.
 Proof. induction k; intros [|w z]; cbn; auto. rewrite IHk, val_nzero. ring. Qed.
 Lemma at_cons M : forall w z, at_ (map (cons nzero) M) (w :: z) = at_ M z.
 Proof.
-  intros w z. unfold at_, mul, vals. rewrite !map_map. apply map_ext. intros row. cbn.
+  intros w z. unfold at_, image, vals. rewrite !map_map. apply map_ext. intros row. cbn.
   rewrite val_nzero. ring.
 Qed.
 Lemma at_units z : forall k, length z = k -> at_ (units k) z = z.
@@ -126,11 +126,11 @@ Proof.
 Qed.
 Lemma at_short r c M z post : shaped r c M = true -> length z = c -> at_ M (z ++ post) = at_ M z.
 Proof.
-  intros H Hz. apply shaped_is in H as [_ H]. unfold at_, mul, vals. rewrite !map_map.
+  intros H Hz. apply shaped_is in H as [_ H]. unfold at_, image, vals. rewrite !map_map.
   apply map_ext_in. intros row Hr. apply dot_short. rewrite map_length, Hz. now apply H.
 Qed.
 Lemma at_length M z : length (at_ M z) = length M.
-Proof. unfold at_, mul, vals. now rewrite !map_length. Qed.
+Proof. unfold at_, image, vals. now rewrite !map_length. Qed.
 
 (* x'Mx of a block x of z = pre ++ x ++ post *)
 Definition block (k : nat) (scale : num) (M : matrix) : pairs :=
@@ -141,10 +141,10 @@ Proof.
   intros H. destruct (shaped_is _ _ _ H) as [Hl _]. unfold block.
   rewrite (total_zip (pad (length pre)) (fun row => pad (length pre) (vscale c row))).
   transitivity (dot (at_ (units (length M)) (x ++ post)) (map (fun y => val c * y) (at_ M (x ++ post)))).
-  { unfold at_, mul, vals. rewrite !map_map. f_equal; apply map_ext; intros row.
+  { unfold at_, image, vals. rewrite !map_map. f_equal; apply map_ext; intros row.
     - apply dot_pad. - now rewrite dot_pad, dot_vscale. }
   assert (U : at_ (units (length M)) (x ++ post) = at_ (units (length M)) x).
-  { rewrite Hl. clear. unfold at_, mul, vals. rewrite !map_map. apply map_ext_in.
+  { rewrite Hl. clear. unfold at_, image, vals. rewrite !map_map. apply map_ext_in.
     intros row Hr. apply dot_short. rewrite map_length.
     assert (G : forall k row, In row (units k) -> length row = k).
     { clear. induction k as [|k IH]; intros row H; [destruct H|].
@@ -171,7 +171,7 @@ Lemma total_multiplied N E z : total (multiplied N E) z =
   dot (map (fun n => 2 * dot (map val n) z) N) (at_ E z).
 Proof.
   unfold multiplied. rewrite (total_zip (vscale (2%Z, xH)) (fun row => row)).
-  unfold at_, mul, vals. rewrite map_map. f_equal. apply map_ext. intros n.
+  unfold at_, image, vals. rewrite map_map. f_equal. apply map_ext. intros n.
   rewrite dot_vscale. f_equal. unfold val; cbn; field.
 Qed.
 (* N: columns. *)
@@ -245,12 +245,12 @@ Proof.
   set (G := zip (@app num) F L).
   rewrite (total_zip (fun g => g) (fun row => vscale (nopp none) (combination row G))).
   assert (A : map (fun x => dot (map val x) (zeta ++ e)) G = at_ G (zeta ++ e)).
-  { unfold at_, mul, vals. now rewrite map_map. }
+  { unfold at_, image, vals. now rewrite map_map. }
   rewrite A. unfold G at 1. rewrite (at_beside F L k) by (auto; congruence).
   set (a := plus _ _). unfold V. fold (vals P). fold (at_ P a).
   assert (B : map (fun y => dot (map val (vscale (nopp none) (combination y G))) (zeta ++ e)) P
     = map (fun y => - y) (at_ P a)).
-  { unfold at_ at 1, mul, vals. rewrite !map_map. apply map_ext. intros row.
+  { unfold at_ at 1, image, vals. rewrite !map_map. apply map_ext. intros row.
     rewrite dot_vscale, dot_combination, val_opp, val_none. unfold G.
     rewrite (at_beside F L k) by (auto; congruence). fold a. ring. }
   rewrite B. generalize (at_ P a). clear. induction a as [|x a IH]; intros [|y l]; cbn; try ring.

@@ -86,7 +86,7 @@ Proof.
     try discriminate; cbn; auto. cbn in H1, H2. rewrite IH by lia. f_equal. ring.
 Qed.
 Lemma at_firstn k M z : at_ (firstn k M) z = firstn k (at_ M z).
-Proof. unfold at_, mul, vals. now rewrite <- !firstn_map. Qed.
+Proof. unfold at_, image, vals. now rewrite <- !firstn_map. Qed.
 Lemma minus_firstn k : forall a b, minus (firstn k a) (firstn k b) = firstn k (minus a b).
 Proof.
   unfold minus. induction k as [|k IH]; intros [|x a] [|y b]; cbn; auto. now rewrite IH.
@@ -94,7 +94,7 @@ Qed.
 
 (* Two steps under the same inputs. *)
 Section Two.
-Variables (m : model) (d r : list R -> list R) (w x v x' y z u z' q : list R).
+Variables (m : model) (d r w x v x' y z u z' q : list R).
 Hypothesis Hm : model_ok m = true.
 Hypothesis Sx : step m d r x w v x' y.
 Hypothesis Sz : step m d r z w u z' q.
@@ -136,7 +136,7 @@ Proof.
           rewrite U. cbn. lia. }
       assert (E : at_ (units (length a) ++ [repeat nzero (length a)]) (minus zs xs)
         = minus zs xs ++ [0]).
-      { unfold at_, mul, vals. rewrite !map_app. cbn [map]. rewrite dot_zeros. f_equal.
+      { unfold at_, image, vals. rewrite !map_app. cbn [map]. rewrite dot_zeros. f_equal.
         apply at_units. rewrite minus_length; lia. }
       rewrite E. injection Lx as Lx. injection Lz as Lz.
       assert (G : forall (f g : list R) a b, length f = length a -> length g = length b ->
@@ -250,7 +250,7 @@ Proof.
       rewrite at_row in H. cbn [map dot] in H. change (at_ [] _) with (@nil R) in H.
       rewrite dot_minus in H by congruence.
       set (ax := dot (map val a) x) in *. set (az := dot (map val a) z) in *.
-      set (r0 := hd 0 (r w)) in *. cbn [hd] in Hl.
+      set (r0 := hd 0 r) in *. cbn [hd] in Hl.
       assert (Eq : val e1 * (u0 - v0) + val e2 * (u0 ^ 2 - v0 ^ 2) + val e3 * (u0 ^ 3 - v0 ^ 3)
         + (az - ax) = 0) by lra.
       unfold least in H. destruct (fst e3 =? 0)%Z eqn:E3.
@@ -363,7 +363,7 @@ Lemma one_step m d r w x v x' y z u z' q rho P L W e forms proof : model_ok m = 
   on_leaves (leaf_ok m forms) proof (box_of m) = true -> In (decrease m rho P L W) forms ->
   shaped (states m) (states m) P = true -> shaped (length e) (length e) W = true ->
   length L = states m ->
-  V P (minus (plus z' (mul (vals L) e)) x') <= val rho * V P (minus z x) + V W e.
+  V P (minus (plus z' (image (vals L) e)) x') <= val rho * V P (minus z x) + V W e.
 Proof.
   intros Hm Sx Sz Ht Hin HP HW HL.
   pose proof (forms_nonnegative m d r w x v x' y z u z' q Hm Sx Sz forms proof Ht _ e Hin) as Q.
@@ -392,8 +392,8 @@ Proof.
         destruct x, z; cbn in *; lia.
     - rewrite !firstn_length, !app_length. lia.
     - cbn [length] in H1. rewrite map_length in H1. rewrite !app_length. unfold plus.
-      rewrite !zip_length; unfold mul; rewrite ?map_length; lia. }
-  destruct Both as [Lz1 Lx1]. change (mul (vals L) e) with (at_ L e).
+      rewrite !zip_length; unfold image; rewrite ?map_length; lia. }
+  destruct Both as [Lz1 Lx1]. change (image (vals L) e) with (at_ L e).
   rewrite minus_plus_left by (rewrite ?at_length; congruence). lra.
 Qed.
 
@@ -411,20 +411,20 @@ Proof.
   rewrite Hw in Hj.
   assert (Le : forall i, length (e i) = outputs m).
   { intros i. destruct (Sz i) as [z' [q [St [_ [_ L]]]]]. rewrite L.
-    now destruct (difference_of_outputs m d r (w i) (x i) (v i) (x (S i)) (y i) (z i) (u i) z' q Hm (Sx i) St)
+    now destruct (difference_of_outputs m (d i) (r i) (w i) (x i) (v i) (x (S i)) (y i) (z i) (u i) z' q Hm (Sx i) St)
       as [_ [A _]]. }
   assert (Hs : forall i, V (storage t) (minus (z i) (x i)) <= val (fading t) ^ i * val (inlet t) + energy t e i).
   { induction i as [|i IH]; [cbn [pow energy]; lra|]. destruct (Sz i) as [z' [q [St [E _]]]].
-    pose proof (one_step m d r (w i) (x i) (v i) (x (S i)) (y i) (z i) (u i) z' q (fading t) (storage t) (gain t)
+    pose proof (one_step m (d i) (r i) (w i) (x i) (v i) (x (S i)) (y i) (z i) (u i) z' q (fading t) (storage t) (gain t)
       (weight t) (e i) _ proof Hm (Sx i) St Ht (or_introl eq_refl) HP) as A.
     rewrite Le in A. specialize (A HW LL). rewrite E. cbn [energy pow]. unfold vals in A.
     pose proof (Rmult_le_compat_l (val (fading t)) _ _ (Rlt_le _ _ Hr0) IH). lra. }
   destruct (Sz k) as [z' [q [St [_ [M Lm]]]]].
-  pose proof (forms_nonnegative m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q Hm (Sx k) St _ proof Ht) as Q.
-  pose proof (difference_of_outputs m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q Hm (Sx k) St) as [D [Lq Ly]].
-  pose proof (sizes m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as [Lx [Lz [Lv Lu]]].
-  pose proof (zeta_length m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as Lzeta.
-  pose proof (split_zeta m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as Split.
+  pose proof (forms_nonnegative m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q Hm (Sx k) St _ proof Ht) as Q.
+  pose proof (difference_of_outputs m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q Hm (Sx k) St) as [D [Lq Ly]].
+  pose proof (sizes m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as [Lx [Lz [Lv Lu]]].
+  pose proof (zeta_length m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as Lzeta.
+  pose proof (split_zeta m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) z' q (Sx k) St) as Split.
   set (zeta := difference (u k) (v k) (z k) (x k)) in *.
   pose proof Hm as Hm'. unfold model_ok in Hm'. apply andb_prop in Hm' as [_ B].
   apply andb_prop in B as [B _]. destruct (shaped_is _ _ _ B) as [LH RH].
@@ -490,6 +490,17 @@ Proof.
   rewrite <- sqrt_Rsqr_abs. apply sqrt_le_1_alt. unfold Rsqr. exact H.
 Qed.
 
+Definition tubes_ok (m : model) (ts : list tube) (proofs : list tree) : bool :=
+  andb (Nat.eqb (length ts) (length proofs)) (forallb (fun e => tube_ok m (fst e) (snd e)) (combine ts proofs)).
+Theorem tubes_proved m ts proofs : tubes_ok m ts proofs = true -> Forall (stays_near m) ts.
+Proof.
+  unfold tubes_ok. intros H. apply andb_prop in H as [L H]. apply Nat.eqb_eq in L. revert proofs L H.
+  induction ts as [|t ts IH]; intros [|p proofs] L H; try discriminate; constructor;
+    cbn in H; apply andb_prop in H as [H1 H2].
+  - exact (tube_proved m t p H1).
+  - apply (IH proofs); auto.
+Qed.
+
 (* Stability is a tube's decrease without innovations. *)
 Definition stability_ok (m : model) (P : matrix) (rate : num) (proof : tree) : bool :=
   andb (andb (andb (model_ok m) (definite (states m) P))
@@ -500,16 +511,16 @@ Proof.
   unfold stability_ok. intros H d r w x v y z u q Sx Sz k. apply andb_prop in H as [H1 H2].
   apply andb_prop in H1 as [H1 Ht]. apply andb_prop in H1 as [Hm HP]. apply definite_shaped in HP.
   induction k as [|k IH]; [cbn [pow]; lra|].
-  pose proof (one_step m d r (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) (z (S k)) (q k)
+  pose proof (one_step m (d k) (r k) (w k) (x k) (v k) (x (S k)) (y k) (z k) (u k) (z (S k)) (q k)
     (nmul rate rate) P (repeat [] (states m)) [] [] _ proof Hm (Sx k) (Sz k) Ht (or_introl eq_refl)
     HP eq_refl (repeat_length _ _)) as A.
   rewrite val_mul in A.
-  assert (E : plus (z (S k)) (mul (vals (repeat [] (states m))) []) = z (S k)).
-  { pose proof (sizes m d r (w (S k)) (x (S k)) (v (S k)) (x (S (S k))) (y (S k)) (z (S k)) (u (S k))
+  assert (E : plus (z (S k)) (image (vals (repeat [] (states m))) []) = z (S k)).
+  { pose proof (sizes m (d (S k)) (r (S k)) (w (S k)) (x (S k)) (v (S k)) (x (S (S k))) (y (S k)) (z (S k)) (u (S k))
       (z (S (S k))) (q (S k)) (Sx (S k)) (Sz (S k))) as [_ [Lz _]].
     rewrite <- Lz. unfold plus. generalize (z (S k)). clear.
     induction l as [|a l IH]; [reflexivity|]. cbn [length repeat].
-    change (a + 0 :: zip Rplus l (mul (vals (repeat [] (length l))) []) = a :: l).
+    change (a + 0 :: zip Rplus l (image (vals (repeat [] (length l))) []) = a :: l).
     rewrite IH. f_equal. ring. }
   assert (Z0 : V [] [] = 0) by reflexivity. rewrite E, Z0 in A.
   replace (val rate * val rate) with (val rate ^ 2) in A by ring.

@@ -6,18 +6,19 @@ Import ListNotations.
 Open Scope R_scope.
 
 Definition matrix := list (list num).
-Definition mul (M : list (list R)) (z : list R) : list R := map (fun row => dot row z) M.
+Definition image (M : list (list R)) (z : list R) : list R := map (fun row => dot row z) M.
 Definition plus (a b : list R) : list R := zip Rplus a b.
 Definition minus (a b : list R) : list R := zip Rminus a b.
 (* x'Px *)
-Definition V (P : matrix) (x : list R) : R := dot x (mul (map (map val) P) x).
+Definition V (P : matrix) (x : list R) : R := dot x (image (map (map val) P) x).
 
 (* [Linear a]: y = x_1 + d, x_i+ = a_i y + x_(i+1) + r_i.
    [Affine p n scale range terms]: 0 = (sum of w^e C over the terms (e, C)) [v; x] + r, x+ = the
    first n entries of [v; x], y_j = scale_j v_j + d_j; v has p entries, x n, and w is in its range.
    [Monotone e1 e2 e3 a shift]: 0 = e1 v + e2 v^2 + e3 v^3 + a'x + r_0, x+ = [v; shift x + r],
    y = v + d.
-   What depends on the inputs alone, d and r, may be anything: it is the same for two solutions. *)
+   What depends on the inputs alone, d and r, may be anything, another at each time: it is the same
+   for two solutions. *)
 Inductive model :=
 | Linear (a : list num)
 | Affine (p n : nat) (scale : list num) (range : list (num * num))
@@ -31,34 +32,34 @@ Fixpoint weighted (terms : list (list nat * matrix)) (w z : list R) (row : nat) 
   end.
 
 (* From the state x under the inputs w the model may give v, x' and y. *)
-Definition step (m : model) (d r : list R -> list R) (x w v x' y : list R) : Prop :=
+Definition step (m : model) (d r x w v x' y : list R) : Prop :=
   match m with
   | Linear a =>
-      v = [] /\ length x = length a /\ length (r w) = length a /\
-      y = [hd 0 x + hd 0 (d w)] /\
-      x' = plus (plus (map (fun c => val c * hd 0 y) a) (tl x ++ [0])) (r w)
+      v = [] /\ length x = length a /\ length r = length a /\
+      y = [hd 0 x + hd 0 d] /\
+      x' = plus (plus (map (fun c => val c * hd 0 y) a) (tl x ++ [0])) r
   | Affine p n scale range terms =>
-      length v = p /\ length x = n /\ length (d w) = p /\ in_box w range /\
-      (forall i, (i < p)%nat -> weighted terms w (v ++ x) i + nth i (r w) 0 = 0) /\
-      x' = firstn n (v ++ x) /\ y = plus (zip Rmult (map val scale) v) (d w)
+      length v = p /\ length x = n /\ length d = p /\ in_box w range /\
+      (forall i, (i < p)%nat -> weighted terms w (v ++ x) i + nth i r 0 = 0) /\
+      x' = firstn n (v ++ x) /\ y = plus (zip Rmult (map val scale) v) d
   | Monotone e1 e2 e3 a shift =>
-      length v = 1%nat /\ length x = length a /\ length (tl (r w)) = length shift /\
+      length v = 1%nat /\ length x = length a /\ length (tl r) = length shift /\
       (let u := hd 0 v in
-       val e1 * u + val e2 * u ^ 2 + val e3 * u ^ 3 + dot (map val a) x + hd 0 (r w) = 0) /\
-      x' = v ++ plus (mul (map (map val) shift) x) (tl (r w)) /\ y = [hd 0 v + hd 0 (d w)]
+       val e1 * u + val e2 * u ^ 2 + val e3 * u ^ 3 + dot (map val a) x + hd 0 r = 0) /\
+      x' = v ++ plus (image (map (map val) shift) x) (tl r) /\ y = [hd 0 v + hd 0 d]
   end.
 
 (* The simulation x, and the observer z beside it, under the same inputs w: after the model's own
    step, the innovation e_k = measured_k - (the observer's output) is injected. Where there was no
    measurement, e_k = 0 and measured_k is that output. *)
 Record run (m : model) (L : matrix) := Run {
-  d : list R -> list R; r : list R -> list R; w : nat -> list R;
+  d : nat -> list R; r : nat -> list R; w : nat -> list R;
   x : nat -> list R; v : nat -> list R; y : nat -> list R;
   z : nat -> list R; vz : nat -> list R; e : nat -> list R;
   measured : nat -> list R;
-  simulation : forall k, step m d r (x k) (w k) (v k) (x (S k)) (y k);
-  observer : forall k, exists z' yz, step m d r (z k) (w k) (vz k) z' yz /\
-    z (S k) = plus z' (mul (map (map val) L) (e k)) /\
+  simulation : forall k, step m (d k) (r k) (x k) (w k) (v k) (x (S k)) (y k);
+  observer : forall k, exists z' yz, step m (d k) (r k) (z k) (w k) (vz k) z' yz /\
+    z (S k) = plus z' (image (map (map val) L) (e k)) /\
     measured k = plus yz (e k) /\ length (e k) = length yz }.
 Arguments w {m L}. Arguments x {m L}. Arguments y {m L}. Arguments z {m L}. Arguments e {m L}.
 Arguments measured {m L}.
@@ -82,7 +83,7 @@ Definition stays_near (m : model) (t : tube) : Prop :=
 
 (* Two solutions under the same inputs. *)
 Definition forgets (m : model) (P : matrix) (rate : num) : Prop :=
-  forall d r (w x v y z u q : nat -> list R),
-  (forall k, step m d r (x k) (w k) (v k) (x (S k)) (y k)) ->
-  (forall k, step m d r (z k) (w k) (u k) (z (S k)) (q k)) ->
+  forall d r w x v y z u q : nat -> list R,
+  (forall k, step m (d k) (r k) (x k) (w k) (v k) (x (S k)) (y k)) ->
+  (forall k, step m (d k) (r k) (z k) (w k) (u k) (z (S k)) (q k)) ->
   forall k, V P (minus (z k) (x k)) <= (val rate ^ 2) ^ k * V P (minus (z O) (x O)).
