@@ -9,7 +9,7 @@ Names, types, defaults and limits are those of the dataclasses in `nlsid_core.id
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from itertools import product
 from typing import Annotated, Any, get_type_hints
@@ -24,6 +24,7 @@ from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
     BlockCascadeClass,
+    CellClass,
     Fit,
     ImplicitClass,
     LinearClass,
@@ -37,11 +38,13 @@ from nlsid_core.identification import (
     methods_of,
 )
 from nlsid_core.identification.methods import alike
+from nlsid_core.progress import Progress, silent
 
 CLASSES: dict[str, type] = {
     "linear": LinearClass,
     "state_affine": StateAffineClass,
     "block_cascade": BlockCascadeClass,
+    "cells": CellClass,
     "monotone": MonotoneClass,
     "implicit": ImplicitClass,
     "linear_states": LinearStateClass,
@@ -52,8 +55,6 @@ OWN = {  # of every section
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
     "allow_unproved": bool,
 }
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ class IdentificationConfig:
         *,
         validation: Dataset | None = None,
         test: Dataset | None = None,
-        progress: Progress | None = None,
+        progress: Progress = silent,
     ) -> Fit[Model]:
         """`nlsid_core.identification.identify` with these options."""
         return identify(

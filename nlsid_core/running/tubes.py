@@ -123,8 +123,13 @@ class TubeRun:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
 
-    def missing(self, t: float, reason: str) -> Reading:
-        """The reading at t (s) where no sample came; the run goes on with the next one."""
+    def missing(self, t: float, reason: str, *, doubted: bool = False) -> Reading:
+        """The reading at t (s) where no sample came; the run goes on with the next one.
+
+        doubted: the last sample may not be the robot's: a new run starts.
+        """
+        if doubted:
+            self._begin(reason)
         return Reading(t, Status.UNKNOWN, reason=reason)
 
     def _take(self, t: float) -> str:

@@ -187,7 +187,7 @@ def test_an_array_of_another_length_is_named_and_a_new_run_starts(
     def hear(message: DiagnosticArray) -> None:
         said.extend(status.message for status in message.status)
 
-    design = timing_funnel()
+    design = timing_funnel(1000)
     with (
         node_here("test_joints") as (node, spin_until),
         process(MONITOR, source="/benchmark", stale_after=5.0, allow_old_stamps=True) as monitor,

@@ -129,6 +129,12 @@ def test_two_values_at_one_stamp_are_named(watched: Callable[..., Robot]) -> Non
     robot.spin_until(lambda: robot.has_said("inside"))
     robot.drive([GOOD[-1]], speed=0.001)
     robot.spin_until(lambda: robot.has_said("unknown: speed has two values at one stamp"))
+    robot.said.clear()
+    for k in range(GOOD[-1] + 1, GOOD[-1] + 8):
+        robot.drive([k])
+        robot.drive([k], speed=0.001)
+    waits(robot, 2.0)
+    assert not robot.has_said("inside"), "nobody knows which of the two is the robot"
 
 
 def test_the_right_type_is_taken_after_a_wrong_one(watched: Callable[..., Robot]) -> None:
