@@ -36,7 +36,6 @@ LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
 FEW_LAGS: Final = (1, 2, 3)  # tried with several signals, the inputs at all delays or at one,
 DEGREES: Final = (1, 2, 3, 4)  # with these degrees in the inputs
 MOST_TERMS: Final = 150  # of a polynomial in the inputs that is tried
-CALIBRATED_FROM: Final = 3  # bags besides the test's: every second of them scales the tube
 TRIED_ITERATIONS: Final = 8  # of the robust simulation error, enough to tell lags apart
 LAGS_BETTER: Final = 0.98  # of the error that more lags have to reach
 ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they come
@@ -403,15 +402,6 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
     elif len(names) > 1:
         proposal.content["split"] = {"test": names[-1:]}
         proposal.why["test"] = f"the last of {len(names)} bags"
-    if len(names) > 1:
-        split = proposal.content["split"]
-        others = [name for name in names if name not in split["test"]]
-        if len(others) >= CALIBRATED_FROM:
-            split["calibration"] = others[1::2]
-            proposal.why["calibration"] = (
-                "every second of the others: a trial like them is flagged with a probability of "
-                f"at most 1/{len(others) // 2 + 1} at safety_factor 1"
-            )
     else:
         proposal.content["split"] = {"share": SHARE}
         proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
