@@ -3,7 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-__all__ = ["dart", "f1tenth", "schunk"]
+__all__ = ["dart", "dart_tables", "f1tenth", "schunk"]
 
 
 def dart(floor: str = "*") -> list[Path]:
@@ -13,6 +13,11 @@ def dart(floor: str = "*") -> list[Path]:
     """
     folder = Path(str(files("bags.samples"))) / "dart"
     return sorted(folder.glob(f"{floor}_20*"))
+
+
+def dart_tables() -> Path:
+    """Archive (tar, xz) of 17 of the DART car's drives as its makers' thinned CSV files."""
+    return Path(str(files("bags.samples"))) / "dart" / "tables.tar.xz"
 
 
 def f1tenth() -> list[Path]:
