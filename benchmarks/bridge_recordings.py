@@ -29,6 +29,7 @@ from bags.chain.tracking_config import TrackingConfig
 from bags.designs import documents
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import NlsidError
+from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 
 TRIALS = 30  # of Schunk's 100: 20 to fit, 5 to choose the degrees, 5 to commission
@@ -101,7 +102,7 @@ def attempt(
         tracking_steps.plan_tracking(out / documents.MODEL, config, out)
         stage = STAGES[2]
         tracking_steps.design_tracking_funnel(
-            out, bags[fitted + validating :], config, progress=lambda _what, _done: None
+            out, bags[fitted + validating :], config, progress=silent
         )
         verdict = check(out / documents.FUNNEL_PROOF)
     except NlsidError as refusal:

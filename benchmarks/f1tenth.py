@@ -35,6 +35,7 @@ from nlsid_core.identification.moment_rie import minimise_moment_rie
 from nlsid_core.identification.moments import MonotoneClass, offsets_of, plain_moments
 from nlsid_core.identification.monotone import identify_from_repeats
 from nlsid_core.identification.repeats import compare_repeats
+from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 from nlsid_core.running.reading import Status
 
@@ -48,7 +49,7 @@ def measure() -> dict[str, float | int | bool]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         started = time.perf_counter()
-        result = identify_bags(bags, config, out, progress=lambda _what, _fraction: None)
+        result = identify_bags(bags, config, out, progress=silent)
         identify_seconds = time.perf_counter() - started
         design_funnel_files(out / documents.MODEL, config, out)
         proofs = [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]

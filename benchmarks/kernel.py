@@ -29,6 +29,7 @@ from examples import cart_pole, planar_quadrotor, quadrotor, satellite_funnel
 from nlsid_core import kernel
 from nlsid_core.design import design_funnel
 from nlsid_core.kernel.checking import KINDS
+from nlsid_core.progress import silent
 
 FOLDER = Path(kernel.__file__).parent
 REPEATS = 3
@@ -100,7 +101,7 @@ def times(folder: Path) -> dict[str, Any]:
         sizes[name], margins[name] = proof.stat().st_size / 1e6, float(verdict.margin)
     out = folder / "f1tenth"
     config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     proofs = [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
     result["f1tenth_s"] = sum(_checked(proof)[0] for proof in proofs)

@@ -1,12 +1,13 @@
 """The monitor: time of an update alone, and margins at 1 kHz over DDS between processes.
 
-python -m benchmarks.monitor [--seconds 60] [--json]
+python -m benchmarks.monitor [--seconds 60] [--rate 1000] [--json]
 
 Latency is from the sending of a sample, whose stamp is on an exact grid, to its margin's arrival at
 a third process. Beside it, in the same run: a node of nothing but rclpy that answers each sample
 with a message of the margin's size. On a busy machine both wait for a processor; their ratio and
 the processor time per sample do not; `chrt -f 10 python -m benchmarks.monitor` gives all of them
-the priority that a robot gives them. The monitor runs on a funnel made for timing.
+the priority that a robot gives them. The monitor runs on a funnel made for timing. `grown_mb` is
+by how much its memory grew from the first second of the samples to the last.
 """
 
 import os
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -38,7 +40,7 @@ from bags.designs.documents import FUNNEL
 from bags.samples import f1tenth
 from bags.signals.grid import read_dataset
 from benchmarks.machine import describe, peers
-from benchmarks.processes import cpu_seconds, isolate, node, python
+from benchmarks.processes import cpu_seconds, isolate, node, python, resident_mb
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTubeDesign, design_output_tube
@@ -52,7 +54,6 @@ from nlsid_ros.lane import Lane
 from nlsid_ros.messages import stamp_ns_of
 
 LAGS, FUNNELS, ROUNDS = 6, 10, 40
-RATE = 1000  # Hz
 SOURCE, MARGIN, ECHO = "/benchmark", "/funnel_monitor/margin", "/benchmark/echo"
 STATE, COMMAND = "/benchmark/state:position[0]", "/benchmark/command:position[0]"
 OUTSIDE, OUT = 100.0, 100  # a response no funnel holds, and how many of them end a run
@@ -64,6 +65,7 @@ ASKED = {
     "missed": 0.0,
     "latency_ms_p99": 1.0,
     "error_ms": 5.0,
+    "grown_mb": 1.0,
 }
 
 
@@ -97,9 +99,9 @@ def updates() -> dict[str, float]:
     return result
 
 
-def timing_funnel() -> OutputTubeDesign:
-    """A model sampled at 1 kHz and a funnel that lasts for ever; for timing only."""
-    period, samples = 1.0 / RATE, 200
+def timing_funnel(rate: int) -> OutputTubeDesign:
+    """A model sampled at `rate` Hz and a funnel that lasts for ever; for timing only."""
+    period, samples = 1.0 / rate, 200
     rng = np.random.default_rng(1)
     a, b = np.array([1.9, -0.905]), np.array([0.0, 0.003, 0.002])
     blank = DifferenceEquation(
@@ -151,8 +153,8 @@ class Ear(Node):
                 self.error_ns = time.time_ns()
 
 
-def send(seconds: float) -> None:
-    """Publish command and response at 1 kHz, the last OUT responses outside; print the stamps."""
+def send(seconds: float, rate: int) -> None:
+    """Publish command and response at `rate` Hz, the last OUT responses outside; print stamps."""
     rclpy.init()
     sender = Node("sender")
     state = sender.create_publisher(JointState, STATE.partition(":")[0], qos.STREAM)
@@ -160,13 +162,13 @@ def send(seconds: float) -> None:
     while state.get_subscription_count() < 1:
         time.sleep(0.01)
     time.sleep(0.5)
-    count, message = round(seconds * RATE), JointState(position=[0.0])
+    count, message = round(seconds * rate), JointState(position=[0.0])
     sent, start, start_ns = [], time.perf_counter(), time.time_ns()
     for k in range(count):
-        while (ahead := start + k / RATE - time.perf_counter()) > 0:
+        while (ahead := start + k / rate - time.perf_counter()) > 0:
             time.sleep(max(ahead - 1e-4, 0.0))
         stamp = message.header.stamp
-        stamp.sec, stamp.nanosec = divmod(start_ns + k * 10**9 // RATE, 10**9)
+        stamp.sec, stamp.nanosec = divmod(start_ns + k * 10**9 // rate, 10**9)
         sent.append(time.time_ns())
         message.position[0] = 0.0
         command.publish(message)
@@ -195,27 +197,30 @@ def echo() -> None:
         rclpy.spin(relay)
 
 
-def live(seconds: float) -> dict[str, float]:
+def live(seconds: float, rate: int) -> dict[str, float]:
     """Missed samples, latency from stamp to margin, and time to ERROR, between processes."""
     isolate()
     rclpy.init()
-    ear = Ear(timing_funnel())
+    ear = Ear(timing_funnel(rate))
     executor = SingleThreadedExecutor()
     executor.add_node(ear)
     with python(*node("funnel_monitor", source=SOURCE)) as monitor:
         while not ear.ready:
             executor.spin_once(timeout_sec=0.1)
         before = cpu_seconds(monitor.pid)
-        sent, start_ns = _run(executor, seconds)
+        resident: list[float] = []
+        sent, start_ns = _run(
+            executor, seconds, rate, lambda: resident.append(resident_mb(monitor.pid))
+        )
         cpu = cpu_seconds(monitor.pid) - before
     error_ms = (ear.error_ns - sent[-OUT]) / 1e6
-    latencies = _latencies(ear.margins, sent, start_ns)
+    latencies = _latencies(ear.margins, sent, start_ns, rate)
     with python("benchmarks.monitor", "--echo") as relay:
         _until_there(ear, executor)
         before = cpu_seconds(relay.pid)
-        sent_alone, start_alone_ns = _run(executor, min(seconds, 20.0))
+        sent_alone, start_alone_ns = _run(executor, min(seconds, 20.0), rate)
         cpu_alone = cpu_seconds(relay.pid) - before
-    alone = _latencies(ear.echoes, sent_alone, start_alone_ns)
+    alone = _latencies(ear.echoes, sent_alone, start_alone_ns, rate)
     ear.destroy_node()
     rclpy.shutdown()
     result = {"sent": float(len(sent)), "missed": float(len(sent) - len(latencies))}
@@ -227,6 +232,7 @@ def live(seconds: float) -> dict[str, float]:
         ratio = result[f"latency_ms_p{percent}"] / result[f"rclpy_alone_ms_p{percent}"]
         result[f"ratio_p{percent}"] = ratio
     result["error_ms"] = error_ms
+    result["grown_mb"] = resident[-1] - resident[min(2, len(resident) - 1)]
     result["cpu_us_per_sample"] = 1e6 * cpu / len(sent)
     result["rclpy_alone_cpu_us_per_sample"] = 1e6 * cpu_alone / len(sent_alone)
     return result
@@ -237,23 +243,33 @@ def _until_there(ear: Ear, executor: SingleThreadedExecutor) -> None:
         executor.spin_once(timeout_sec=0.1)
 
 
-def _run(executor: SingleThreadedExecutor, seconds: float) -> tuple[list[int], int]:
+def _run(
+    executor: SingleThreadedExecutor,
+    seconds: float,
+    rate: int,
+    every_second: Callable[[], None] = lambda: None,
+) -> tuple[list[int], int]:
     """When each sample was sent, and the stamp of the first (ns), from a process that sends."""
-    command = [sys.executable, "-m", "benchmarks.monitor", "--send", str(seconds)]
+    asked = ["--send", str(seconds), "--rate", str(rate)]
+    command = [sys.executable, "-m", "benchmarks.monitor", *asked]
     sender = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     heard: list[str] = []
     reader = threading.Thread(target=lambda: heard.extend(sender.stdout or ()))
     reader.start()
+    due = time.monotonic()
     while reader.is_alive():
+        if time.monotonic() >= due:
+            every_second()
+            due += 1.0
         executor.spin_once(timeout_sec=0.1)
     sender.wait()
     said = json.loads(heard[-1])
     return said["sent_ns"], said["start_ns"]
 
 
-def _latencies(arrivals: dict[int, int], sent: list[int], start_ns: int) -> FloatArray:
+def _latencies(arrivals: dict[int, int], sent: list[int], start_ns: int, rate: int) -> FloatArray:
     """ms from sending to arrival of every sample that arrived."""
-    stamps = (start_ns + k * 10**9 // RATE for k in range(len(sent)))
+    stamps = (start_ns + k * 10**9 // rate for k in range(len(sent)))
     ways = [
         arrivals[stamp] - at for stamp, at in zip(stamps, sent, strict=True) if stamp in arrivals
     ]
@@ -264,17 +280,18 @@ def main() -> None:
     """Print the table; with --json the last line is one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate", type=int, default=1000, help="Hz")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
     parser.add_argument("--echo", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.send:
-        send(options.send)
+        send(options.send, options.rate)
         return
     if options.echo:
         echo()
         return
-    result = updates() | live(options.seconds)
+    result = updates() | live(options.seconds, options.rate)
     print(f"{describe()}\n{'':24} {'reached':>10} {'asked':>10}")
     for key, value in result.items():
         asked = f"{ASKED[key]:10.4g}" if key in ASKED else ""

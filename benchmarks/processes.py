@@ -8,7 +8,7 @@ from pathlib import Path
 from nlsid_ros import processes
 from nlsid_ros.processes import isolate
 
-__all__ = ["cpu_seconds", "isolate", "node", "python"]
+__all__ = ["cpu_seconds", "isolate", "node", "python", "resident_mb"]
 
 
 def python(module: str, *arguments: str) -> AbstractContextManager[subprocess.Popen[bytes]]:
@@ -25,3 +25,9 @@ def cpu_seconds(pid: int) -> float:
     """User and system time of a process so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def resident_mb(pid: int) -> float:
+    """Memory of a process that is in use now, in MB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

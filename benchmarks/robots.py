@@ -42,6 +42,7 @@ from bags.tools.importing import import_tables
 from benchmarks.cache import cache_folder
 from benchmarks.machine import describe
 from nlsid_core.errors import NlsidError
+from nlsid_core.progress import silent
 from nlsid_core.running.reading import Status
 
 JOINTS = "sensor_msgs/msg/JointState"
@@ -232,7 +233,7 @@ def measure(robot: Robot, data: Path, *, cache: Path) -> dict[str, Any]:
                 s.path for s in (*config.signals.response, *config.signals.excitation)
             ]
             step = "identify"
-            fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
+            fit = identify_bags(bags, config, out, progress=silent)
             row["test_error"] = fit.fit.errors["test"][fit.fit.chosen.method.name]
             step = "funnel"
             design = design_funnel_files(out / documents.MODEL, config, out)
@@ -302,7 +303,7 @@ def floors(robot: Robot, bags: list[Path], folder: Path, cache: Path) -> dict[st
         config = Config.model_validate(content)
         with tempfile.TemporaryDirectory() as name:
             out = Path(name)
-            fit = identify_bags(bags, config, out, progress=lambda _what, _part: None)
+            fit = identify_bags(bags, config, out, progress=silent)
             errors.append(fit.fit.errors["test"][fit.fit.chosen.method.name])
             made = design_funnel_files(out / documents.MODEL, config, out)
             catching = what_a_funnel_catches(out / documents.MODEL, config, made)

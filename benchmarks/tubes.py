@@ -49,6 +49,7 @@ from nlsid_core.identification import (
     StateAffineClass,
     identify,
 )
+from nlsid_core.progress import silent
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 
@@ -88,9 +89,7 @@ def f1tenth_case(model_class: Any) -> Case:
     """Commanded to measured speed: the test trials of the shipped configuration are judged."""
     config = load_config(config_file("f1tenth.yaml"))
     plain = config.split.model_copy(update={"calibration": ()})
-    trials = read_trials(
-        f1tenth(), config.model_copy(update={"split": plain}), progress=lambda _w, _f: None
-    )
+    trials = read_trials(f1tenth(), config.model_copy(update={"split": plain}), progress=silent)
     recorded = trials.train.trajectories
     train, calibration = Dataset(recorded[::2]), Dataset(recorded[1::2])
     return Case(model_class, train, calibration, trials.test, 114)

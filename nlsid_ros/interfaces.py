@@ -23,6 +23,7 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
 from nlsid_core.errors import NlsidError
+from nlsid_core.progress import silent
 from nlsid_ros.bag_player import BagPlayer
 from nlsid_ros.excitation import Excitation
 from nlsid_ros.funnel_monitor import FunnelMonitor
@@ -100,7 +101,7 @@ def example_nodes(folder: Path) -> list[tuple[str, Callable[[], ManagedNode], di
     """(name, maker, parameters) of the nodes the page is about, on a funnel made in `folder`."""
     config_path = config_file("f1tenth.yaml")
     config = load_config(config_path)
-    identify_bags(f1tenth(), config, folder, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, folder, progress=silent)
     design_funnel_files(folder / documents.MODEL, config, folder)
     bags = [str(f1tenth()[0])]
     return [

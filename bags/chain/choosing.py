@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bags.chain.config import Config
 from bags.chain.identification_config import IdentificationConfig
-from bags.chain.steps import Identified, Progress, Trials, part, read_trials, write_identified
+from bags.chain.steps import Identified, Trials, read_trials, write_identified
 from bags.designs import documents
 from bags.pictures.choices import Scored, draw_comparison, draw_selection
 from bags.pictures.report import report_available
@@ -15,6 +15,7 @@ from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.files import write_atomically
 from nlsid_core.identification import Fit, Model, Selection, describe, identify, select
 from nlsid_core.identification.prediction import history
+from nlsid_core.progress import Progress, part
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ Names, types, defaults and limits are those of the dataclasses in `nlsid_core.id
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from itertools import product
 from typing import Annotated, Any, get_type_hints
@@ -37,6 +37,7 @@ from nlsid_core.identification import (
     methods_of,
 )
 from nlsid_core.identification.methods import alike
+from nlsid_core.progress import Progress, silent
 
 CLASSES: dict[str, type] = {
     "linear": LinearClass,
@@ -52,8 +53,6 @@ OWN = {  # of every section
     "max_rate": Annotated[float, Field(gt=0.0, lt=1.0)],
     "allow_unproved": bool,
 }
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +78,7 @@ class IdentificationConfig:
         *,
         validation: Dataset | None = None,
         test: Dataset | None = None,
-        progress: Progress | None = None,
+        progress: Progress = silent,
     ) -> Fit[Model]:
         """`nlsid_core.identification.identify` with these options."""
         return identify(

@@ -9,9 +9,9 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
-from nlsid_core.design.continuous.sweep import Progress
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.errors import DocumentError
+from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
 MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "nominal", "goal",
@@ -90,7 +90,7 @@ class FunnelProblem:
             _limits(document, source),
         )
 
-    def design(self, progress: Progress | None = None) -> FunnelDesign:
+    def design(self, progress: Progress = silent) -> FunnelDesign:
         """Solve it; OptionError, DataError and Infeasible as `nlsid_core.design.design`."""
         problem = ContinuousTracking(
             self.field,

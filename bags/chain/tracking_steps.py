@@ -1,7 +1,7 @@
 """The steps of `nlsid track`: each takes files, returns what it made, writes it whole or not."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +28,9 @@ from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.progress import Progress
 from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Reading
-
-Progress = Callable[[str, float], None]
 
 
 def read_states(bags: Sequence[Path], config: TrackingConfig) -> Dataset:

@@ -4,17 +4,14 @@ A command imports what it runs when it is called.
 """
 
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
+from bags.commands.progress import progress_bar
 from nlsid_core.errors import BagError, DataError
 
 if TYPE_CHECKING:
@@ -102,7 +99,7 @@ def info(
     from bags.tools.info import bag_info
 
     for path in expand_bags(bags):
-        with _progress("reading") as progress:
+        with progress_bar("reading", after=PROGRESS_AFTER) as progress:
             found = bag_info(path, definitions=_definitions(definitions), progress=progress)
         if as_json:
             typer.echo(bag_show.info_json(found))
@@ -124,7 +121,7 @@ def signals(
 
     with (
         Bag(bag, unfinished=True, definitions=_definitions(definitions)) as source,
-        _progress("reading") as progress,
+        progress_bar("reading", after=PROGRESS_AFTER) as progress,
     ):
         found = bag_signals(source, progress=progress)
     if as_json:
@@ -150,7 +147,7 @@ def plot(
         raise BagError("drawing needs matplotlib: pip install 'nlsid[report]'")
     from bags.pictures.signal_plots import draw_signals, write_picture
 
-    with _progress("reading") as progress:
+    with progress_bar("reading", after=PROGRESS_AFTER) as progress:
         samples = read_signals(
             bag,
             signals,
@@ -204,7 +201,7 @@ def recover_command(bag: BagArgument, bag_out: OutOption) -> None:
     """
     from bags.tools.recover import recover
 
-    with _progress("recovering") as progress:
+    with progress_bar("recovering", after=PROGRESS_AFTER) as progress:
         found = recover(bag, bag_out, progress=progress)
     for topic, count in found.counts.items():
         out.print(f"{count:9d} messages on {topic}", soft_wrap=True, markup=False)
@@ -248,7 +245,7 @@ def export_command(
     from bags.tools import export
 
     if period is None:
-        with _progress("exporting") as progress:
+        with progress_bar("exporting", after=PROGRESS_AFTER) as progress:
             rows = export.export_topics(
                 bag,
                 target,
@@ -296,7 +293,7 @@ def cut(
     """Copy a stretch of time, or some topics, to a new bag."""
     from bags.tools import edit
 
-    with _progress("copying") as progress:
+    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
         count = edit.cut(
             bag,
             bag_out,
@@ -316,7 +313,7 @@ def merge(bags: BagsArgument, bag_out: OutOption) -> None:
     from bags.recordings.folders import expand_bags
     from bags.tools import edit
 
-    with _progress("copying") as progress:
+    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
         count = edit.merge(expand_bags(bags), bag_out, progress=progress)
     out.print(f"wrote {bag_out}, {count} messages", soft_wrap=True, markup=False)
 
@@ -333,7 +330,7 @@ def split(
     """Copy a bag in parts: at the repeats of an excitation, or every so many seconds."""
     from bags.tools import edit
 
-    with _progress("copying") as progress:
+    with progress_bar("copying", after=PROGRESS_AFTER) as progress:
         parts = edit.split(bag, bag_out, repeats=repeats, every=every, progress=progress)
     for part in parts:
         out.print(f"wrote {part}", soft_wrap=True, markup=False)
@@ -402,24 +399,3 @@ def _clock(clock: Clock | None) -> str | None:
     from bags.signals.reader import CLOCKS
 
     return None if clock is None else next(name for name in CLOCKS if name.startswith(clock.value))
-
-
-@contextmanager
-def _progress(task: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar that appears after PROGRESS_AFTER s, and only where someone is watching."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    started = time.monotonic()
-    columns = (TextColumn(escape(task)), BarColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=err, transient=True, disable=not sys.stderr.isatty())
-    identifier = bar.add_task(task, total=None)
-
-    def show(done: int, total: int) -> None:
-        if time.monotonic() - started > PROGRESS_AFTER:
-            bar.start()
-            bar.update(identifier, completed=done, total=total)
-
-    try:
-        yield show
-    finally:
-        bar.stop()

@@ -15,6 +15,13 @@ from rich.markup import escape
 
 from bags.commands.bag_cli import bag_app
 from bags.commands.config_cli import config_app
+from bags.commands.fleet_cli import (
+    PatienceOption,
+    SchedulerOption,
+    StrictOption,
+    WorkersOption,
+    fleet_app,
+)
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
@@ -32,11 +39,13 @@ app = typer.Typer(
 app.add_typer(track_app, name="track")
 app.add_typer(bag_app)
 app.add_typer(config_app)
+app.add_typer(fleet_app)
 out = Console()
 err = Console(stderr=True)
 
 BagsArgument = Annotated[
-    list[Path], typer.Argument(help="Bags: rosbag2 folders, .mcap files, or folders of bags.")
+    list[Path],
+    typer.Argument(help="Bags: rosbag2 folders, .mcap files, folders of bags, URLs (s3://...)."),
 ]
 ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
 OutOption = Annotated[
@@ -118,14 +127,33 @@ def init(
 
 
 @app.command()
-def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
-    """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
+def identify(
+    bags: BagsArgument,
+    config: ConfigOption,
+    out_dir: OutOption,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
+    strict: StrictOption = False,
+    patience: PatienceOption = 60.0,
+) -> None:
+    """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html.
+
+    Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
+    cannot be used is listed and left out, and the next run reads only what is new.
+    """
     from bags.chain.config import load_config
     from bags.chain.steps import identify_bags
-    from bags.commands import show
+    from bags.commands import fleet_cli, show
     from bags.recordings.folders import expand_bags
+    from bags.recordings.remote import is_url
 
     settings = load_config(config)
+    if workers or scheduler or strict or any(map(is_url, bags)):
+        fleet_cli.identify(
+            out, bags, settings, out_dir,
+            workers=workers, scheduler=scheduler, strict=strict, patience=patience,
+        )  # fmt: skip
+        return
     folders = expand_bags(bags)
     with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)

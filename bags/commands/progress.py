@@ -1,16 +1,37 @@
 """A progress bar on standard error, as a callback for the steps."""
 
-from collections.abc import Callable, Iterator
+import sys
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
+
+from nlsid_core.progress import Progress
 
 
 @contextmanager
-def progress_bar(task: str) -> Iterator[Callable[[str, float], None]]:
-    """Yield `progress(what, fraction)`; the bar disappears when the work is done."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+def progress_bar(task: str, *, after: float = 0.0) -> Iterator[Progress]:
+    """Yield `progress(what, fraction)`; the bar disappears when the work is done.
 
+    It is shown only to a terminal. after: s of work before it appears.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    started = time.monotonic()
     columns = (SpinnerColumn(), BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        identifier = bar.add_task(task, total=1.0)
-        yield lambda what, fraction: bar.update(identifier, description=what, completed=fraction)
+    console = Console(stderr=True)
+    bar = Bar(*columns, console=console, transient=True, disable=not sys.stderr.isatty())
+    identifier = bar.add_task(task, total=1.0)
+
+    def show(what: str, fraction: float) -> None:
+        if time.monotonic() - started >= after:
+            bar.start()
+            bar.update(identifier, description=what, completed=fraction)
+
+    if after <= 0.0:
+        bar.start()
+    try:
+        yield show
+    finally:
+        bar.stop()

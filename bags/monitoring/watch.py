@@ -116,7 +116,7 @@ class Watch:
         before = self.pairing.late_responses
         newest, self._newest[topic] = self._newest.get(topic), (stamp_ns, measured)
         if newest is not None and newest[0] == stamp_ns and newest != self._newest[topic]:
-            return self.missing(f"{self.design.name} has two values at one stamp")
+            return self.missing(f"{self.design.name} has two values at one stamp", doubted=True)
         readings = self._judge(self.pairing.take(stamp_ns, numbers))
         if self.origin_ns is None and not any(map(math.isfinite, measured)):
             said = ", ".join(f"{value:g}" for value in measured)
@@ -143,12 +143,12 @@ class Watch:
         reading = self.monitor.missing(t, reason)
         return [*said, Stamped(stamp_ns, reading, self._alarm.update(reading))]
 
-    def missing(self, reason: str) -> list[Stamped]:
-        """The state is missing or stale: unknown from here on."""
+    def missing(self, reason: str, *, doubted: bool = False) -> list[Stamped]:
+        """The state is missing or stale, or its last sample is doubted: unknown from here on."""
         if not self._newest_ns:
             return []
         t = seconds(self._newest_ns, self._newest_ns if self.origin_ns is None else self.origin_ns)
-        reading = self.monitor.missing(t, reason)
+        reading = self.monitor.missing(t, reason, doubted=doubted)
         return [Stamped(self._newest_ns, reading, self._alarm.update(reading))]
 
     def refuse(self, stamp_ns: int, reason: str) -> list[Stamped]:

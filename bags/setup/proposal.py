@@ -29,6 +29,7 @@ from bags.signals.signal import SignalPath
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
+from nlsid_core.progress import silent
 from nlsid_core.running.grid import TOLERANCE
 
 LAGS: Final = (1, 2, 3, 4, 6, 8, 10)  # tried on a part of the training trials
@@ -418,9 +419,7 @@ def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]
     ]
     while True:
         try:
-            return read_trials(
-                bags, proposal.config(definitions), progress=lambda _what, _part: None
-            )
+            return read_trials(bags, proposal.config(definitions), progress=silent)
         except DataError as error:
             change = next(
                 (c for c in changes if c[2] in str(error) and grid.get(c[0]) != c[1]), None

@@ -4,7 +4,7 @@
 puts the parts together. Memory: one chunk and its index, and what is returned.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,13 +17,13 @@ from bags.recordings.message_types import decode, is_stamped
 from bags.signals.signal import SignalPath, Step
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 STAMP: Final = (
     (Step("header"), Step("stamp"), Step("sec")),
     (Step("header"), Step("stamp"), Step("nanosec")),
 )
 MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with more memory at once
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,13 @@ class Columns:
 
 
 def stream_columns(
-    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress | None = None
+    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress = silent
 ) -> Iterator[Columns]:
     """The signals part by part, in the order of the bag's files.
 
     `signals`: the name a column gets -> where it is; none of them with `[*]` (see `expand_paths`).
-    All are checked against the types in the bag before a message is read. `progress` is called with
-    messages done and to come. Raises BagError where `signals` or the bag are wrong.
+    All are checked against the types in the bag before a message is read. Raises BagError where
+    `signals` or the bag are wrong.
     """
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
@@ -62,12 +62,11 @@ def stream_columns(
     for channel, batch in bag.batches(list(readers)):
         yield readers[channel.topic].read(batch)
         done += len(batch)
-        if progress is not None:
-            progress(done, total)
+        progress("reading", done / max(total, 1))
 
 
 def read_columns(
-    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress | None = None
+    bag: Bag, signals: Mapping[str, SignalPath], *, progress: Progress = silent
 ) -> dict[str, Columns]:
     """Topic -> its signals over the whole bag, by log time; equal log times as recorded.
 

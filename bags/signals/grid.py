@@ -2,10 +2,8 @@
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, overload
 
@@ -13,6 +11,7 @@ import numpy as np
 
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
+from bags.recordings.remote import place
 from bags.signals.expressions import Expression, factors, product
 from bags.signals.reader import (
     HEADER_STAMP,
@@ -27,6 +26,7 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
 from nlsid_core.files import canonical
+from nlsid_core.progress import Progress, silent
 from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
@@ -281,8 +281,8 @@ def read_dataset(
     split_gaps: bool = False,
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
-    executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    names: Sequence[str] | None = None,
+    progress: Progress = silent,
 ) -> Dataset:
     """The signals (see `bags.signals.expressions`) of several bags, one trajectory a bag.
 
@@ -297,14 +297,14 @@ def read_dataset(
     split_gaps: a bag in which a signal is missing, or NaN, for more than `max_gap` gives one
     trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
     are no repeats, and `skipped_samples` counts what is in none of them. definitions: of message
-    types that the bags do not define (`bags.recordings.definitions`). executor:
-    reads bags in parallel (threads, processes, a Dask client's executor). `progress(done, total)`
-    is called after each bag. Raises BagError and DataError as `read_signals`, `to_trajectories` and
-    `Dataset` do.
+    types that the bags do not define (`bags.recordings.definitions`). names: of the trajectories
+    (None: their bags'). progress: told after each bag. Raises BagError and
+    DataError as `read_signals`, `to_trajectories` and `Dataset` do.
     """
-    paths = [Path(bag) for bag in bags]
-    names = list(map(trial_name, paths))
-    if len(twice := {name for name in names if names.count(name) > 1}):
+    paths = [place(bag) for bag in bags]
+    names = list(map(trial_name, paths)) if names is None else names
+    if len(set(names)) < len(names):
+        twice = {name for name in names if names.count(name) > 1}
         raise DataError(f"two bags are called '{min(twice)}'; trials are told apart by name")
     options = {
         "period": period,
@@ -318,13 +318,12 @@ def read_dataset(
         "unfinished": unfinished,
     }
     signals = {"responses": list(responses), "excitations": list(excitations)}
-    read = partial(_read_trials, signals=signals, options=options, definitions=definitions)
     trajectories: list[Trajectory] = []
-    found = (map if executor is None else executor.map)(read, paths, names)
-    for done, trials in enumerate(found, start=1):
-        trajectories += trials
-        if progress is not None:
-            progress(done, len(paths))
+    for done, (path, name) in enumerate(zip(paths, names, strict=True), start=1):
+        trajectories += _read_trials(
+            path, name, signals=signals, options=options, definitions=definitions
+        )
+        progress("reading bags", done / len(paths))
     return Dataset(tuple(trajectories))
 
 

@@ -11,11 +11,13 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.signals.columns import Columns, Progress, expand_paths, read_columns
+from bags.recordings.remote import RemotePath
+from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.timing import without_duplicates
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 HEADER_STAMP: Final = "header stamp"
 LOG_TIME: Final = "log time"
@@ -55,7 +57,7 @@ def read_signals(
     unfinished: bool = False,
     gaps_in: Sequence[str] = (),
     definitions: Mapping[str, Definition] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Samples]:
     """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
 
@@ -118,10 +120,17 @@ def bag_digest(bag: Path | str) -> str:
 
 
 def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
-    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data."""
+    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data.
+
+    The digest of a remote file is of what storage says of it and of its end (docs/decisions/0027):
+    its content is not read for it.
+    """
     with Bag(bag, unfinished=unfinished) as source:
         digest = hashlib.sha256()
         for file in source.files:
+            if isinstance(file, RemotePath):
+                digest.update(file.identity())
+                continue
             with file.open("rb") as stream:
                 while block := stream.read(2**20):
                     digest.update(block)

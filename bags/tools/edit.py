@@ -1,7 +1,7 @@
 """New bags from old ones: a part of one, several as one, one in parts."""
 
 import heapq
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +14,10 @@ from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile
 from bags.recordings.storage import Channel
 from bags.recordings.writer import BagWriter
-from bags.signals.columns import Progress
 from bags.signals.reader import read_signals, stamp_text
 from bags.signals.repeats import find_period
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 REPORT_EVERY: Final = 1000  # messages between two reports of progress
 
@@ -31,7 +31,7 @@ def cut(
     topics: Sequence[str] | None = None,
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> int:
     """Copy the messages logged from `start` to before `end` s after the first (None: to the last).
 
@@ -62,7 +62,7 @@ def cut(
     return copied
 
 
-def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress | None = None) -> int:
+def merge(paths: Sequence[Path | str], out: Path | str, *, progress: Progress = silent) -> int:
     """Copy several bags into one, by log time; returns how many messages there were.
 
     Raises BagError if a bag cannot be read, if two have one topic with different types, and if
@@ -89,7 +89,7 @@ def split(
     *,
     repeats: str | None = None,
     every: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> list[Path]:
     """Copy a bag in parts to the new bags `out`_01, `out`_02, ...
 
@@ -113,8 +113,8 @@ def split(
             k = int(np.searchsorted(edges_ns, message.log_time_ns, side="right")) - 1
             if 0 <= k < len(writers):
                 _write(writers[k], message, channel)
-            if progress is not None and done % REPORT_EVERY == 0:
-                progress(done, total)
+            if done % REPORT_EVERY == 0:
+                progress("copying", done / max(total, 1))
     return parts
 
 
@@ -174,15 +174,15 @@ def _with_channels(
 def _copy(
     messages: Iterator[tuple[Message, Channel]],
     writer: BagWriter,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
     total: int,
 ) -> int:
     done = 0
     for message, channel in messages:
         _write(writer, message, channel)
         done += 1
-        if progress is not None and done % REPORT_EVERY == 0:
-            progress(done, total)
+        if done % REPORT_EVERY == 0:
+            progress("copying", done / max(total, 1))
     return done
 
 

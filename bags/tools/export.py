@@ -17,7 +17,7 @@ import numpy as np
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.signals.columns import Columns, Progress, expand_paths, stream_columns
+from bags.signals.columns import Columns, expand_paths, stream_columns
 from bags.signals.expressions import Expression, Running
 from bags.signals.grid import seconds
 from bags.signals.reader import expanded, read_signals
@@ -25,6 +25,7 @@ from bags.signals.resample import Method, resample
 from bags.signals.signal import SignalPath, numeric_paths
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import Progress, silent
 
 FORMATS: Final = ("csv", "npz", "parquet")
 MAX_COLUMNS: Final = 256  # of one array, when everything is exported; images are not tables
@@ -48,7 +49,7 @@ def export_topics(
     signals: Sequence[str] | None = None,
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Exported:
     """One table per topic in the new folder `out`: times in ns, the signals after their operations.
 
@@ -167,7 +168,7 @@ def _write_topics(
     columns: Mapping[str, Expression],
     folder: Path,
     form: str,
-    progress: Progress | None,
+    progress: Progress,
 ) -> dict[str, int]:
     writers: dict[str, TableWriter] = {}
     rows: dict[str, int] = {}

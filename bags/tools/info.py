@@ -15,10 +15,11 @@ from bags.recordings.batch import Batch
 from bags.recordings.cdr import Gatherer, UnreadableMessageError
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
-from bags.signals.columns import STAMP, Progress
+from bags.signals.columns import STAMP
 from bags.signals.timing import ClockRelation, clock_relation
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 GAP: Final = 5.0  # median intervals without a message
 BINS: Final = np.array([0.0, 0.5, 0.8, 0.95, 1.05, 1.25, 2.0, 5.0, np.inf])  # median intervals
@@ -96,11 +97,11 @@ def bag_info(
     path: Path | str,
     *,
     definitions: Mapping[str, Definition] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> BagInfo:
     """Read the whole bag once, an unfinished one as far as it goes.
 
-    `progress` is called with messages done and to come. Raises BagError as `Bag` does.
+    Raises BagError as `Bag` does.
     """
     with Bag(path, unfinished=True, definitions=definitions) as bag:
         found = {topic: _Collector(bag, topic, msgtype) for topic, msgtype in bag.topics.items()}
@@ -108,8 +109,7 @@ def bag_info(
         for channel, batch in bag.batches():
             found[channel.topic].add(batch)
             done += len(batch)
-            if progress is not None:
-                progress(done, total)
+            progress("reading", done / max(total, 1))
         return BagInfo(
             path=bag.path,
             files=len(bag.files),

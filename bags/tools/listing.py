@@ -13,10 +13,11 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, fields_of
-from bags.signals.columns import Progress, TopicReader
+from bags.signals.columns import TopicReader
 from bags.signals.signal import ANGLES, QUATERNION, SignalPath, Step, numeric_paths
 from bags.signals.units import implied_unit
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 MAX_NAMED: Final = 64  # elements of one array that are listed by name
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
@@ -41,7 +42,7 @@ class Listed:
     note: str = ""
 
 
-def bag_signals(bag: Bag, *, progress: Progress | None = None) -> list[Listed]:
+def bag_signals(bag: Bag, *, progress: Progress = silent) -> list[Listed]:
     """Every number of every topic, in the order of the topics; reads the whole bag once."""
     topics = {topic: _Topic(bag, topic) for topic in bag.topics}
     wanted = [topic for topic, listing in topics.items() if listing.names]
@@ -49,8 +50,7 @@ def bag_signals(bag: Bag, *, progress: Progress | None = None) -> list[Listed]:
     for channel, batch in bag.batches(wanted):
         topics[channel.topic].read(batch)
         done += len(batch)
-        if progress is not None:
-            progress(done, total)
+        progress("reading", done / max(total, 1))
     return [listed for listing in topics.values() for listed in listing.listed()]
 
 

@@ -11,8 +11,8 @@ from bags.recordings.folders import BagFiles, bag_files
 from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.storage import Channel, McapStorage, reading
 from bags.recordings.writer import BagWriter
-from bags.signals.columns import Progress
 from nlsid_core.errors import BagError
+from nlsid_core.progress import Progress, silent
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Recovery:
         return sum(self.counts.values())
 
 
-def recover(path: Path | str, out: Path | str, *, progress: Progress | None = None) -> Recovery:
+def recover(path: Path | str, out: Path | str, *, progress: Progress = silent) -> Recovery:
     """Copy every message that can be read from the bag `path` to the new bag `out`.
 
     Of an MCAP file every complete, undamaged chunk is copied, whatever its indexes and summary
@@ -52,8 +52,7 @@ def recover(path: Path | str, out: Path | str, *, progress: Progress | None = No
                 except BagError as error:
                     count = 0 if batch is None else len(batch)
                     lost.append(f"{file.name}: {count} messages: {error}")
-            if progress is not None:
-                progress(sum(sizes[: k + 1]), sum(sizes))
+            progress("recovering", sum(sizes[: k + 1]) / max(sum(sizes), 1))
         if not sums and lost:
             raise BagError(f"{path}: no message can be read: {'; '.join(lost[:5])}")
         counts = dict(writer.counts)

@@ -7,28 +7,28 @@ from concurrent.futures import Executor
 from typing import overload
 
 from nlsid_core.design.continuous.design import FunnelDesign, design_funnel
-from nlsid_core.design.continuous.sweep import Progress
 from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.sampled.design import TrackingDesign, design_state_funnel
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
+from nlsid_core.progress import Progress, silent
 
 
 @overload
 def design(problem: OutputTube) -> OutputTubeDesign: ...
 @overload
-def design(problem: SampledTracking, *, progress: Progress | None = None) -> TrackingDesign: ...
+def design(problem: SampledTracking, *, progress: Progress = silent) -> TrackingDesign: ...
 @overload
 def design(
     problem: ContinuousTracking,
     *,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> FunnelDesign: ...
 def design(
     problem: OutputTube | SampledTracking | ContinuousTracking,
     *,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> OutputTubeDesign | TrackingDesign | FunnelDesign:
     """A funnel for the problem, proved, and a policy unless it needs none.
 

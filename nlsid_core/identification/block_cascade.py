@@ -5,7 +5,6 @@ smoothing are chosen by the simulation error on validation data.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, get_args
 
@@ -25,6 +24,7 @@ from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.models import BlockCascade, Signal
 from nlsid_core.options import require_one_of, require_whole
+from nlsid_core.progress import Progress, silent
 
 STEPS = 40
 TOLERANCE = 1e-3  # relative gain of a step below which a choice of knots and phases is judged
@@ -33,7 +33,6 @@ MAX_PHASES_TRIED = 4
 MOST_STARTS, MOST_SAMPLES = 1000, 2**31
 START_COEFFICIENTS = 15  # of f, at the start
 
-Progress = Callable[[str, float], None]
 Begin = Literal["measured", "rest"]
 
 
@@ -122,7 +121,7 @@ def identify_block_cascade(
     *,
     transient: int = 0,
     slowest: float = MAX_RADIUS,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
 
@@ -134,7 +133,6 @@ def identify_block_cascade(
     started = time.perf_counter()
     orders, phases, intervals = model_class.orders, model_class.phases, model_class.intervals
     smoothing, starts = model_class.smoothing, model_class.starts
-    report = progress if progress is not None else _silent
     scales = _scales(train)
     fitted, judged = (_trials(data, scales, transient, model_class) for data in (train, validation))
     needed = 2 * (sum(orders) + 2) + START_COEFFICIENTS
@@ -149,7 +147,7 @@ def identify_block_cascade(
         radius=slowest,
     )
     total = len(phases) * len(intervals) * len(smoothing) + 2
-    report(f"best of {starts} starts", 1 / total)
+    progress(f"best of {starts} starts", 1 / total)
     single = minimise(
         fitted,
         with_intervals(first, fitted, intervals[0]),
@@ -166,7 +164,7 @@ def identify_block_cascade(
             base = with_intervals(base, fitted, K)
             for weight in smoothing:
                 tried.append(_choice(base, fitted, judged, scales[1], weight, radius=slowest))
-                report(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
+                progress(f"{M} phases, {K} intervals", (len(tried) + 1) / total)
             finer = min(tried[-len(smoothing) :], key=_validation_error)
             if _validation_error(finer) > coarser:
                 break  # finer knots still would fit noise
@@ -178,7 +176,7 @@ def identify_block_cascade(
     )  # fmt: skip
     tried.append(polished)
     chosen, parameters = min(tried, key=_validation_error)
-    report("minimised further", 1.0)
+    progress("minimised further", 1.0)
     model = _model(parameters, scales, train)
     proof = prove_stability(model)
     if proof is None:

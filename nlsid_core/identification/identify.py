@@ -17,7 +17,8 @@ from nlsid_core.identification.fit import Fit
 from nlsid_core.identification.methods import METHODS, M, Method, ModelClass, alike, describe
 from nlsid_core.identification.rates import default_max_rate
 from nlsid_core.identification.searches import OFFERS, methods_of
-from nlsid_core.identification.trail import Progress, Task, silent
+from nlsid_core.identification.trail import Task
+from nlsid_core.progress import Progress, silent
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +35,7 @@ def identify(
     max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Fit[M]:
     """Identify a model of the class, proved incrementally stable.
 
@@ -69,7 +70,7 @@ def identify(
         validation=validation,
         transient=transient,
         executor=executor,
-        progress=silent if progress is None else progress,
+        progress=progress,
     )
     trail = offer.search(train, model_class, task)
     fit = Fit(tuple(trail.candidates), chosen, trail.history, max_rate=slowest)
@@ -97,7 +98,7 @@ def select(
     max_rate: float | None = None,
     allow_unproved: bool = False,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> "Selection[M]":
     """Identify every class on `train`, choose by the error on `validation`, fit to both again.
 
@@ -106,7 +107,6 @@ def select(
     needs `validation` for choices of its own. Options are those of `identify`. Raises Infeasible if
     no class has a model.
     """
-    report = silent if progress is None else progress
     tried: list[Tried[M]] = []
 
     def fitted(data: Dataset, model_class: ModelClass[M], judged: Dataset | None) -> Fit[M]:
@@ -124,7 +124,7 @@ def select(
         )
 
     for number, model_class in enumerate(classes):
-        report(describe(model_class), number / (len(classes) + 1))
+        progress(describe(model_class), number / (len(classes) + 1))
         try:
             fit = fitted(train, model_class, validation)
         except (DataError, SolverError) as refusal:
@@ -137,7 +137,7 @@ def select(
     if best.fit is None:
         reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
         raise Infeasible(f"no class has a proved model: {reasons}")
-    report("fitting to training and validation trials", len(classes) / (len(classes) + 1))
+    progress("fitting to training and validation trials", len(classes) / (len(classes) + 1))
     refit = None
     if not OFFERS[type(best.model_class)].needs_validation:
         try:
@@ -145,7 +145,7 @@ def select(
             refit = fitted(both, best.model_class, None)
         except (DataError, SolverError) as refusal:
             log.warning("not fitted to training and validation trials together: %s", refusal)
-    report("done", 1.0)
+    progress("done", 1.0)
     return Selection(
         tuple(tried), best.model_class, best.fit if refit is None else refit, refit is not None
     )

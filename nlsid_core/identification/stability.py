@@ -267,7 +267,7 @@ def _by_programs(search: _Search, root: Leaf) -> StabilityProof | None:
             if found.proved:
                 return _with_room(search, *_fastest(search, room, alone, found))
             tree = found.tree
-        if not search.form.box or len(leaves) > MOST_LEAVES // 2:
+        if search.form.whole == len(search.form.box) or len(leaves) > MOST_LEAVES // 2:
             return None
         tree = _refined(search, tree, None if found is None else found.P)
     return None
@@ -443,7 +443,7 @@ def _refined(search: _Search, tree: Tree, P: FloatArray | None) -> Tree:
         if leaf.margin >= FEASIBLE:
             continue
         halves = []
-        for i, (low, high) in enumerate(leaf.box):
+        for i, (low, high) in list(enumerate(leaf.box))[search.form.whole :]:
             middle = (low + high) / 2
             ends = ((low, middle), (middle, high))
             parts = [search.leaf([*leaf.box[:i], end, *leaf.box[i + 1 :]]) for end in ends]

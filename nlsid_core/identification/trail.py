@@ -27,15 +27,11 @@ from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rates import is_too_slow, searched_rate
 from nlsid_core.identification.rse import Iterate, robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
+from nlsid_core.progress import Progress, silent
 
-Progress = Callable[[str, float], None]
 T = TypeVar("T", bound=Model)
 W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
-
-
-def silent(_what: str, _fraction: float) -> None:
-    """Progress that nobody looks at."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,8 @@ class Model:
 
     F: (n, m + n), H: (p, m + n) for m quantities ν. vertices: matrices E, each (m, m + n), whose
     convex hull holds E(θ) for θ in a box inside `box`, perhaps by stated ends. ray: E(θ) may have
-    any multiple of [1, 0] added. inputs: for which inputs this is so, in words.
+    any multiple of [1, 0] added. inputs: for which inputs this is so, in words. whole: so many
+    entries of the box, the first, cannot be split.
     """
 
     period: Fraction
@@ -74,6 +75,7 @@ class Model:
     ray: bool = False
     linear: Linear | None = None
     effort: int = 0  # of finding the vertices, in products
+    whole: int = 0
 
     @property
     def states(self) -> int:
@@ -104,7 +106,7 @@ def positive(model: Model, multipliers: Node | None, forms: Sequence[tuple[str, 
     if not m:
         raise Rejected("this class of models has no multipliers")
     work, first = 0, forms[0][0]
-    for box, leaf in _leaves(multipliers, model.box, 0):
+    for box, leaf in _leaves(multipliers, model.box, model.whole, 0):
         given = leaf["N"]
         Ns = given.array(len(forms), size, m) if len(forms) > 1 else [given.array(size, m)]
         work += 30 * model.effort
@@ -143,7 +145,7 @@ def zero(size: int) -> Matrix:
     return [[Fraction(0)] * size for _ in range(size)]
 
 
-def _leaves(node: Node, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
+def _leaves(node: Node, box: Box, whole: int, depth: int) -> Iterator[tuple[Box, dict[str, Node]]]:
     parts = node.members("", "N ends split parts")
     if set(parts) == {"N"} or (set(parts) == {"N", "ends"} and box):
         yield box, parts
@@ -154,11 +156,11 @@ def _leaves(node: Node, box: Box, depth: int) -> Iterator[tuple[Box, dict[str, N
         )
     if depth == MAX_SPLITS:
         raise Rejected(f"{node.where}: more than {MAX_SPLITS} splits, one inside the other")
-    i = parts["split"].whole(0, len(box) - 1)
+    i = parts["split"].whole(whole, len(box) - 1)
     low, high = box[i]
     halves = ((low, (low + high) / 2), ((low + high) / 2, high))
     for half, part in zip(halves, parts["parts"].items(2, 2), strict=True):
-        yield from _leaves(part, [*box[:i], half, *box[i + 1 :]], depth + 1)
+        yield from _leaves(part, [*box[:i], half, *box[i + 1 :]], whole, depth + 1)
 
 
 def read_model(node: Node, bounds: Node | None = None) -> Model:
@@ -316,7 +318,9 @@ def _implicit(node: Node, bounds: Node | None) -> Model:
 
     Where h is linear in v and x, E is one matrix. Where h = e(v) - (affine in x), v one number and
     e a cubic that increases, e' is at least its least slope: a ray. Else E is in the hull of the
-    Bernstein coefficients of ∂h/∂(v, x) on a box of v, x and w, both solutions being in it.
+    Bernstein coefficients of ∂h/∂(v, x) on a box of v, x and w, both solutions being in it. Their
+    (v, x) may be in two leaves: for one h there is a point between them where E ζ = 0 (mean value
+    theorem), whatever leaf it is in; for several there need be none, so only w is split.
     """
     given = read_implicit_model(node)
     parts = node.members("y u window", f"{MEMBERS} training bags")
@@ -360,6 +364,7 @@ def _implicit(node: Node, bounds: Node | None) -> Model:
         given.period, y, u, F, [_unit(i, p + n) for i in range(p)],
         "for every input" if bounds is None else "while signals stay in the box", box,
         vertices, ray=least is not None, effort=0 if only else _effort(E, box),
+        whole=p + n if p > 1 and box else 0,
     )  # fmt: skip
 
 

@@ -157,13 +157,14 @@ class Monitor:
         """The reading at t (s) of a sample y before the run's start."""
         return Reading(t, Status.UNKNOWN, measured=_numbers(y), reason=reason)
 
-    def missing(self, t: float, reason: str) -> Reading:
+    def missing(self, t: float, reason: str, *, doubted: bool = False) -> Reading:
         """End the run because the state is missing or stale at time t (s): unknown from here on.
 
-        Tubes around a simulation go on with the next sample.
+        Tubes around a simulation go on with the next sample, or, if the last one is `doubted` to be
+        the robot's, start a new run.
         """
         if self.goes_on:
-            return self._tubes.missing(t, reason)
+            return self._tubes.missing(t, reason, doubted=doubted)
         self._ended = self._ended or reason
         return Reading(t, Status.UNKNOWN, reason=self._ended)
 

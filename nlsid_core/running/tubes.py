@@ -92,8 +92,9 @@ class TubeRun:
         self._due = math.nan
         self._begin()
 
-    def _begin(self) -> None:
-        """Collect a start again; the grid of time goes on."""
+    def _begin(self, why: str = "") -> None:
+        """Collect a start again; the grid of time goes on. why: what ended the run before it."""
+        self._ended = why
         self._start: list[tuple[FloatArray, FloatArray]] = []
         self._x: FloatArray | None = None
         self._spent = np.zeros(len(self._tubes))
@@ -117,13 +118,18 @@ class TubeRun:
             return self._unknown(t, measured, fault)
         fault = self._fault(t, measured, applied)
         if fault:
-            return self._unknown(t, measured, self._without(applied) or fault)
+            return self._unknown(t, measured, self._without(applied, fault) or fault)
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
 
-    def missing(self, t: float, reason: str) -> Reading:
-        """The reading at t (s) where no sample came; the run goes on with the next one."""
+    def missing(self, t: float, reason: str, *, doubted: bool = False) -> Reading:
+        """The reading at t (s) where no sample came; the run goes on with the next one.
+
+        doubted: the last sample may not be the robot's: a new run starts.
+        """
+        if doubted:
+            self._begin(reason)
         return Reading(t, Status.UNKNOWN, reason=reason)
 
     def _take(self, t: float) -> str:
@@ -139,15 +145,17 @@ class TubeRun:
         if lost < 0:
             return f"the sample at t = {t:g} s came a second time, or time went back"
         if abs(late - lost) > TOLERANCE:
-            self._begin()
             self._due = t + self.period
-            return (
+            off = (
                 f"the sample at t = {t:g} s is {late - lost:+.2g} periods of {self.period:g} s off "
-                f"the grid; {TOLERANCE:g} are allowed; a new run starts"
+                f"the grid; {TOLERANCE:g} are allowed"
             )
+            self._begin(off)
+            return f"{off}; a new run starts"
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
         if lost:
-            self._begin()
+            missing = "1 sample is" if lost == 1 else f"{lost} samples are"
+            self._begin(f"{missing} missing before t = {t:g} s")
         return ""
 
     def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
@@ -159,18 +167,18 @@ class TubeRun:
                     return f"no {signal.name} at t = {t:g} s (it is {value}): nothing is claimed"
         return ""
 
-    def _without(self, u: FloatArray) -> str:
+    def _without(self, u: FloatArray, fault: str) -> str:
         """A step with e = 0 under the input u, or a new run if that is not known.
 
-        Why the model ends the run, empty if it does not.
+        fault: why nothing was measured. Why the model ends the run, empty if it does not.
         """
         known = u.shape == (len(self._stepper.u),) and np.isfinite(u).all()
         if self._x is None or not known:
-            self._begin()
+            self._begin(fault)
             return ""
         _, after, refused = self._advance(u)
         if refused:
-            self._begin()
+            self._begin(refused)
             return refused
         self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
         self._follow_command(u)
@@ -178,17 +186,17 @@ class TubeRun:
 
     def _collect(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
         if any(((u < low) | (u > high)).any() for _, (low, high), _ in self._boxes):
-            self._begin()
-            return self._unknown(
-                t, y, f"outside the box in which the tube is proved, at t = {t:g} s"
-            )
+            away = f"outside the box in which the tube is proved, at t = {t:g} s"
+            self._begin(away)
+            return self._unknown(t, y, away)
         self._start.append((y, u))
         self._follow_command(u)
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
             self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))
             self._start = []
-        return self._unknown(t, y, f"{STARTING} {self.lags} samples")
+        why = f" of a new run: {self._ended}" if self._ended else ""
+        return self._unknown(t, y, f"{STARTING} {self.lags} samples{why}")
 
     def _advance(self, u: FloatArray) -> tuple[FloatArray, FloatArray, str]:
         """Outputs and next states, and why there are none or nothing is known of them."""
@@ -217,8 +225,9 @@ class TubeRun:
     def _judge(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
         outputs, after, refused = self._advance(u)
         if refused:
-            self._begin()
-            return self._unknown(t, y, f"{refused}, at t = {t:g} s; a new run starts")
+            refused = f"{refused}, at t = {t:g} s"
+            self._begin(refused)
+            return self._unknown(t, y, f"{refused}; a new run starts")
         e = y - outputs[:-1]
         simulated = outputs[-1]
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
@@ -238,9 +247,9 @@ class TubeRun:
             spent = self._spent / level
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         if not (followed and np.isfinite(self._spent).all() and np.isfinite(after).all()):
-            self._begin()
             what = "the model's state" if followed else "the level that follows the commands"
             reason = f"{what} is not finite at t = {t:g} s"
+            self._begin(reason)
             if np.isfinite(simulated).all() and (sizes > 1.0).any():
                 away = Reading(
                     t, Status.OUTSIDE, -math.inf, math.inf, 0.0, measured=tuple(y.tolist()),

@@ -17,6 +17,7 @@ from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
+from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 
 
@@ -24,7 +25,7 @@ from nlsid_core.proofs import check
 def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("chain")
     config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return out / documents.FUNNEL
 

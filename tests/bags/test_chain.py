@@ -25,6 +25,7 @@ from bags.signals.grid import read_dataset
 from bags.signals.signal import SignalPath
 from nlsid_core import files
 from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 
@@ -63,7 +64,7 @@ def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Pat
     """On the trials for which they were first measured, all but the test trials."""
     split = config.split.model_copy(update={"calibration": ()})
     everything = config.model_copy(update={"split": split})
-    result = identify_bags(f1tenth(), everything, tmp_path, progress=lambda _w, _f: None)
+    result = identify_bags(f1tenth(), everything, tmp_path, progress=silent)
     errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     assert errors["least_squares"] == pytest.approx(11.7, abs=0.05)
     assert errors["sem"] == pytest.approx(8.5, abs=0.05)
@@ -76,7 +77,7 @@ def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Pat
 def test_errors_without_the_calibration_trials_are_as_documented(
     config: Config, tmp_path: Path
 ) -> None:
-    result = identify_bags(f1tenth(), config, tmp_path, progress=lambda _w, _f: None)
+    result = identify_bags(f1tenth(), config, tmp_path, progress=silent)
     errors = {c.method.name: c.error_percent(result.test) for c in result.fit.candidates}
     assert errors["least_squares"] == pytest.approx(11.52, abs=0.05)
     assert errors["rse_first"] == pytest.approx(12.60, abs=0.05)
@@ -89,7 +90,7 @@ def test_test_trials_do_not_influence_the_model(
     config: Config, chain: Path, tmp_path: Path
 ) -> None:
     fewer = [bag for bag in f1tenth() if bag.name[-2:] not in TEST[1:]]
-    identify_bags(fewer, config, tmp_path, progress=lambda _w, _f: None)
+    identify_bags(fewer, config, tmp_path, progress=silent)
     assert documents.load_model(tmp_path / documents.MODEL).document() == (
         documents.load_model(chain / documents.MODEL).document()
     )
@@ -328,7 +329,7 @@ def test_a_name_in_the_split_that_no_bag_has_is_said(config: Config) -> None:
     split = config.split.model_copy(update={"test": ("trial_05", "trial_5"), "calibration": ()})
     bags = [bag for bag in f1tenth() if bag.name in ("trial_05", "trial_06")]
     given = config.model_copy(update={"split": split})
-    trials = read_trials(bags, given, progress=lambda _w, _f: None)
+    trials = read_trials(bags, given, progress=silent)
     assert trials.absent == ("trial_5",)
 
 

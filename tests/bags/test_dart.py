@@ -14,6 +14,7 @@ from bags.monitoring.replay import replay_bag
 from bags.samples import convert_dart, dart, dart_tables
 from bags.signals.reader import bag_metadata, read_signals
 from nlsid_core.errors import DataError
+from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
@@ -88,7 +89,7 @@ def test_without_the_tables_nothing_is_converted(tmp_path: Path) -> None:
 def test_unseen_drives_stay_inside_and_other_floors_are_named(tmp_path: Path) -> None:
     """The whole way with a product of two topics' signals, one of them lagged, as an input."""
     config = load_config(config_file("dart.yaml"))
-    fit = identify_bags(dart("rubbery"), config, tmp_path, progress=lambda _what, _part: None)
+    fit = identify_bags(dart("rubbery"), config, tmp_path, progress=silent)
     assert fit.fit.errors["test"]["rse"] < 10.0  # %
     design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
     for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):

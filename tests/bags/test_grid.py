@@ -204,18 +204,18 @@ def test_a_dataset_carries_names_groups_digests_and_reports_progress(tmp_path: P
         for k in range(2)
     ]
     bags.append(speed_bag(tmp_path / "single", [0.0, 0.1], [0.0, 0.1]))
-    seen: list[tuple[int, int]] = []
+    seen: list[tuple[str, float]] = []
     dataset = read_dataset(
         [bags[0], bags[1] / "trial_1.mcap", bags[2]],
         responses=[SPEED],
         excitations=[COMMAND],
-        progress=lambda done, total: seen.append((done, total)),
+        progress=lambda what, fraction: seen.append((what, fraction)),
     )
     assert dataset.names == ("trial_0", "trial_1", "single")
     assert [t.name for t in dataset.repeats()["step"]] == ["trial_0", "trial_1"]
     assert [t.digest for t in dataset] == [bag_digest(bag) for bag in bags]
     assert dataset.period == 0.025
-    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert seen == [("reading bags", k / 3) for k in (1, 2, 3)]
 
 
 def test_two_bags_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from nlsid_core.models import (
     MonotoneEquation,
     StateAffineModel,
 )
+from nlsid_core.progress import silent
 from tests.bag_messages import COMMAND, SPEED, speed_bag
 from tests.identified_bags import (
     saturating,
@@ -68,10 +69,6 @@ def claimed(name: str) -> str:
 
 def nlsid(*arguments: object) -> Any:
     return CliRunner().invoke(app, [str(a) for a in arguments], env={"COLUMNS": "200"})
-
-
-def quiet(_what: str, _fraction: float) -> None:
-    return None
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +153,7 @@ def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
     monotone = {"model": "monotone", "lags": 2, "delays": [0, 1]}
     compare = [{"lags": 3}, CASCADE, affine, monotone]
     config = write_config(tmp_path / "robot.yaml", {"lags": 3}, compare=compare)
-    compared = compare_bags(bags_in(folder), load_config(config), progress=quiet)
+    compared = compare_bags(bags_in(folder), load_config(config), progress=silent)
     best = min(compared.rows, key=lambda row: row.scores.simulation_percent)
     assert best.label.startswith("block cascade")
     assert compared.skipped_at_start == 60
@@ -171,13 +168,13 @@ def test_what_cannot_be_compared_is_named_and_the_rest_is(folder: Path, tmp_path
     alone = [bag for bag in bags_in(folder) if bag.name not in ("run_1", "run_3")]
     compare = [{"model": "monotone", "lags": 2}, {"lags": 90}]
     config = load_config(write_config(tmp_path / "c.yaml", {"lags": 2}, compare=compare))
-    compared = compare_bags(alone, config, progress=quiet)
+    compared = compare_bags(alone, config, progress=silent)
     names = [row.candidate.method.name for row in compared.rows]
     assert names == ["least_squares", "rie", "sem", "sem_certified"]
     assert "share a `group`" in compared.refusals[0]
     impossible = config.model_copy(update={"compare": config.identification.each({"lags": [100]})})
     with pytest.raises(Infeasible, match="no class has a model"):
-        compare_bags([alone[0], *alone[-2:]], impossible, progress=quiet)
+        compare_bags([alone[0], *alone[-2:]], impossible, progress=silent)
 
 
 def test_select_takes_the_order_with_the_least_validation_error(
@@ -200,7 +197,7 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
     config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
     options = {"lags": [1, 3, 100]}
     few = [bag for bag in bags_in(folder) if bag.name in ("run_0", "run_4", "run_5")]
-    chosen = select_bags(few, config, tmp_path, options=options, progress=quiet)
+    chosen = select_bags(few, config, tmp_path, options=options, progress=silent)
     one, three, hundred = chosen.selection.errors
     assert three < one
     assert hundred == np.inf
@@ -208,7 +205,7 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
     section = {"model": "state_affine", "lags": 1, "iterations": 3}
     affine = load_config(write_config(tmp_path / "a.yaml", section))
     both = select_bags(
-        few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=quiet
+        few, affine, tmp_path, options={"lags": [1, 2], "right_degree": [1, 2]}, progress=silent
     )
     assert len(both.selection.tried) == 4
     least = both.selection.tried[int(np.argmin(both.selection.errors))]
@@ -231,7 +228,7 @@ def test_a_selection_that_makes_no_sense_says_why(
 ) -> None:
     config = load_config(write_config(tmp_path / "c.yaml", {"lags": 1}))
     with pytest.raises(DataError, match=reason):
-        select_bags(bags_in(folder), config, tmp_path / "out", options=options, progress=quiet)
+        select_bags(bags_in(folder), config, tmp_path / "out", options=options, progress=silent)
     assert not (tmp_path / "out").exists()
 
 

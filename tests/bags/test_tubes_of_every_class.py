@@ -17,6 +17,7 @@ from bags.designs.documents import Proved
 from bags.monitoring.replay import replay_bag
 from bags.monitoring.watch import Watch
 from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
@@ -37,10 +38,6 @@ TWO: dict[str, dict[str, Any]] = {
 RUNS = 6
 
 
-def quiet(_what: str, _fraction: float) -> None:
-    """Progress that nobody sees."""
-
-
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_saturating_bags(tmp_path_factory.mktemp("one"))
@@ -59,7 +56,7 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     path = write_config(tmp_path / "config.yaml", (ONE | TWO)[name], **counts, **FUNNEL)
     config, out = load_config(path), tmp_path / "out"
     bags = [folder / f"run_{k}" for k in range(RUNS)]
-    identify_bags(bags, config, out, progress=quiet)
+    identify_bags(bags, config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     assert "for ever" in check(out / documents.FUNNEL_PROOF).statement
     proved = documents.load_proved(out / documents.FUNNEL)
@@ -75,7 +72,7 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
 ) -> None:
     path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
     config, out = load_config(path), tmp_path / "out"
-    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=quiet)
+    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     kept = np.setdiff1d(np.arange(300), [100, 101, 102])
     y = np.zeros((300, 2))
@@ -99,7 +96,7 @@ def linear(one: Path, tmp_path: Path) -> Proved[AnyDesign]:
     """The proved tube of a linear model."""
     path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
     config, out = load_config(path), tmp_path / "out"
-    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=quiet)
+    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return documents.load_proved(out / documents.FUNNEL)
 

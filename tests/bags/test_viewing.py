@@ -30,6 +30,7 @@ from bags.viewing.replay import Recording
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
 from bags.viewing.serving import serve
 from nlsid_core.errors import DataError
+from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from tests.browser import CHROMIUM, MISSING, Page, browser
@@ -44,7 +45,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("chain")
     config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return out / documents.FUNNEL
 

@@ -11,8 +11,8 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import CertifiedSem, LinearClass, identify, prove_stability
+from nlsid_core.errors import DataError, ShapeError, SolverError
+from nlsid_core.identification import CertifiedSem, LinearClass, identify, newton, prove_stability
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.linear import (
@@ -320,3 +320,13 @@ def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
         for trial in stacked.dataset
     ]
     assert rms == pytest.approx(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+
+
+def test_a_parameter_whose_curvature_is_lost_in_rounding_keeps_its_place() -> None:
+    """On a matrix that is not finite LAPACK's least squares may never return."""
+    hessian = np.array([[2.0, 1e-17], [1e-17, -1e-17]])
+    step = newton._newton_step(np.array([1.0, 1e-17]), hessian)
+    assert step[0] == pytest.approx(-0.5)
+    assert abs(step[1]) < 1.0
+    with pytest.raises(SolverError, match="beyond all numbers"):
+        newton._newton_step(np.array([1e300, 0.0]), np.array([[1e-300, 1e300], [1e300, 1e-300]]))

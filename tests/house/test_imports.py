@@ -18,7 +18,7 @@ DOWNWARD = {
 # The rooms of bags, each standing on those before it.
 ROOMS = (
     "recordings", "signals", "tools", "designs", "monitoring", "viewing", "pictures", "chain",
-    "setup", "commands",
+    "fleet", "setup", "commands",
 )  # fmt: skip
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {
@@ -26,7 +26,7 @@ BANDS = {
     "run": {"running"},
     "nouns": {"funnels", "policies", "models", "dynamics", "data", "polynomial"}
     | {"documents", "proofs", "designs"},
-    "base": {"errors", "arrays", "files", "options"},
+    "base": {"errors", "arrays", "files", "options", "progress"},
     "kernel": {"kernel"},
 }
 BELOW = {

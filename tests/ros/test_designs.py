@@ -21,6 +21,7 @@ from bags.designs.bundle import MAX_BYTES, Bundle
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.progress import silent
 from nlsid_ros import qos
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 from tests.ros.robot import GOOD, MONITOR, Robot
@@ -155,7 +156,7 @@ def test_an_older_design_is_not_taken_after_the_one_in_use_was_published_again(
 ) -> None:
     """The older one is proved too, but its check takes long enough to be overtaken."""
     config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, tmp_path, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, tmp_path, progress=silent)
     assert config.funnel is not None
     wider = config.funnel.model_copy(update={"safety_factor": 2.0})
     design_funnel_files(

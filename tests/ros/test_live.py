@@ -16,6 +16,7 @@ from bags.samples import f1tenth
 from bags.setup.candidates import look
 from bags.setup.proposal import propose
 from bags.setup.written import yaml_text
+from nlsid_core.progress import silent
 from tests.ros.domains import fresh_domain
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
@@ -74,7 +75,7 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
     }
     config.write_text(yaml_text(propose(bags, look(bags), robot="car", **chosen)))
     settings = load_config(config)
-    identify_bags(bags, settings, out, progress=lambda _what, _fraction: None)
+    identify_bags(bags, settings, out, progress=silent)
     design_funnel_files(out / documents.MODEL, settings, out)
     seen = played_live(out / documents.FUNNEL, tmp_path, environment)
     assert seen["sent"] == seen["recorded"] == 361

@@ -23,6 +23,7 @@ from bags.designs.bundle import Bundle
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
+from nlsid_core.progress import silent
 from nlsid_ros import qos
 from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
 
@@ -80,7 +81,7 @@ def test_a_model_is_identified_on_request_published_and_can_be_called_off(tmp_pa
 
 def test_a_redesigned_funnel_is_published_again_and_a_forged_one_is_not(tmp_path: Path) -> None:
     config = load_config(CONFIG)
-    identify_bags(f1tenth(), config, tmp_path, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, tmp_path, progress=silent)
     design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
     funnels: list[str] = []
     said: list[str] = []

@@ -16,6 +16,7 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
+from nlsid_core.progress import silent
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
@@ -30,7 +31,7 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("tube")
     config = load_config(config_file("f1tenth.yaml"))
     config = config.model_copy(update={"funnel": FunnelConfig()})
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return out
 

@@ -29,6 +29,7 @@ from bags.recordings.bag import Bag
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
+from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
@@ -168,7 +169,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
     path = tmp_path / "robot.yaml"
     path.write_text(yaml.safe_dump(content))
     config, out = load_config(path), tmp_path / "out"
-    identify_bags(f1tenth(), config, out, progress=lambda _what, _fraction: None)
+    identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     replayed = replay_bag(

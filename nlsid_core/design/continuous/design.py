@@ -18,7 +18,7 @@ from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Goal, Setting, prepare
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
-from nlsid_core.design.continuous.sweep import Ends, Progress, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.dynamics.taylor import field_of
@@ -26,6 +26,7 @@ from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
@@ -75,7 +76,7 @@ def design_funnel(
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> FunnelDesign:
     """The funnel that `ContinuousTracking` describes; its options are these.
 
@@ -178,9 +179,7 @@ def validity_caps(
     return caps
 
 
-def _found(
-    setting: Setting, progress: Progress | None
-) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """ρ by the backward sweep, and its proof; where inputs are held, for bounds of their change.
 
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
@@ -217,7 +216,7 @@ def _found(
 
 
 def _held(
-    setting: Setting, hold: Hold, free: FloatArray, progress: Progress | None
+    setting: Setting, hold: Hold, free: FloatArray, progress: Progress
 ) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """The funnel for one hold, within scaled copies of the free one."""
     steps, policy, P = setting.steps, setting.policy, setting.P
@@ -250,7 +249,7 @@ def _held(
     ) from refusal
 
 
-def _free(setting: Setting, progress: Progress | None) -> FloatArray:
+def _free(setting: Setting, progress: Progress) -> FloatArray:
     """ρ (K,) as it is found if nothing is held."""
     steps, policy, P = setting.steps, setting.policy, setting.P
     caps = validity_caps(steps.field, policy, P)
@@ -263,7 +262,7 @@ def _free(setting: Setting, progress: Progress | None) -> FloatArray:
 
 
 def _swept(
-    setting: Setting, caps: FloatArray, progress: Progress | None
+    setting: Setting, caps: FloatArray, progress: Progress
 ) -> tuple[Setting, ContinuousFunnel, Proved, float]:
     """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
     steps, policy, P = setting.steps, setting.policy, setting.P
@@ -279,7 +278,7 @@ def _swept(
 
 
 def _expanded(
-    setting: Setting, progress: Progress | None, margin: float
+    setting: Setting, progress: Progress, margin: float
 ) -> tuple[Setting, FloatArray, list[Ends] | None]:
     """The sweep that expands the dynamics around what it finds; the setting has their field."""
     assert setting.expansion is not None

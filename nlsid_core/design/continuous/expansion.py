@@ -11,12 +11,13 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import Diagnosis, diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section, section_at
-from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends, Progress
+from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends
 from nlsid_core.dynamics import Nominal
 from nlsid_core.dynamics.taylor import Cubic, Rates, field_of
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.progress import Progress, silent
 
 ROOM = 1 + 1e-6  # of the box over the funnel: the checker decides in rationals
 NEAR = 1.01  # of the largest ρ: closer is not worth another expansion
@@ -89,7 +90,7 @@ def sweep_expanded(
     *,
     margin: float,
     rho_final: float,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Swept:
     """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
 
@@ -116,8 +117,7 @@ def sweep_expanded(
             else:
                 k += 1
             continue
-        if progress is not None:
-            progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
+        progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
         k -= 1
     return Swept(rho, [ends[k] for k in range(K - 1)], [steps.local[k] for k in range(K - 1)])
 

@@ -15,11 +15,12 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
-from nlsid_core.design.continuous.sweep import Ends, Progress, sweep_rho
+from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.progress import Progress, silent
 
 STOP = 0.025  # thesis: growth of the volume below which the alternation has converged
 MAX_ITERATIONS = 30
@@ -54,7 +55,7 @@ def enlarge_shape(
     objective: str = "volume",
     iterations: int = MAX_ITERATIONS,
     executor: Executor | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[ContinuousFunnel, Proved, list[tuple[str, float]]]:
     """Enlarge P(t), keeping the end, and prove the last funnel of the alternation that can be.
 
@@ -74,9 +75,8 @@ def enlarge_shape(
         growth = candidate.volume_integral() / present.volume_integral()
         present = candidate
         found.append(present)
-        if progress is not None:
-            volume = present.volume_integral()
-            progress(f"P(t): volume integral {volume:.4g}", min(0.95, (iteration + 1) / 10))
+        volume = present.volume_integral()
+        progress(f"P(t): volume integral {volume:.4g}", min(0.95, (iteration + 1) / 10))
         if growth < 1 + STOP:
             break
     history = [(f"P {i}", f.volume_integral()) for i, f in enumerate(found)]

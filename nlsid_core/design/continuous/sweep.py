@@ -12,14 +12,13 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.errors import Infeasible
+from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
 ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
 MAX_TRIES = 12
 NEAR = 1.01  # of a feasible ρ: closer to the largest is not worth another program
 LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +36,7 @@ def sweep_rho(
     margin: float,
     rho_final: float = 1.0,
     caps: FloatArray | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> tuple[FloatArray, list[Ends]]:
     """ρ (K,) with ρ(t_f) = rho_final and the L-steps at both ends of every interval.
 
@@ -64,8 +63,7 @@ def sweep_rho(
         rho[k], at_start = _largest(steps, start, 0.0, rho[k + 1], h, cap, margin, at_end)
         ends.append(Ends(at_start, at_end))
         duals = at_start
-        if progress is not None:
-            progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
+        progress(f"rho at {start.t:.3g} s", 1 - k / len(instants))
     return rho, ends[::-1]
 
 

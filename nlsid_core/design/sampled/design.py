@@ -4,7 +4,7 @@ Backward, the inlet: the largest radius whose step, disturbance included, fits i
 the tube: where starts in the inlet get to. Every step of both is one semidefinite program.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeAlias
 
@@ -24,6 +24,7 @@ from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.policies.sampled import SampledPolicy
+from nlsid_core.progress import Progress, silent
 from nlsid_core.running.assumption import disturbance_of
 
 AIM = 1.0 - 5e-5  # of the next radius: where the search for a radius aims ...
@@ -32,8 +33,6 @@ ATTEMPTS = 8  # semidefinite programs a step; two or three are usual
 INSIDE_BOX = 1.0 - 1e-9  # of what the box of the data leaves
 
 ROOTS = 3.0  # radii of the tube within which the roots of an implicit step are claimed
-
-Progress = Callable[[str, float], None]
 
 
 TrackingDesign: TypeAlias = Design[MeasuredState, SampledPolicy, SampledFunnel, None]
@@ -67,14 +66,13 @@ def design_state_funnel(
     assumption: DisturbanceAssumption,
     goal: float | None = None,
     start: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> TrackingDesign:
     """The largest inlet that reaches the goal, and the tube from it; see `SampledTracking`.
 
     Raises CertificateRejected if the assumption is not one a checker would accept,
     Infeasible if the disturbance leaves no inlet, DataError if `start` is beyond the inlet.
     """
-    report = progress if progress is not None else _silent
     refuse_assumption(model, assumption)
     norms = frame(model, policy, feedback)
     cap = norms.cap - assumption.widens
@@ -89,14 +87,14 @@ def design_state_funnel(
     steps = [kind.at(model, policy, norms, k, assumption) for k in range(len(policy))]
     for k, step in enumerate(steps):
         cap[k] = step.largest(float(cap[k]))
-    inlet, to_goal = _inlet(steps, cap, goal, report)
+    inlet, to_goal = _inlet(steps, cap, goal, progress)
     roots = ROOTS * (inlet + assumption.widens)
     first = float(inlet[0]) if start is None else start
     if not 0 < first <= inlet[0]:
         raise DataError(
             f"start {first:.4g} should be positive and at most the inlet {inlet[0]:.4g}"
         )
-    tube, along = _tube(steps, first, roots, report)
+    tube, along = _tube(steps, first, roots, progress)
     funnel = SampledFunnel(
         S=norms.S,
         A=norms.A,

@@ -12,11 +12,12 @@ from nlsid_core import files
 from nlsid_core.arrays import ArrayLike
 from nlsid_core.design.continuous.lstep import sections
 from nlsid_core.design.continuous.setting import Goal, prepare
-from nlsid_core.design.continuous.sweep import Progress, sweep_rho
+from nlsid_core.design.continuous.sweep import sweep_rho
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.progress import Progress, silent
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ def sample_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Sampled:
     """The largest ρ(t) that holds at `samples` instants of every interval, both ends among them.
 

@@ -167,8 +167,8 @@ def quadratic(rows: Rows, P: Rows) -> Rows:
             for i in range(size)]  # fmt: skip
 
 
-def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any) -> bool:
-    """(D) and every (O_j)."""
+def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any, kept: int) -> bool:
+    """(D) and every (O_j); the first `kept` entries of the box are not split."""
     box, ray, hull = shape
     n, p = len(F), len(H)
     size, rho = m + n + p, exact(tube["rho"])
@@ -198,6 +198,8 @@ def holds(F: Rows, H: Rows, m: int, tube: Json, tree: Json | None, shape: Any) -
         if "split" in tree:
             assert set(tree) == {"split", "parts"}
             i = tree["split"]
+            if i < kept:
+                return False
             low, high = box[i]
             halves = [(low, (low + high) / 2), ((low + high) / 2, high)]
             return all(
@@ -327,7 +329,8 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
             return False
         if not disjoint(given):
             return False
-        if not all(holds(F, H, m, tube, tree, (box, ray, hull)) for F, H in modes):
+        kept = m + len(F) if model["kind"] == "implicit" and m > 1 and box else 0
+        if not all(holds(F, H, m, tube, tree, (box, ray, hull), kept) for F, H in modes):
             return False
         for tau, width in zip(tube["tau"], tube["half_widths"], strict=True):
             if not width > 0 or level + rho * inlet > exact(tau) * exact(width) ** 2:

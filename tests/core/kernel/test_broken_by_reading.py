@@ -222,3 +222,47 @@ def test_a_path_prints_one_line() -> None:
     lines = done.stdout.splitlines()
     assert len(lines) == 3
     assert all("cannot be read" in line for line in lines)
+
+
+def test_solutions_on_two_branches_are_not_near_each_other() -> None:
+    """v³ = w of complex v: -1 has the roots 1/2 ± i √3/2, both in the box, √3 apart for ever.
+
+    On each part of the box the equation's slope, which turns by more than half a turn over the
+    whole of it, has a multiplier of its own; no multiplier serves the two solutions.
+    """
+    documents = tube()
+    del documents["policy"], documents["funnel"]["policy"]
+    signals = [SIGNAL | {"name": name} for name in ("real", "imaginary")]
+    terms = [([3, 0, 0, 0, 0], 1, 0), ([1, 2, 0, 0, 0], -3, 0), ([2, 1, 0, 0, 0], 0, 3),
+             ([0, 3, 0, 0, 0], 0, -1), ([0, 0, 0, 0, 1], -1, 0)]  # fmt: skip
+    documents["model"] = {
+        "format": "nlsid/model", "version": 2, "kind": "implicit", "period": 0.1,
+        "equation": "0 = h(v, x, w), x+ = [v; shift(x, w)]", "states": ["a", "b"],
+        "inputs": ["w"], "monotonicity": 1, "y": signals, "u": [SIGNAL], "window": [[0, 0]],
+        "h": {"exponents": [e for e, *_ in terms], "coefficients": [c for _, *c in terms]},
+    }  # fmt: skip
+    unity, nothing = [[1, 0], [0, 1]], [[0, 0]] * 4
+    (stated,) = documents["funnel"]["tubes"]
+    stated |= {"rho": 0.5, "L": [[0, 0], [0, 0]], "P": unity, "R": unity, "tau": [0.5, 0.5],
+               "level": 2.0**-14, "half_widths": [2.0**-6, 2.0**-6]}  # fmt: skip
+    stated["assumption"] |= {"kind": "fading"}
+    del stated["assumption"]["samples"]
+    documents["funnel"]["box"] = {"y": [[0.25, 1.25], [-1.25, 1.25]], "u": [[-2, 2]]}
+
+    def multipliers(box: list[tuple[float, float]], depth: int) -> Json:
+        """N = 2 (the slope at the middle)^-1, on parts of a 64th of the box."""
+        if depth < 6:
+            i = depth % 2
+            middle = sum(box[i]) / 2
+            halves = [[*box[:i], end, *box[i + 1 :]]
+                      for end in ((box[i][0], middle), (middle, box[i][1]))]  # fmt: skip
+            return {"split": i, "parts": [multipliers(half, depth + 1) for half in halves]}
+        a, b = (sum(ends) / 2 for ends in box)
+        size = 3 * (a**2 + b**2) ** 2 / 2
+        turned = [[(a**2 - b**2) / size, 2 * a * b / size],
+                  [-2 * a * b / size, (a**2 - b**2) / size]]  # fmt: skip
+        return {"N": [turned + nothing] * 3}
+
+    proof = {"multipliers": [multipliers([(0.25, 1.25), (-1.25, 1.25)], 0)]}
+    with pytest.raises(Rejected, match="split should be a whole number from 4 to 4"):
+        decided("tube", documents, proof)
