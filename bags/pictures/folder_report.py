@@ -64,7 +64,7 @@ def print_page(page: Path, out: Path) -> None:
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         raise DataError(
-            f"a PDF is printed by Chromium or Chrome, and none of {', '.join(BROWSERS)} is on PATH; "
+            f"a PDF is printed by Chromium or Chrome; none of {', '.join(BROWSERS)} is on PATH; "
             f"install one (Debian, Ubuntu: apt install chromium), or open {page} and print it"
         )
     with tempfile.TemporaryDirectory() as scratch:
