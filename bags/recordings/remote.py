@@ -208,13 +208,14 @@ class RemotePath(PosixPath):
         return held[at] if at >= 0 and byte < held[at][0] + len(held[at][1]) else None
 
     def _hold(self, start: int, content: bytes) -> None:
-        """Keep a part; the oldest leave when there is too much."""
+        """Keep a part in the place of those inside it; the oldest leave when there is too much."""
         order: list[tuple[int, bytes]] = self.__dict__.setdefault("_order_held", [])
+        end = start + len(content)
+        order[:] = [p for p in order if p[0] < start or p[0] + len(p[1]) > end]
         order.append((start, content))
         while len(order) > 1 and sum(len(part) for _, part in order) > HELD_BYTES:
             order.pop(0)
-        longest = dict(sorted(order, key=lambda part: (part[0], len(part[1]))))
-        self.__dict__["_parts_held"] = sorted(longest.items())
+        self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
     def _asked(self, ask: Callable[[Any, str, dict[str, float]], T]) -> T:
         """The answer of storage, asked again with growing waits while the patience lasts."""
