@@ -36,6 +36,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import (
     BlockCascadeClass,
+    CellClass,
     CertifiedSem,
     Fit,
     ImplicitClass,
@@ -220,6 +221,8 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
             yield StateAffineClass(lags, leading_degree=2, right_degree=3), CertifiedSem(STEPS)
             half = (lags + 1) // 2
             yield BlockCascadeClass((half, lags - half), phases=(1,), intervals=(8, 16)), Sem()
+    if first.y.shape[1] == 1:
+        yield from ((CellClass(cells), CertifiedSem(STEPS)) for cells in (1, 2))
     if one:
         yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
 

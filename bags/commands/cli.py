@@ -25,6 +25,7 @@ from bags.commands.fleet_cli import (
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
+from nlsid_core import second as second_kernel
 from nlsid_core.errors import DataError, NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -300,10 +301,14 @@ def compose(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    second: Annotated[
+        bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
+    ] = False,
 ) -> None:
     """Decide proofs without a solver: PROVED (status 0) or REJECTED (status 1).
 
-    Status 2 if a proof cannot be read, so that nothing was decided about it.
+    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
+    kernel was asked and has no opinion of it.
     """
     status = 0
     for path in proofs:
@@ -311,6 +316,10 @@ def check(
         try:
             said = str(kernel.check(path))
             typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
+            if second:
+                opinion = second_kernel.opinion(path)
+                typer.echo(f"  {opinion}")
+                status = max(status, {"accepted": 0, "refused": 1}.get(opinion.verdict, 2))
         except kernel.Rejected as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")
