@@ -3,10 +3,11 @@
 The kernel's `positive` takes monomials v, a power of two for each (V = diag 2^columns), and factors
 R_j of whole numbers, and asks that what is left of the polynomial,
     r = c - Σ_j B_j(s) |R_j V v|² / 4^unit,
-is diagonally dominant in V v. So the Gram matrix is scaled to a diagonal near 1, half of its least
-eigenvalue is left to r, and the Cholesky factor of the rest is rounded: log2(order/δ) + 4 bits keep
-the rounding below δ. Where v_i² = v_a v_b, the rounding of the pair counts on the diagonal of v_i:
-there a column is raised to the mean of the pair's. Nothing here is trusted.
+is diagonally dominant in V v. So the Gram matrix is scaled to a diagonal near 1, most of its least
+eigenvalue is left to r, and the Cholesky factor of the rest is rounded to the fewest bits that
+change no row of the Gram matrix by more than a part of that. Where v_i² = v_a v_b, the rounding of
+the pair counts on the diagonal of v_i: there a column is raised to the mean of the pair's. Nothing
+here is trusted.
 Source: docs/certificate.md.
 """
 
@@ -22,8 +23,8 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial.documents import write_whole
 
-ROOM = 0.5  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
-SPARE_BITS = 4  # beyond log2(order/δ): the rounding of a row's products then stays below δ
+ROOM = 0.9  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
+ROUNDING = 0.3  # of that room: what rounding may take of a row
 MULTIPLIER_BITS = 48  # of a multiplier's factor: any rounding of it is a sum of squares
 SMALLEST = 2.0**-200  # of a diagonal entry, relative to the largest: below it a column is not used
 Residual = Mapping[tuple[int, ...], ArrayLike]
@@ -54,15 +55,17 @@ def witness(
     room = ROOM * least
     columns = _raised(monomials, _columns(Q))
     small = diagonal * np.exp2(-columns.astype(np.float64))
-    unit = max(0, ceil(log2(len(monomials) / (room.min() * small.min() ** 2))) + SPARE_BITS)
     try:
-        roots = [
+        roots = np.array([
             cholesky(part - delta * np.eye(len(part))) * small
             for part, delta in zip(S, room, strict=True)
-        ]
+        ])  # fmt: skip
     except LinAlgError as error:
         raise Infeasible("a Gram matrix is positive definite to rounding only") from error
-    return _written(monomials, columns, unit, roots)
+    allowed = ROUNDING * room[:, None] * small**2
+    enough = ceil(log2(len(monomials) ** 1.5 / allowed.min()))  # |E|₁ ≤ k^1.5 2^-unit
+    unit = next(u for u in range(max(0, enough) + 1) if u >= enough or _kept(roots, u, allowed))
+    return _written(monomials, columns, unit, list(roots))
 
 
 def multiplier(
@@ -167,6 +170,13 @@ def _absorbed(monomials: IntArray, Q: FloatArray, residual: Residual) -> FloatAr
         for i, j in places[tuple(key)]:
             Q[:, i, j] += control / len(places[tuple(key)])
     return Q
+
+
+def _kept(roots: FloatArray, unit: int, allowed: FloatArray) -> bool:
+    """Whether factors of whole numbers over 2^unit change no row of R'R by more than allowed."""
+    whole = np.ldexp(np.round(np.ldexp(roots, unit)), -unit)
+    lost = np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole
+    return bool((np.abs(lost).sum(axis=2) <= allowed).all())
 
 
 def _columns(Q: FloatArray) -> IntArray:
