@@ -25,6 +25,7 @@ from bags.commands.fleet_cli import (
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
+from nlsid_core import second as second_kernel
 from nlsid_core.errors import DataError, NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -300,10 +301,14 @@ def compose(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    second: Annotated[
+        bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
+    ] = False,
 ) -> None:
     """Decide proofs without a solver: PROVED (status 0) or REJECTED (status 1).
 
-    Status 2 if a proof cannot be read, so that nothing was decided about it.
+    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
+    kernel was asked and has no opinion of it.
     """
     status = 0
     for path in proofs:
@@ -311,6 +316,10 @@ def check(
         try:
             said = str(kernel.check(path))
             typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
+            if second:
+                opinion = second_kernel.opinion(path)
+                typer.echo(f"  {opinion}")
+                status = max(status, {"accepted": 0, "refused": 1}.get(opinion.verdict, 2))
         except kernel.Rejected as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")
@@ -332,6 +341,9 @@ def report(
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
     ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also as PDF beside the page; needs Chromium or Chrome.")
+    ] = False,
 ) -> None:
     """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
 
@@ -341,7 +353,7 @@ def report(
     from bags.commands import show
     from bags.designs import documents
     from bags.monitoring.replay import replay_bag
-    from bags.pictures.folder_report import write_folder_report
+    from bags.pictures.folder_report import print_page, write_folder_report
     from bags.pictures.report import report_available
     from bags.recordings.folders import expand_bags
 
@@ -363,6 +375,9 @@ def report(
             drawn = plots.svg(plots.margins(replays))
     write_folder_report(folder, target, replays=replays, drawn=drawn)
     out.print(f"wrote {target}", soft_wrap=True)
+    if pdf:
+        print_page(target, target.with_suffix(".pdf"))
+        out.print(f"wrote {target.with_suffix('.pdf')}", soft_wrap=True)
 
 
 @app.command()

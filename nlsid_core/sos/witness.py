@@ -13,6 +13,7 @@ Source: docs/certificate.md.
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from itertools import combinations
 from math import ceil, lcm, log2
 
 import numpy as np
@@ -23,8 +24,9 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial.documents import write_whole
 
-ROOM = 0.9  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
-ROUNDING = 0.3  # of that room: what rounding may take of a row
+ROOM = 0.7  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
+ROUNDING = 0.3  # of that room: what rounding may take of a diagonal entry
+SPARE_BITS = 8  # beyond what is enough where no product of v is a square of another
 MULTIPLIER_BITS = 48  # of a multiplier's factor: any rounding of it is a sum of squares
 SMALLEST = 2.0**-200  # of a diagonal entry, relative to the largest: below it a column is not used
 Residual = Mapping[tuple[int, ...], ArrayLike]
@@ -64,7 +66,10 @@ def witness(
         raise Infeasible("a Gram matrix is positive definite to rounding only") from error
     allowed = ROUNDING * room[:, None] * small**2
     enough = ceil(log2(len(monomials) ** 1.5 / allowed.min()))  # |E|₁ ≤ k^1.5 2^-unit
-    unit = next(u for u in range(max(0, enough) + 1) if u >= enough or _kept(roots, u, allowed))
+    enough = max(0, enough + SPARE_BITS)
+    places = _charged(monomials, columns)
+    kept = (u for u in range(enough) if (_lost(roots, u, places) <= allowed).all())
+    unit = next(kept, enough)
     return _written(monomials, columns, unit, list(roots))
 
 
@@ -172,11 +177,28 @@ def _absorbed(monomials: IntArray, Q: FloatArray, residual: Residual) -> FloatAr
     return Q
 
 
-def _kept(roots: FloatArray, unit: int, allowed: FloatArray) -> bool:
-    """Whether factors of whole numbers over 2^unit change no row of R'R by more than allowed."""
+def _lost(roots: FloatArray, unit: int, places: tuple[IntArray, IntArray]) -> FloatArray:
+    """(J+1, k) what each diagonal entry of r loses where factors are whole numbers over 2^unit."""
     whole = np.ldexp(np.round(np.ldexp(roots, unit)), -unit)
-    lost = np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole
-    return bool((np.abs(lost).sum(axis=2) <= allowed).all())
+    change = np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole
+    at = np.zeros_like(change)
+    for total, part in zip(at, change, strict=True):
+        np.add.at(total, places, part)
+    return np.asarray(np.abs(at).sum(axis=1) + np.abs(at).sum(axis=2)) / 2
+
+
+def _charged(monomials: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
+    """(k, k) each: where the kernel counts v_a v_b, at a square's own place or that of one pair."""
+    k, shifts = len(monomials), columns.tolist()
+    keys = [[tuple(key) for key in row] for row in (monomials[:, None] + monomials[None]).tolist()]
+    home: dict[tuple[int, ...], tuple[int, int]] = {}
+    for i, j in combinations(range(k), 2):
+        a, b = home.setdefault(keys[i][j], (i, j))
+        if shifts[i] + shifts[j] > shifts[a] + shifts[b]:
+            home[keys[i][j]] = (i, j)
+    home |= {keys[i][i]: (i, i) for i in range(k)}
+    places = np.array([[home[key] for key in row] for row in keys])
+    return places[..., 0], places[..., 1]
 
 
 def _columns(Q: FloatArray) -> IntArray:
