@@ -63,6 +63,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "executors": Benchmark("executors"),
         "faults": Benchmark("faults"),
         "first_order_bias": Benchmark("first_order_bias"),
+        "fleet": Benchmark("fleet"),
         "funnel_scaling": Benchmark("funnel_scaling"),
         "heat_exchanger": Benchmark("heat_exchanger", data="exchanger"),
         "known_problems": Benchmark("known_problems"),
