@@ -1,4 +1,4 @@
-"""The second kernel (verified/): the examples' proofs in Coq and extracted; mutants of both kernels.
+"""The second kernel (verified/): proofs of the examples in Coq and extracted; mutants of both.
 
     python -m benchmarks.verified [--json] [--mutations N] [--no-designs]
 
