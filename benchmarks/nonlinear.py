@@ -20,6 +20,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ from nlsid_core.identification import (
     StateAffineClass,
     identify,
 )
+from nlsid_core.identification.cells import Limit
 from nlsid_core.identification.prediction import simulate_trials
 
 SAMPLES = 10_000
@@ -222,7 +224,9 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
             half = (lags + 1) // 2
             yield BlockCascadeClass((half, lags - half), phases=(1,), intervals=(8, 16)), Sem()
     if first.y.shape[1] == 1:
-        yield from ((CellClass(cells), CertifiedSem(STEPS)) for cells in (1, 2))
+        limits: tuple[Limit, ...] = ("top", "friction", "none")
+        for cells, limit in product((1, 2), limits):
+            yield CellClass(cells, intervals=4, limit=limit), CertifiedSem(STEPS)
     if one:
         yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
 

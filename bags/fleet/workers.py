@@ -84,7 +84,7 @@ def _dask(scheduler: str) -> Executor:
     except ImportError as error:
         raise DataError("--scheduler needs Dask: pip install 'nlsid[fleet]'") from error
     try:
-        client: Any = Client(scheduler, set_as_default=False)  # type: ignore[no-untyped-call]
+        client: Any = Client(scheduler, set_as_default=False)
     except (OSError, ValueError) as error:
         raise DataError(f"no Dask scheduler answers at {scheduler}: {error}") from error
     executor: Executor = client.get_executor()

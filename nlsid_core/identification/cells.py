@@ -1,7 +1,8 @@
 """`identify_cells`: contracting scalar cells in a row, that saturate and flow over, as a network.
 
     z_i = φ_i(x_i) + g_i(x_{i-1}) + γ_i (z_{i-1} - m_{i-1})₊ + b_i·u,
-    x_i⁺ = min(z_i, m_i),   y = x_c
+    x_i⁺ = min(z_i, m_i),   y = x_c,   or with friction   y⁺ = rest + z_c - min(max(z_c, -h), h):
+dry friction h as the implicit Euler method has it, with sticking (z_c is then a force times time).
 φ_i, g_i are linear between equally spaced knots. Slopes of φ_i in [0, ρ] make every such cascade
 stable: V = Σ w^i Δx_i² decreases at a rate near ρ for a small w, what a cell gets from those before
 it being bounded. Inside these bounds the simulation error is minimised, x(0) of every trial free,
@@ -11,7 +12,7 @@ with exact sensitivities: with all signals known they solve one bidiagonal syste
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement, product
-from typing import ClassVar
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 from scipy.linalg import solve_banded
@@ -24,10 +25,12 @@ from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
 from nlsid_core.identification.fit import Step
 from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.models import CellNetwork, PiecewiseLinear, Signal
-from nlsid_core.options import require_whole
+from nlsid_core.options import require_one_of, require_whole
 
 MOST_CELLS, MOST_INTERVALS, MOST_START_SAMPLES = 3, 30, 10_000
 POLES = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)  # of the cells, at the start
+LEAST_FRICTION = 1e-6
+FRICTIONS = (0.1, 0.5)  # in spreads of y, what it takes from y at rest, at the start
 TOPS = (1.0, 0.9, 0.75)  # quantiles of a hidden state at which it flows over, at the start
 STARTS, KEPT = 3, 2  # combinations of poles; minima that are refined
 START_SAMPLES, START_STEPS, START_INTERVALS = 5000, 20, 2
@@ -35,18 +38,22 @@ TOLERANCE = 1e-6
 DIVERGED = 1e6  # a state in spreads: what the minimiser should not visit
 
 
+Limit = Literal["top", "friction", "none"]
+
+
 @dataclass(frozen=True)
 class CellClass:
     """Scalar states in a row, each contracting by a map of its own; the last is the output.
 
-    cells: 1 to 3, the others hidden. intervals: between the knots of a map, 1 to 30. saturation:
-    cells have tops, and flow over into the next. start_samples: at the start of a trial, that show
-    its first state and are not scored, 1 to 10000. smoothing: of slopes of neighbouring intervals.
+    cells: 1 to 3, the others hidden. intervals: between the knots of a map, 1 to 30. limit: of the
+    states, "top" (cells flow over into the next), "friction" (dry, of the output) or "none".
+    start_samples: at the start of a trial, that show its first state and are not scored, 1 to
+    10000. smoothing: of slopes of neighbouring intervals.
     """
 
     cells: int = 2
     intervals: int = 6
-    saturation: bool = True
+    limit: Limit = "top"
     start_samples: int = 20
     smoothing: float = 1e-6
     kind: ClassVar[type[CellNetwork]] = CellNetwork
@@ -55,6 +62,7 @@ class CellClass:
         require_whole(self, "cells", 1, MOST_CELLS)
         require_whole(self, "intervals", 1, MOST_INTERVALS)
         require_whole(self, "start_samples", 1, MOST_START_SAMPLES)
+        require_one_of(self, "limit", get_args(Limit))
         if not 0.0 <= self.smoothing < np.inf:
             raise OptionError("smoothing", self.smoothing, "0 or more")
 
@@ -72,7 +80,8 @@ class Trial:
 class Cascade:
     """c cells with K intervals: knots (c, K+1); level (c,); phi, g (c, K) slopes, of g[0] none.
 
-    gamma, top (c,), b (c, q); top is infinite without saturation; x0 (trials, c). g_i is zero at
+    gamma, top, half, rest (c,), b (c, q); top is infinite where there is none, half (width of the
+    dead zone) not a number; x0 (trials, c). g_i is zero at
     the first knot of x_{i-1}.
     """
 
@@ -82,6 +91,8 @@ class Cascade:
     g: FloatArray
     gamma: FloatArray
     top: FloatArray
+    half: FloatArray
+    rest: FloatArray
     b: FloatArray
     x0: FloatArray
 
@@ -91,6 +102,8 @@ class Cascade:
         for i in range(len(self.level)):
             parts += [self.level[i : i + 1], self.phi[i], self.b[i]]
             parts += [self.g[i]] if i else []
+            if np.isfinite(self.half[i]):
+                parts += [self.half[i : i + 1], self.rest[i : i + 1]]
             if np.isfinite(self.top[i]):
                 parts += [self.top[i : i + 1], *([self.gamma[i : i + 1]] if i else [])]
         return np.concatenate([*parts, self.x0.ravel()])
@@ -101,6 +114,8 @@ class Cascade:
         for i in range(len(self.level)):
             sizes = {"level": 1, "phi": self.phi.shape[1], "b": self.b.shape[1]}
             sizes |= {"g": self.g.shape[1]} if i else {}
+            if np.isfinite(self.half[i]):
+                sizes |= {"half": 1, "rest": 1}
             if np.isfinite(self.top[i]):
                 sizes |= {"top": 1} | ({"gamma": 1} if i else {})
             cell = {}
@@ -112,7 +127,10 @@ class Cascade:
 
     def unpacked(self, theta: FloatArray) -> "Cascade":
         """The same with other free numbers."""
-        arrays = {k: getattr(self, k).copy() for k in ("level", "phi", "g", "gamma", "top", "b")}
+        arrays = {
+            k: getattr(self, k).copy()
+            for k in ("level", "phi", "g", "gamma", "top", "half", "rest", "b")
+        }
         for i, cell in enumerate(self.places()):
             for name, place in cell.items():
                 arrays[name][i] = theta[place] if arrays[name].ndim > 1 else theta[place][0]
@@ -131,6 +149,7 @@ class Cascade:
         onward = [np.concatenate([[0.0], np.cumsum(self.g[i] * widths[i - 1])]).tolist()
                   for i in range(cells)]  # fmt: skip
         top, gamma = self.top.tolist(), self.gamma.tolist()
+        half, rest = self.half.tolist(), self.rest.tolist()
         x, xs, zs = x0.tolist(), [], []
         for drive in rows:
             xs.append(x)
@@ -142,7 +161,10 @@ class Cascade:
                 value = own[i][k] + phi[i][k] * d + drive[i] + flow
                 z.append(value)
                 over = value - top[i]
-                after.append(top[i] if over > 0.0 else value)
+                if half[i] == half[i]:
+                    after.append(rest[i] + value - min(max(value, -half[i]), half[i]))
+                else:
+                    after.append(top[i] if over > 0.0 else value)
                 if i + 1 < cells:
                     flow = onward[i + 1][k] + g[i + 1][k] * d
                     if over > 0.0:
@@ -177,13 +199,17 @@ class Cascade:
                     flows = over_before > 0.0
                     direct[:, cell["gamma"]] = np.maximum(over_before, 0.0)[:, None]
                     direct += (self.gamma[i] * flows)[:, None] * after
-            below = z[:, i] <= self.top[i]
+            rubs = "half" in cell
+            below = abs(z[:, i]) > self.half[i] if rubs else z[:, i] <= self.top[i]
             a = below * self.phi[i][index]
             forcing = np.zeros((N, len(used)))
             forcing[0, column[own + i]] = 1.0
             forcing[1:] = below[:-1, None] * direct[:-1]
             if "top" in cell:
                 forcing[1:, cell["top"]] += ~below[:-1, None]
+            if rubs:
+                forcing[1:, cell["rest"]] += 1.0
+                forcing[1:, cell["half"]] -= (below * np.sign(z[:, i]))[:-1, None]
             bands = np.ones((2, N))
             bands[1] = -a
             moved = solve_banded((1, 0), bands, forcing, overwrite_b=True, check_finite=False)
@@ -227,12 +253,16 @@ def identify_cells(
     short = _shortened(trials)
     tried, done = [], []
     for poles in _best_poles(short, model_class.cells, slowest):
-        hidden = model_class.cells - 1 if model_class.saturation else 0
-        for tops in product(TOPS, repeat=hidden):
-            start = _start(short, poles, tops, model_class)
+        limits = list(product(TOPS, repeat=model_class.cells - 1))
+        if model_class.limit != "top":
+            limits = [(h,) for h in FRICTIONS] if model_class.limit == "friction" else [()]
+        for levels in limits:
+            start = _start(short, poles, levels, model_class, -scales[2] / scales[3])
             tried.append(_minimised(start, short, model_class, slowest, START_STEPS))
             named = ", ".join(f"{pole:g}" for pole in poles)
-            done.append(Step(f"poles {named}, tops {tops}", scales[3] * tried[-1][0]))
+            done.append(
+                Step(f"poles {named}, {model_class.limit} {levels}", scales[3] * tried[-1][0])
+            )
     found = []
     for _, cascade in sorted(tried, key=lambda entry: entry[0])[:KEPT]:
         wide = _with_trials(cascade, short, trials)
@@ -261,6 +291,8 @@ def _minimised(
     low, high = np.full(len(theta), -np.inf), np.full(len(theta), np.inf)
     for cell in places:
         low[cell["phi"]], high[cell["phi"]] = 0.0, slowest
+        if "half" in cell:
+            low[cell["half"]] = LEAST_FRICTION
     smooth = [
         (place.start + k, place.start + k + 1)
         for cell in places for name, place in cell.items() if name in ("phi", "g")
@@ -334,9 +366,13 @@ def _best_poles(trials: Sequence[Trial], cells: int, slowest: float) -> list[tup
 
 
 def _start(
-    trials: Sequence[Trial], poles: Sequence[float], tops: Sequence[float], model_class: CellClass
+    trials: Sequence[Trial],
+    poles: Sequence[float],
+    levels: Sequence[float],
+    model_class: CellClass,
+    still: float,
 ) -> Cascade:
-    """The linear cascade with these poles, hidden states in their spreads."""
+    """The linear cascade with these poles, hidden states in their spreads; still: y of 0."""
     cells, q = len(poles), trials[0].u.shape[1]
     _, gains = _gains(trials, poles)
     paths = [_filtered(trial.u @ gains[:-1, None], poles) for trial in trials]
@@ -354,15 +390,18 @@ def _start(
     level[-1] += (1.0 - pole[-1]) * gains[-1]
     b = np.zeros((cells, q))
     b[0] = (1.0 - pole[0]) * gains[:-1] / spread[0]
-    top = np.full(cells, np.inf)
-    if model_class.saturation:
-        top = np.array(
-            [float(np.quantile(part / s, quantile)) for part, s, quantile in
-             zip(x, spread, (*tops, 1.0), strict=True)]
-        )  # fmt: skip
+    top, half, rest = np.full(cells, np.inf), np.full(cells, np.nan), np.zeros(cells)
+    if model_class.limit == "top":
+        parts = zip(x, spread, (*levels, 1.0), strict=True)
+        top = np.array([float(np.quantile(part / s, quantile)) for part, s, quantile in parts])
+    elif model_class.limit == "friction":
+        half[-1], rest[-1] = levels[0] * (1.0 - pole[-1]), still
+        level[-1] -= still
     x0 = np.array([[path[i][0, 0] / spread[i] for i in range(cells)] for path in paths])
     x0[:, -1] = [trial.y[0] for trial in trials]
-    return Cascade(knots, level, phi, np.repeat(gain[:, None], K, axis=1), gain, top, b, x0)
+    return Cascade(
+        knots, level, phi, np.repeat(gain[:, None], K, axis=1), gain, top, half, rest, b, x0
+    )
 
 
 def _knots(x: FloatArray, intervals: int) -> FloatArray:
@@ -407,8 +446,8 @@ def _network(
 ) -> CellNetwork:
     """The cascade as a network of recorded signals: the only place where scaling is undone."""
     cells, q = cascade.b.shape
-    saturates = bool(np.isfinite(cascade.top).all())
-    m = (3 if saturates else 2) * cells - 1
+    saturates = np.isfinite(cascade.top)
+    m = 2 * cells - 1 + int(saturates.sum()) + int(np.isfinite(cascade.half).sum())
     width = m + cells + q + 1
     maps: list[PiecewiseLinear] = []
     into, after = [], np.zeros((cells, width))
@@ -427,14 +466,18 @@ def _network(
         z[m + cells : -1] += cascade.b[i] / scales[1]
         z[-1] -= float(cascade.b[i] @ (scales[0] / scales[1]))
         after[i] = z
-        if saturates:
+        if saturates[i]:
             top = float(cascade.top[i])
             clip = PiecewiseLinear(np.array([top - 1, top, top + 1]), np.array([top - 1, top, top]))
             after[i] = added(clip, z)
+        elif np.isfinite(cascade.half[i]):
+            h, rest = float(cascade.half[i]), float(cascade.rest[i])
+            ends, sticks = np.array([-h - 1, -h, h, h + 1]), np.array([-1.0, 0.0, 0.0, 1.0])
+            after[i] = added(PiecewiseLinear(ends, rest + sticks), z)
         if i + 1 < cells:
             values = np.concatenate([[0.0], np.cumsum(cascade.g[i + 1] * widths)])
             onward = added(PiecewiseLinear(knots, values), state)
-            onward = onward + cascade.gamma[i + 1] * (z - after[i]) * saturates
+            onward = onward + cascade.gamma[i + 1] * (z - after[i]) * saturates[i]
     output = scales[3] * _unit(m + cells - 1, width) + scales[2] * _unit(width - 1, width)
     first = train.trajectories[0]
     return CellNetwork(

@@ -22,7 +22,7 @@ from nlsid_core.identification import (
     prove_stability,
     select,
 )
-from nlsid_core.identification.cells import Cascade, Trial
+from nlsid_core.identification.cells import Cascade, Limit, Trial
 from nlsid_core.identification.prediction import predict, simulate_trial
 from nlsid_core.models import CellNetwork, PiecewiseLinear
 from tests.core.kernel.stability_claims import network
@@ -51,7 +51,7 @@ def test_two_tanks_that_flow_over_are_found_to_the_noise_and_proved(fit: Fit[Cel
 
 
 def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
-    straight = identify(tanks(1), replace(SMALL, saturation=False))
+    straight = identify(tanks(1), replace(SMALL, limit="none"))
     assert len(straight.model.maps) == 3
     assert rms(straight, tanks(1)) > 3.0 * rms(fit, tanks(1))
 
@@ -67,25 +67,30 @@ def test_select_takes_the_cells_where_the_data_are_of_cells() -> None:
     assert chosen.errors[2] < 0.3 * min(chosen.errors[:2])
 
 
-def cascade(saturates: bool) -> tuple[Cascade, Trial]:
+def cascade(limit: str) -> tuple[Cascade, Trial]:
     rng = np.random.default_rng(3)
     K, cells = 3, 3
-    top = np.array([0.6, 0.4, 0.9]) if saturates else np.full(cells, np.inf)
+    top = np.array([0.6, 0.4, 0.9]) if limit == "top" else np.full(cells, np.inf)
+    half = np.array([np.nan, np.nan, 1.0 if limit == "friction" else np.nan])
     made = Cascade(
         knots=np.tile(np.linspace(-1.0, 1.0, K + 1), (cells, 1)), level=rng.normal(0, 0.1, cells),
         phi=rng.uniform(0.2, 0.9, (cells, K)), g=rng.uniform(0.1, 0.6, (cells, K)),
-        gamma=rng.uniform(0.2, 0.8, cells), top=top, b=rng.normal(0, 0.4, (cells, 2)),
+        gamma=rng.uniform(0.2, 0.8, cells), top=top, half=half, rest=np.array([0.0, 0.0, 0.1]),
+        b=rng.normal(0, 0.4, (cells, 2)),
         x0=rng.normal(0, 0.5, (2, cells)),
     )  # fmt: skip
     return made, Trial(rng.normal(size=(60, 2)), np.zeros(60), 0)
 
 
-@pytest.mark.parametrize("saturates", [True, False])
-def test_the_sensitivities_are_those_of_finite_differences(saturates: bool) -> None:
-    made, trial = cascade(saturates)
+@pytest.mark.parametrize("limit", ["top", "friction", "none"])
+def test_the_sensitivities_are_those_of_finite_differences(limit: str) -> None:
+    made, trial = cascade(limit)
     theta = made.pack()
     x, z = made.simulate(trial.u, made.x0[1])
-    assert not saturates or (z > made.top).any(axis=0).all(), "every cell flows over"
+    assert limit != "top" or (z > made.top).any(axis=0).all(), "every cell flows over"
+    assert limit != "friction" or 0.05 < np.mean(abs(z[:, 2]) < made.half[2]) < 0.95, (
+        "it sticks and slips"
+    )
     J, h = made.sensitivities(trial, x, z, 1), 1e-7
     for k in range(len(theta)):
         moved = [made.unpacked(theta + sign * h * np.eye(len(theta))[k]) for sign in (1.0, -1.0)]
@@ -179,3 +184,31 @@ def test_data_that_cannot_be_used_are_refused() -> None:
     ):
         with pytest.raises(error, match=said):
             identify(Dataset((bad,)), CellClass(cells=1), method=CertifiedSem())
+
+
+def sliding(seed: int, samples: int = 1200) -> Dataset:
+    """A mass with viscous and dry friction under stepped forces: it comes to rest, and sticks."""
+    rng, v, y = np.random.default_rng(seed), 0.3, []
+    u = np.repeat(rng.uniform(-3.0, 3.0, samples // 20), 20)
+    for force in u:
+        y.append(v)
+        free = 0.95 * v + 0.05 * force
+        v = free - min(max(free, -0.06), 0.05)
+    measured = np.array(y) + 0.002 * rng.standard_normal(samples)
+    return Dataset(
+        (Trajectory(t=0.01 * np.arange(samples), y=measured, u=u, name=f"slide {seed}"),)
+    )
+
+
+def test_a_slide_that_comes_to_rest_in_dry_friction_is_found_and_proved() -> None:
+    """It stands still for a tenth of the time or more."""
+    resting = np.mean(np.abs(sliding(1).trajectories[0].y) < 0.006)
+    assert resting > 0.1
+    errors = {}
+    limits: tuple[Limit, ...] = ("friction", "none")
+    for limit in limits:
+        made = identify(sliding(1), CellClass(1, intervals=2, limit=limit))
+        errors[limit] = rms(made, sliding(2))
+        assert made.proof.rate < 0.97
+    assert errors["friction"] < 1.3 * 0.002
+    assert errors["none"] > 3.0 * errors["friction"]

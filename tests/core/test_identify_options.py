@@ -51,6 +51,7 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (CellClass, "cells"): ((1, 3), (0, 4, 1.5)),
     (CellClass, "intervals"): ((1, 30), (0, 31)),
     (CellClass, "start_samples"): ((1, 10_000), (0, 10_001)),
+    (CellClass, "limit"): (("top", "friction", "none"), ("saturation",)),
     (CellClass, "smoothing"): ((0.0, 1.0), (-1e-9, float("nan"), float("inf"))),
     (ImplicitClass, "lags"): ((1, 100), (0, 101)),
     (ImplicitClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
@@ -64,11 +65,7 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (CertifiedRse, "iterations"): ((1, 1000), (0, 1001)),
     (CertifiedSem, "iterations"): ((1, 1000), (0, 1001)),
 }
-FREE = {
-    (MomentRie, "accept_untested_repeats"),
-    (ImplicitClass, "coupled"),
-    (CellClass, "saturation"),
-}  # true or false
+FREE = {(MomentRie, "accept_untested_repeats"), (ImplicitClass, "coupled")}  # true or false
 
 
 @pytest.mark.parametrize(("kind", "key"), LIMITS, ids=lambda part: getattr(part, "__name__", part))
