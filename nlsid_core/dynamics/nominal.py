@@ -37,12 +37,16 @@ class Nominal:
         return self.x.t
 
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
-        """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""
-        rate = self.x.derivative()
-        worst = (0.0, float(self.t[0]), 0)
+        """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, in which interval (its start, s), and state."""
+        gaps = self.gaps(field)
+        k, i = np.unravel_index(int(gaps.argmax()), gaps.shape)
+        return float(gaps[k, i]), float(self.t[k]), int(i)
+
+    def gaps(self, field: VectorField | Rates) -> FloatArray:
+        """(K-1, n) the largest |f(t, x₀, u₀) - ẋ₀| over fine samples of every interval."""
+        rate, gaps = self.x.derivative(), np.zeros((len(self.t) - 1, self.x.control.shape[2]))
         for k, (start, end) in enumerate(zip(self.t[:-1], self.t[1:], strict=True)):
-            for t in np.linspace(start, end, SAMPLES, endpoint=k == len(self.t) - 2):
+            for t in np.linspace(start, end, SAMPLES, endpoint=k == len(gaps) - 1):
                 gap = np.abs(field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t))
-                if gap.max() > worst[0]:
-                    worst = (float(gap.max()), float(t), int(gap.argmax()))
-        return worst
+                gaps[k] = np.maximum(gaps[k], gap)
+        return gaps
