@@ -37,7 +37,7 @@ class Nominal:
         return self.x.t
 
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
-        """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, in which interval (its start, s), and state."""
+        """The largest |f(t, x₀, u₀) - ẋ₀| sampled, its interval's start (s), and the state."""
         gaps = self.gaps(field)
         k, i = np.unravel_index(int(gaps.argmax()), gaps.shape)
         return float(gaps[k, i]), float(self.t[k]), int(i)

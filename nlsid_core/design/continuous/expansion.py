@@ -25,7 +25,9 @@ STEP = 1.3  # of ρ, while the largest is bracketed
 FALL = 0.98  # of ρ, squared at each further try
 MAX_TRIES = 10  # of exact L-steps a knot
 BACK, MAX_BACK = 0.8, 40  # of ρ, where the interval before cannot take it; how often
-BETWEEN = np.linspace(0.125, 0.875, 7)  # of an interval, where bounds are looked at, no program solved
+BETWEEN = np.linspace(
+    0.125, 0.875, 7
+)  # of an interval, where bounds are looked at, no program solved
 STEEP = 0.01  # of (Δρ/ρ)² over the interval's length: left where 1/ρ is far from linear in time
 LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
 
@@ -173,15 +175,14 @@ class _Interval:
 
     def between(self, rho: float, known: Ends) -> float:
         """An upper bound of what is left within the interval, from the duals at its ends."""
-        h = self.pair[1].t - self.pair[0].t
-        found = []
+        h, least = self.pair[1].t - self.pair[0].t, np.inf
         for s in BETWEEN.tolist():
             section = section_at(self.steps, self.policy, self.P, self.k, s)
             here = (1 - s) * rho + s * self.after
-            duals = known.start if s < 0.5 else known.end  # noqa: PLR2004
+            duals = known.start if s < 0.5 else known.end
             phi = self.steps.predicted(section, here, duals, saturated=False)
-            found.append(phi + (self.after - rho) / h / here)
-        return min(found)
+            least = min(least, phi + (self.after - rho) / h / here)
+        return least
 
     def largest(self, ratio: float, known: Ends | None, cap: float) -> tuple[float, Ends]:
         """The largest ρ ≤ cap at the start, nearly, and its L-steps.
@@ -233,4 +234,5 @@ class _Interval:
         values = [-np.inf if known is None else self.predicted(r, known) for r in levels.tolist()]
         rho = float(levels[int(np.argmax(values))])
         self.expand(rho)
-        return diagnosed(self.steps, self.pair, (rho, self.after))
+        growth = (self.after - rho) / (self.pair[1].t - self.pair[0].t)
+        return diagnosed(self.steps, self.pair, (rho, self.after), growth)

@@ -6,7 +6,7 @@ Source: Hargraves and Paris, "Direct trajectory optimization using nonlinear pro
 collocation", 1987; Mao, Szmuk and Açıkmeşe, "Successive convexification", 2016.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -115,7 +115,7 @@ def plan_motion(
 
 def _held(
     rates: VectorField | Rates,
-    ends: list[FloatArray],
+    ends: Sequence[FloatArray],
     rest: FloatArray,
     seconds: float,
     box: FloatArray,
