@@ -20,6 +20,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import (
     BlockCascadeClass,
+    CellClass,
     CertifiedSem,
     Fit,
     ImplicitClass,
@@ -48,6 +50,7 @@ from nlsid_core.identification import (
     StateAffineClass,
     identify,
 )
+from nlsid_core.identification.cells import Limit
 from nlsid_core.identification.prediction import simulate_trials
 
 SAMPLES = 10_000
@@ -220,6 +223,10 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
             yield StateAffineClass(lags, leading_degree=2, right_degree=3), CertifiedSem(STEPS)
             half = (lags + 1) // 2
             yield BlockCascadeClass((half, lags - half), phases=(1,), intervals=(8, 16)), Sem()
+    if first.y.shape[1] == 1:
+        limits: tuple[Limit, ...] = ("top", "friction", "none")
+        for cells, limit in product((1, 2), limits):
+            yield CellClass(cells, intervals=4, limit=limit), CertifiedSem(STEPS)
     if one:
         yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
 

@@ -14,6 +14,7 @@ from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -29,8 +30,8 @@ from nlsid_core.policies.tube import TubePolicy
 Noun: TypeAlias = (
     ContinuousFunnel | SampledFunnel | TubeFunnel
     | ContinuousPolicy | SampledPolicy | TubePolicy | VectorField
-    | BlockCascade | DifferenceEquation | ImplicitModel | MonotoneEquation | StateAffineModel
-    | StateModel | TrapezoidalModel
+    | BlockCascade | CellNetwork | DifferenceEquation | ImplicitModel | MonotoneEquation
+    | StateAffineModel | StateModel | TrapezoidalModel
 )  # fmt: skip
 
 # By format, and by kind where the format has kinds.
@@ -44,6 +45,7 @@ READERS: Mapping[tuple[str, str | None], Callable[..., Noun]] = MappingProxyType
         ("nlsid/policy", "tube"): TubePolicy.from_document,
         ("nlsid/policy", "sampled"): SampledPolicy.from_document,
         ("nlsid/model", "block_cascade"): BlockCascade.from_document,
+        ("nlsid/model", "cell_network"): CellNetwork.from_document,
         ("nlsid/model", "difference_equation"): DifferenceEquation.from_document,
         ("nlsid/model", "implicit"): ImplicitModel.from_document,
         ("nlsid/model", "monotone_equation"): MonotoneEquation.from_document,

@@ -3,6 +3,7 @@
 
     python generate.py FILE.proof.json --coq OUT.v     a theorem for Coq about the file's numbers
     python generate.py FILE.proof.json --words OUT     the same numbers for the extracted checker
+    python generate.py FILE.proof.json --ask CHECKER   what that says: status 0, 1; 3 is not covered
 
 Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them. What the second
 kernel does not cover is refused by name (NotCovered). Standard library only.
@@ -11,7 +12,9 @@ kernel does not cover is refused by name (NotCovered). Standard library only.
 import argparse
 import hashlib
 import json
+import subprocess
 import sys
+import tempfile
 from collections.abc import Iterable
 from fractions import Fraction
 from itertools import pairwise
@@ -26,17 +29,17 @@ class NotCovered(Exception):  # noqa: N818 - says what the second kernel does no
     """What the file has and the second kernel does not cover; or what is wrong with the file."""
 
 
-class Problem:
+class Funnel:
     """The numbers of a continuous funnel: what the theorem is about, and its witness."""
 
-    def __init__(self, path: Path) -> None:
-        document = _load(path.read_bytes(), path.name)
-        claim, proof = document["claim"], document["proof"]
-        kind = claim["kind"]
-        if kind != "continuous_funnel":
-            raise NotCovered(f"claims of kind {kind} are not covered by the second kernel")
+    def __init__(self, claim: Any, proof: Any, folder: Path) -> None:
         _only(claim, "kind about", "goal")
-        files, self.digests = _bound(claim["about"], path.parent)
+        files, digests = _bound(claim["about"], folder, "vector_field policy funnel")
+        _kinds(files)
+        if any(file["vector_field"] != digests["vector_field"] for file in files[1:]):
+            raise NotCovered("a file names another vector field")
+        if files[2]["policy"] != digests["policy"]:
+            raise NotCovered("the funnel names another policy")
         self.field, self.policy, self.funnel = files
         required = "margin basis multiplier pieces"
         _only(proof, required, "goal_multiplier sides kappa")
@@ -91,11 +94,11 @@ def _only(members: dict[str, Any], required: str, optional: str = "") -> None:
         raise NotCovered(f"not covered by the second kernel: {', '.join(sorted(unknown))}")
 
 
-def _bound(about: dict[str, Any], folder: Path) -> tuple[list[Any], dict[str, str]]:
-    """The vector field, the policy and the funnel, by digests of their bytes."""
-    _only(about, "vector_field policy funnel")
+def _bound(about: dict[str, Any], folder: Path, roles: str) -> tuple[list[Any], dict[str, str]]:
+    """The files of these roles, by digests of their bytes."""
+    _only(about, roles)
     files, digests = [], {}
-    for role in ("vector_field", "policy", "funnel"):
+    for role in roles.split():
         name = about[role]["file"]
         if not name or any(sign in name for sign in "/\\:"):
             raise NotCovered(f"{name!r} is not a plain file name")
@@ -104,17 +107,35 @@ def _bound(about: dict[str, Any], folder: Path) -> tuple[list[Any], dict[str, st
         if digests[role] != about[role]["digest"]:
             raise NotCovered(f"{name} is not the file that the proof is about")
         files.append(_load(content, name))
-    _kinds(files)
-    if any(file["vector_field"] != digests["vector_field"] for file in files[1:]):
-        raise NotCovered("a file names another vector field")
-    if files[2]["policy"] != digests["policy"]:
-        raise NotCovered("the funnel names another policy")
     return files, digests
 
 
+class Increments:
+    """The numbers of a model, and of tubes around it or of its stability, with the multipliers."""
+
+    def __init__(self, claim: Any, proof: Any, folder: Path) -> None:
+        self.tubes: list[Any] | None = None
+        if claim["kind"] == "stability":
+            _only(claim, "kind about rate")
+            (self.model,), _ = _bound(claim["about"], folder, "model")
+            _only(proof, "P", "multipliers")
+            self.P, self.rate = proof["P"], claim["rate"]
+            self.trees = [proof.get("multipliers")]
+        else:
+            _only(claim, "kind about")
+            if "policy" in claim["about"]:
+                raise NotCovered("a tube around a policy's plan is not covered")
+            (self.model, funnel), digests = _bound(claim["about"], folder, "model funnel")
+            if funnel["model"] != digests["model"]:
+                raise NotCovered("the funnel names another model")
+            _only(proof, "", "multipliers")
+            self.tubes = funnel["tubes"]
+            self.trees = proof.get("multipliers", [None] * len(self.tubes))
+
+
 def number(value: Any) -> Fraction:
-    """The exact value of a number of a file."""
-    if type(value) not in (int, float):
+    """The exact value of a number of a file, or a fraction made of such."""
+    if type(value) not in (int, float, Fraction):
         raise NotCovered(f"{value!r} is not a number")
     return Fraction(value)
 
@@ -141,12 +162,11 @@ def bits(value: Any) -> int:
 class Coq:
     """Terms of Coq; what is defined is named."""
 
-    def __init__(self) -> None:
+    def __init__(self, modules: str) -> None:
         self.lines = [
             "(* Made by generate.py. The theorem is about the numbers below. *)",
             "From Coq Require Import ZArith Reals List Uint63.",
-            "From Verified Require Import Integers Forms Polynomials Positive Claim.",
-            "From Verified Require Import Funnel Goal Data.",
+            f"From Verified Require Import {modules}.",
             "Import ListNotations.",
             "Open Scope Z_scope.",
         ]
@@ -178,6 +198,9 @@ class Coq:
     def made(self, constructor: str, *terms: str) -> str:
         return f"({constructor} {' '.join(terms)})"
 
+    def chosen(self, constructor: str, _place: int, *terms: str) -> str:
+        return self.made(constructor, *terms)
+
     def named(self, name: str, term: str) -> str:
         self.lines.append(f"Definition {name} := {term}.")
         return name
@@ -207,8 +230,26 @@ class Words:
     def made(self, _constructor: str, *terms: str) -> str:
         return " ".join(terms)
 
+    def chosen(self, _constructor: str, place: int, *terms: str) -> str:
+        return " ".join([str(place), *terms])
+
     def named(self, _name: str, term: str) -> str:
         return term
+
+
+def shifted(n: int, p: int) -> list[list[Fraction]]:
+    """The first n - p of n entries, as a matrix."""
+    return [[Fraction(int(i == j)) for j in range(n)] for i in range(n - p)]
+
+
+def beside(G: list[Any], p: int) -> list[tuple[list[int], list[list[Any]]]]:
+    """[G_0 ... G_n] as one matrix polynomial."""
+    found = [dict(zip(map(tuple, g["exponents"]), g["coefficients"], strict=True)) for g in G]
+    nothing = [[0] * p] * p
+    return [
+        (list(e), [[entry for g in found for entry in g.get(e, nothing)[i]] for i in range(p)])
+        for e in sorted({e for g in found for e in g})
+    ]
 
 
 def listing(entries: Iterable[str]) -> str:
@@ -270,15 +311,114 @@ class Writer:
         unit = to.whole(integer(stated["unit"], 0, SHIFT))
         return to.made("word_squares", unit, scale, to.listed(factors))
 
+    def matrix(self, rows: Iterable[Iterable[Any]]) -> str:
+        """Rows of numbers."""
+        return self.to.listed(map(self.nums, rows))
+
+    def symmetric(self, P: list[list[Any]], what: str) -> str:
+        """A symmetric matrix, whole."""
+        self.upper(P, what)
+        return self.matrix(P)
+
+    def model(self, model: dict[str, Any]) -> str:
+        """What two solutions under the same inputs are told apart by (Tubes.v)."""
+        to, kind = self.to, model["kind"]
+        if kind == "difference_equation":
+            return to.chosen("Linear", 0, self.nums(model["a"]))
+        if kind == "monotone_equation":
+            a = [-number(entry) for entry in model["a"]]
+            return self.monotone([number(entry) for entry in model["e"]], a, shifted(len(a), 1))
+        if kind == "state_affine":
+            p, n = len(model["y"]), len(model["y"]) * (len(model["G"]) - 1)
+            ranges = [
+                [(number(end) - number(model["u_offset"][i])) / number(model["u_scale"][i])
+                 for end in model["u_range"][i]]
+                for i, _ in model["window"]
+            ]  # fmt: skip
+            return self.affine(p, n, model["y_scale"], ranges, beside(model["G"], p))
+        if kind == "implicit":
+            return self.implicit(model)
+        raise NotCovered(f"models of kind {kind} are not covered")
+
+    def affine(
+        self, p: int, n: int, scale: list[Any], ranges: list[list[Fraction]],
+        terms: list[tuple[list[int], list[list[Any]]]],
+    ) -> str:  # fmt: skip
+        """0 = (a matrix polynomial in w) [v; x] + what the inputs add, x+ = [v; x] cut off."""
+        to = self.to
+        rows = to.listed(to.pair(self.counts(e, 20), self.matrix(C)) for e, C in terms)
+        box = to.listed(to.pair(self.num(low), self.num(high)) for low, high in ranges)
+        return to.chosen("Affine", 1, to.count(p), to.count(n), self.nums(scale), box, rows)
+
+    def monotone(self, e: list[Fraction], a: list[Fraction], shift: list[list[Fraction]]) -> str:
+        """0 = e(v) + a'x + what the inputs add, x+ = [v; shift x]."""
+        return self.to.chosen("Monotone", 2, *map(self.num, e), self.nums(a), self.matrix(shift))
+
+    def implicit(self, model: dict[str, Any]) -> str:
+        """An implicit model whose equations are affine in v and x, or a cubic in one v."""
+        n = len(model["states"])
+        table = list(zip(model["h"]["exponents"], model["h"]["coefficients"], strict=True))
+        p = len(table[0][1])
+        moved = [[Fraction(0)] * n for _ in range(n - p)]
+        if p < n:
+            rows = zip(model["shift"]["exponents"], model["shift"]["coefficients"], strict=True)
+            for e, coefficients in rows:
+                if any(e[:n]) and sum(e) > 1:
+                    raise NotCovered("a shift that is not linear in the states")
+                for i, c in enumerate(coefficients):
+                    if any(e[:n]):
+                        moved[i][e.index(1)] += number(c)
+        known = [(e, row) for e, row in table if any(e[: p + n]) and any(map(number, row))]
+        if all(sum(e) == 1 for e, _ in known):
+            if moved != shifted(n, p):
+                raise NotCovered("an implicit model that does more than shift its states")
+            E = [[sum((number(row[i]) for e, row in known if e[j]), Fraction(0))
+                  for j in range(p + n)] for i in range(p)]  # fmt: skip
+            return self.affine(p, n, [1] * p, [], [([], E)])
+        cubic, a = [Fraction(0)] * 4, [Fraction(0)] * n
+        for e, row in known:
+            if p == 1 and sum(e) == e[0] <= 3:
+                cubic[e[0]] += number(row[0])
+            elif p == 1 and sum(e) == 1:
+                a[e.index(1) - 1] += number(row[0])
+            else:
+                raise NotCovered("an implicit model whose increments are known on a box only")
+        if cubic[3] <= 0:
+            raise NotCovered("an implicit model whose increments are known on a box only")
+        return self.monotone(cubic[1:], a, moved)
+
+    def tree(self, tree: Any, forms: int) -> str:
+        """The multipliers of the leaves, by columns, one for each form."""
+        to = self.to
+        if tree is None:
+            return to.chosen("Leaf", 0, to.listed([to.listed([])] * forms))
+        if set(tree) == {"split", "parts"}:
+            lower, upper = (self.tree(part, forms) for part in tree["parts"])
+            return to.chosen("Split", 1, to.count(integer(tree["split"], 0, 99)), lower, upper)
+        if "ends" in tree:
+            raise NotCovered("stated ends of a leaf are not covered")
+        _only(tree, "N")
+        Ns = tree["N"] if forms > 1 else [tree["N"]]
+        return to.chosen("Leaf", 0, to.listed(self.matrix(zip(*N, strict=True)) for N in Ns))
+
+    def tube(self, tube: dict[str, Any]) -> str:
+        """The numbers of one tube."""
+        return self.to.made(
+            "Tube", self.num(tube["rho"]), self.matrix(tube["L"]),
+            self.symmetric(tube["P"], "P"), self.symmetric(tube["R"], "R"),
+            self.nums(tube["tau"]), self.nums(tube["half_widths"]), self.num(tube["level"]),
+            self.num(tube["inlet"]),
+        )  # fmt: skip
+
     def shifts(self, values: Iterable[Any]) -> str:
         """Powers of two."""
         return self.to.listed(self.to.whole(integer(e, -SHIFT, SHIFT)) for e in values)
 
-    def counts(self, values: Iterable[Any]) -> str:
+    def counts(self, values: Iterable[Any], most: int = 7) -> str:
         """Exponents of a monomial."""
-        return self.to.listed(self.to.count(integer(e, 0, 7)) for e in values)
+        return self.to.listed(self.to.count(integer(e, 0, most)) for e in values)
 
-    def segments(self, problem: Problem) -> str:
+    def segments(self, problem: Funnel) -> str:
         """Every interval between knots."""
         to, field, policy, funnel = self.to, problem.field, problem.policy, problem.funnel
         n, m = field["states"], field["inputs"]
@@ -325,7 +465,7 @@ class Writer:
             made.append(to.named(f"segment_{k}", term))
         return to.listed(made)
 
-    def problem(self, problem: Problem) -> str:
+    def problem(self, problem: Funnel) -> str:
         """What the theorem is about."""
         to, field = self.to, problem.field
         limits: list[str | None] = [None] * field["inputs"]
@@ -341,7 +481,7 @@ class Writer:
         clipped = to.listed(map(to.maybe, limits))
         return to.made("Problem", self.segments(problem), clipped, box, to.maybe(goal))
 
-    def witness(self, problem: Problem) -> str:
+    def witness(self, problem: Funnel) -> str:
         """What is used to decide it."""
         to, proof = self.to, problem.proof
         by_segment: list[list[str]] = [[] for _ in problem.spans]
@@ -397,21 +537,81 @@ Theorem funnel : forall x, solution data x ->
 Proof. exact (funnel_proved data proof accepted). Qed.
 Print Assumptions funnel.
 """
+NEAR = """\
+Theorem accepted : tubes_ok data tubes proofs = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem near : Forall (stays_near data) tubes.
+Proof. exact (tubes_proved data tubes proofs accepted). Qed.
+Print Assumptions near.
+"""
+STABLE = """\
+Theorem accepted : stability_ok data storage rate proof = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem stable : forgets data storage rate.
+Proof. exact (stability_proved data storage rate proof accepted). Qed.
+Print Assumptions stable.
+"""
 
 
-def coq(problem: Problem) -> str:
+def read(path: Path) -> Funnel | Increments:
+    """The numbers of a proof file of a kind that is covered."""
+    document = _load(path.read_bytes(), path.name)
+    claim, proof = document["claim"], document["proof"]
+    if claim["kind"] == "continuous_funnel":
+        return Funnel(claim, proof, path.parent)
+    if claim["kind"] in ("tube", "stability"):
+        return Increments(claim, proof, path.parent)
+    raise NotCovered(f"claims of kind {claim['kind']} are not covered by the second kernel")
+
+
+def coq(problem: Funnel | Increments) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
-    to = Coq()
+    if isinstance(problem, Funnel):
+        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Data")
+        writer = Writer(to)
+        data, proof = writer.problem(problem), writer.witness(problem)
+        to.lines += [f"Definition data : problem := {data}.", f"Definition proof := {proof}."]
+        return "\n".join(to.lines) + "\n" + THEOREM
+    to = Coq("Integers Forms Claim Data Tubes Boxes Near")
     writer = Writer(to)
-    data, proof = writer.problem(problem), writer.witness(problem)
-    to.lines += [f"Definition data : problem := {data}.", f"Definition proof := {proof}."]
-    return "\n".join(to.lines) + "\n" + THEOREM
+    to.named("data", writer.model(problem.model))
+    if problem.tubes is None:
+        to.named("storage : matrix", writer.symmetric(problem.P, "P"))
+        to.named("rate : num", writer.num(problem.rate))
+        to.named("proof", writer.tree(problem.trees[0], 1))
+        return "\n".join(to.lines) + "\n" + STABLE
+    to.named("tubes", to.listed(map(writer.tube, problem.tubes)))
+    to.named("proofs", to.listed(trees(writer, problem)))
+    return "\n".join(to.lines) + "\n" + NEAR
 
 
-def words(problem: Problem) -> str:
+def trees(writer: Writer, problem: Increments) -> list[str]:
+    """The multipliers of every tube."""
+    assert problem.tubes is not None
+    pairs = zip(problem.tubes, problem.trees, strict=True)
+    return [writer.tree(tree, 1 + len(tube["tau"])) for tube, tree in pairs]
+
+
+def words(problem: Funnel | Increments) -> str:
     """The same as whole numbers, for the extracted checker."""
-    writer = Writer(Words())
-    return f"{writer.problem(problem)}\n{writer.witness(problem)}\n"
+    to = Words()
+    writer = Writer(to)
+    if isinstance(problem, Funnel):
+        return f"funnel {writer.problem(problem)}\n{writer.witness(problem)}\n"
+    model = writer.model(problem.model)
+    if problem.tubes is None:
+        terms = writer.symmetric(problem.P, "P"), writer.num(problem.rate)
+        return "\n".join(["stability", model, *terms, writer.tree(problem.trees[0], 1)])
+    tubes = to.listed(map(writer.tube, problem.tubes))
+    return "\n".join(["tube", model, tubes, to.listed(trees(writer, problem))])
+
+
+def asked(checker: Path, problem: Funnel | Increments) -> int:
+    """The extracted checker's status: 0 accepted, 1 refused."""
+    with tempfile.NamedTemporaryFile("w", suffix=".words") as file:
+        file.write(words(problem))
+        file.flush()
+        return subprocess.run([checker, file.name], check=False).returncode
 
 
 def main() -> int:
@@ -419,16 +619,18 @@ def main() -> int:
     parser.add_argument("file", type=Path)
     parser.add_argument("--coq", type=Path)
     parser.add_argument("--words", type=Path)
+    parser.add_argument("--ask", type=Path, metavar="CHECKER")
     given = parser.parse_args()
     try:
-        problem = Problem(given.file)
+        problem = read(given.file)
         for path, write in ((given.coq, coq), (given.words, words)):
             if path is not None:
                 path.write_text(write(problem))
+        return asked(given.ask, problem) if given.ask is not None else 0
     except (NotCovered, KeyError, ValueError, TypeError, IndexError) as error:
-        print(f"{given.file}: NOT COVERED {type(error).__name__}: {error}", file=sys.stderr)
-        return 1
-    return 0
+        said = error if isinstance(error, NotCovered) else f"{type(error).__name__} {error}"
+        print(f"not covered: {said}", file=sys.stderr)
+        return 3
 
 
 if __name__ == "__main__":

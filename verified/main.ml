@@ -47,7 +47,31 @@ let witness () =
   let pieces = listed (fun () -> listed piece) in
   { margin; basis; multiplier; sides; pieces; goal_multiplier = num () }
 
+let model () = match count () with
+  | 0 -> Linear (nums ())
+  | 1 ->
+    let p = count () in let n = count () in let scale = nums () in
+    let range = listed (pair num num) in
+    Affine (p, n, scale, range, listed (pair (fun () -> listed count) matrix))
+  | 2 ->
+    let e1 = num () in let e2 = num () in let e3 = num () in let a = nums () in
+    Monotone (e1, e2, e3, a, matrix ())
+  | _ -> failwith "a model"
+let tube () =
+  let fading = num () in let gain = matrix () in let storage = matrix () in
+  let weight = matrix () in let tau0 = nums () in let widths = nums () in
+  let top = num () in { fading; gain; storage; weight; tau0; widths; top; inlet = num () }
+let rec tree () = match count () with
+  | 0 -> Leaf (listed matrix)
+  | 1 -> let i = count () in let lower = tree () in Split (i, lower, tree ())
+  | _ -> failwith "a tree"
+
 let () =
-  let d = problem () in
-  let w = witness () in
-  if decide d w then print_endline "accepted" else (print_endline "refused"; exit 1)
+  let accepted = match word () with
+    | "funnel" -> let d = problem () in decide_funnel d (witness ())
+    | "tube" -> let m = model () in let ts = listed tube in decide_tubes m ts (listed tree)
+    | "stability" ->
+      let m = model () in let storage = matrix () in let rate = num () in
+      decide_stability m storage rate (tree ())
+    | _ -> failwith "a kind" in
+  if accepted then print_endline "accepted" else (print_endline "refused"; exit 1)

@@ -21,7 +21,7 @@ from bags.chain.sections import (
 from bags.signals.expressions import parse_factors
 from bags.signals.sampling import Sampler, sampled_path
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import BlockCascadeClass, LinearClass
+from nlsid_core.identification import BlockCascadeClass, CellClass, LinearClass
 from nlsid_core.running.comparison import Centre
 
 ONE_BY_ONE = (LinearClass, BlockCascadeClass)  # classes of one response and one excitation
@@ -357,6 +357,11 @@ def _model_refusals(config: Config) -> Iterator[str]:
         yield (
             f"identification.model: a {kind.__name__} has one response and one excitation, not "
             f"{said}; take state_affine or implicit, or leave out signals"
+        )
+    elif kind is CellClass and counts[0] != 1:
+        yield (
+            f"identification.model: cells have one response, not {said}; take state_affine or "
+            "implicit, or leave out signals"
         )
     elif (
         config.funnel is not None

@@ -24,6 +24,7 @@ from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
     BlockCascadeClass,
+    CellClass,
     Fit,
     ImplicitClass,
     LinearClass,
@@ -43,6 +44,7 @@ CLASSES: dict[str, type] = {
     "linear": LinearClass,
     "state_affine": StateAffineClass,
     "block_cascade": BlockCascadeClass,
+    "cells": CellClass,
     "monotone": MonotoneClass,
     "implicit": ImplicitClass,
     "linear_states": LinearStateClass,

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from itertools import combinations
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
-from nlsid_core.progress import Progress, part
+from nlsid_core.progress import Progress, part, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
@@ -70,6 +71,11 @@ def identify_bags(
     Raises DataError (BagError for bags) before anything is written.
     """
     trials = read_trials(bags, config, progress=part(progress, 0.0, 0.5))
+    return identify_trials(trials, config, out, progress=progress)
+
+
+def identify_trials(trials: Trials, config: Config, out: Path, *, progress: Progress) -> Identified:
+    """The same of trials that were read already."""
     fit = config.identification.identify(
         trials.train,
         validation=trials.validation,
@@ -115,11 +121,26 @@ def write_identified(
 
 def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> Trials:
     """The trials of the configured signals on the configured grid, by what they are for."""
+    return by_use(read_signals_of(bags, config, progress=progress), config)
+
+
+def read_signals_of(
+    bags: Sequence[Path],
+    config: Config,
+    *,
+    names: Sequence[str] | None = None,
+    progress: Progress = silent,
+) -> Dataset:
+    """The configured signals of bags on the configured grid, with the configured names and units.
+
+    names: what the trials are called (None: as their bags are).
+    """
     responses, excitations = config.signals.response, config.signals.excitation
     dataset = read_dataset(
         bags,
         responses=[signal.path for signal in responses],
         excitations=[signal.path for signal in excitations],
+        names=names,
         period=config.grid.period,
         max_gap=config.grid.max_gap,
         clock=config.clock,
@@ -129,7 +150,11 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
         definitions=read_definitions(config.definitions),
         progress=progress,
     )
-    labelled = _labelled(dataset, responses, excitations)
+    return _labelled(dataset, responses, excitations)
+
+
+def by_use(labelled: Dataset, config: Config) -> Trials:
+    """The trials by what the configuration's split has them for."""
     if config.split.share is not None:
         trials = cut(
             labelled,
@@ -146,7 +171,7 @@ def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> 
         )
     named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
-    return replace(trials, skipped=skipped_samples(dataset), absent=absent)
+    return replace(trials, skipped=skipped_samples(labelled), absent=absent)
 
 
 def _labelled(
@@ -239,8 +264,16 @@ def _selected(dataset: Dataset, names: Sequence[str]) -> Dataset | None:
 
 
 def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
-    """The trials of the bags called so; a bag with gaps has several, `bag.1`, `bag.2`, ..."""
-    return [name for name in dataset.names if name in names or name.rpartition(".")[0] in names]
+    """The trials of the bags called so; a bag with gaps has several, `bag.1`, `bag.2`, ...
+
+    A name with `*` or `?` in it is a pattern.
+    """
+    patterns = [name for name in names if "*" in name or "?" in name]
+
+    def called(name: str) -> bool:
+        return name in names or any(fnmatchcase(name, pattern) for pattern in patterns)
+
+    return [name for name in dataset.names if called(name) or called(name.rpartition(".")[0])]
 
 
 def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTubeDesign:

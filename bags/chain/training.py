@@ -20,7 +20,7 @@ NAMES = ("name", "group", "digest", "provenance")
 
 def save_training(path: Path | str, dataset: Dataset) -> str:
     """Write `dataset` as an .npz file and return its `sha256:` digest."""
-    content = _encoded({"training": dataset}, model="")
+    content = encoded({"training": dataset})
     write_atomically(path, content)
     return _digest(content)
 
@@ -33,12 +33,12 @@ def load_training(path: Path | str, *, digest: str) -> Dataset:
     content = Path(path).read_bytes()
     if _digest(content) != digest:
         raise DataError(f"{path}: not the data the model was fitted to; run `nlsid identify` again")
-    return _decoded(content, model="", source=f"{path}: not a training file")["training"]
+    return decoded(content, source=f"{path}: not a training file")["training"]
 
 
 def save_held_back(path: Path | str, parts: Mapping[str, Dataset], *, model: str) -> None:
     """Write trials that the model with this digest was not fitted to, by what they are for."""
-    write_atomically(path, _encoded(parts, model=model))
+    write_atomically(path, encoded(parts, model=model))
 
 
 def load_held_back(path: Path | str, *, model: str) -> dict[str, Dataset]:
@@ -49,10 +49,11 @@ def load_held_back(path: Path | str, *, model: str) -> dict[str, Dataset]:
     path = Path(path)
     if not path.exists():
         return {}
-    return _decoded(path.read_bytes(), model=model, source=f"{path}: not trials held back")
+    return decoded(path.read_bytes(), model=model, source=f"{path}: not trials held back")
 
 
-def _encoded(parts: Mapping[str, Dataset], *, model: str) -> bytes:
+def encoded(parts: Mapping[str, Dataset], *, model: str = "") -> bytes:
+    """The .npz content of trials by what they are for, of the model with this digest if of one."""
     arrays: dict[str, np.ndarray] = {}
     labels: list[dict[str, Any]] = []
     for use, dataset in parts.items():
@@ -67,7 +68,8 @@ def _encoded(parts: Mapping[str, Dataset], *, model: str) -> bytes:
     return stream.getvalue()
 
 
-def _decoded(content: bytes, *, model: str, source: str) -> dict[str, Dataset]:
+def decoded(content: bytes, *, model: str = "", source: str) -> dict[str, Dataset]:
+    """What `encoded` made; nothing is unpickled. DataError, which `source` begins, if it is not."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             document = json.loads(arrays["labels"].tobytes())

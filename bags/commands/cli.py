@@ -15,9 +15,17 @@ from rich.markup import escape
 
 from bags.commands.bag_cli import bag_app
 from bags.commands.config_cli import config_app
+from bags.commands.fleet_cli import (
+    PatienceOption,
+    SchedulerOption,
+    StrictOption,
+    WorkersOption,
+    fleet_app,
+)
 from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
+from nlsid_core import second as second_kernel
 from nlsid_core.errors import DataError, NlsidError
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
@@ -32,11 +40,13 @@ app = typer.Typer(
 app.add_typer(track_app, name="track")
 app.add_typer(bag_app)
 app.add_typer(config_app)
+app.add_typer(fleet_app)
 out = Console()
 err = Console(stderr=True)
 
 BagsArgument = Annotated[
-    list[Path], typer.Argument(help="Bags: rosbag2 folders, .mcap files, or folders of bags.")
+    list[Path],
+    typer.Argument(help="Bags: rosbag2 folders, .mcap files, folders of bags, URLs (s3://...)."),
 ]
 ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
 OutOption = Annotated[
@@ -118,14 +128,33 @@ def init(
 
 
 @app.command()
-def identify(bags: BagsArgument, config: ConfigOption, out_dir: OutOption) -> None:
-    """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html."""
+def identify(
+    bags: BagsArgument,
+    config: ConfigOption,
+    out_dir: OutOption,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
+    strict: StrictOption = False,
+    patience: PatienceOption = 60.0,
+) -> None:
+    """Identify a model from bags and prove it stable: model.json, model.proof.json, report.html.
+
+    Bags in object storage, or with --workers or --scheduler: each is read by a worker, one that
+    cannot be used is listed and left out, and the next run reads only what is new.
+    """
     from bags.chain.config import load_config
     from bags.chain.steps import identify_bags
-    from bags.commands import show
+    from bags.commands import fleet_cli, show
     from bags.recordings.folders import expand_bags
+    from bags.recordings.remote import is_url
 
     settings = load_config(config)
+    if workers or scheduler or strict or any(map(is_url, bags)):
+        fleet_cli.identify(
+            out, bags, settings, out_dir,
+            workers=workers, scheduler=scheduler, strict=strict, patience=patience,
+        )  # fmt: skip
+        return
     folders = expand_bags(bags)
     with progress_bar("identifying") as progress:
         result = identify_bags(folders, settings, out_dir, progress=progress)
@@ -272,10 +301,14 @@ def compose(
 @app.command()
 def check(
     proofs: Annotated[list[Path], typer.Argument(help="Proof files (FILE.proof.json).")],
+    second: Annotated[
+        bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
+    ] = False,
 ) -> None:
     """Decide proofs without a solver: PROVED (status 0) or REJECTED (status 1).
 
-    Status 2 if a proof cannot be read, so that nothing was decided about it.
+    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
+    kernel was asked and has no opinion of it.
     """
     status = 0
     for path in proofs:
@@ -283,6 +316,10 @@ def check(
         try:
             said = str(kernel.check(path))
             typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
+            if second:
+                opinion = second_kernel.opinion(path)
+                typer.echo(f"  {opinion}")
+                status = max(status, {"accepted": 0, "refused": 1}.get(opinion.verdict, 2))
         except kernel.Rejected as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")

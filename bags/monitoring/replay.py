@@ -12,6 +12,7 @@ from bags.monitoring.watch import Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
+from bags.recordings.remote import place
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -166,7 +167,7 @@ def replay_messages(
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
     """
-    bag = Path(bag)
+    bag = place(bag)
     planned = centre is Centre.PROFILE or design.has_plan
     announced = planned and bool(announced_runs(design, bag, definitions))
     watch = Watch(design, centre=centre, announced=announced)

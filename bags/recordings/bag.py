@@ -13,11 +13,12 @@ from rosbags.typesys.store import Typestore
 from bags.recordings.batch import Batch
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import COMPRESSED, bag_files
-from bags.recordings.mcap_file import MAGIC
+from bags.recordings.mcap_records import MAGIC
 from bags.recordings.message_types import are_same, types_in_bag
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.part import CUSTOM_DATA
 from bags.recordings.quality import Profile
+from bags.recordings.remote import RemotePath, place
 from bags.recordings.storage import Channel, McapStorage, RosbagsStorage, Storage, defined
 from nlsid_core.errors import BagError
 
@@ -37,7 +38,8 @@ class Message(NamedTuple):
 class Bag:
     """A bag open for reading. Use as a context manager.
 
-    A bag is a rosbag2 folder (MCAP or sqlite3, split or not), a single .mcap, or a ROS 1 .bag.
+    A bag is a rosbag2 folder (MCAP or sqlite3, split or not), a single .mcap, or a ROS 1 .bag; of
+    MCAP also one in object storage, by its URL (`bags.recordings.remote`).
     Raises BagError if there is no such bag, if it is damaged or not a bag, or if it is unfinished.
     With `unfinished=True` the last is no error: the messages there are can be read, and `ending`
     says why there may be more. definitions: of types that the bag itself does not define.
@@ -50,7 +52,7 @@ class Bag:
         unfinished: bool = False,
         definitions: Mapping[str, Definition] | None = None,
     ) -> None:
-        self.path = Path(path)
+        self.path = place(path)
         self._described = bag_files(self.path)
         self.files: tuple[Path, ...] = self._described.files
         self.ending: str | None = None
@@ -62,6 +64,11 @@ class Bag:
             self._storage: Storage = McapStorage(self.files, CUSTOM_DATA)
         else:
             whole = self._described.compressed
+            if isinstance(self.path, RemotePath):
+                raise BagError(
+                    f"{self.path}: only MCAP is read from where it lies, and not if it is "
+                    "compressed whole; copy this bag to this machine"
+                )
             self._storage = RosbagsStorage([self.path] if whole else self.files)
         self._storage.channels = [
             defined(channel, definitions or {}) for channel in self._storage.channels
@@ -177,8 +184,8 @@ class Bag:
 
 def _check_start(file: Path) -> None:
     """BagError if an MCAP file does not begin as one."""
-    if file.suffix in (".db3", ".bag", COMPRESSED):
-        return
+    if file.suffix in (".db3", ".bag", COMPRESSED) or isinstance(file, RemotePath):
+        return  # a remote file says what it is at its end
     with file.open("rb") as stream:
         start = stream.read(len(MAGIC))
     if start != MAGIC:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import yaml
 
 from bags.recordings.quality import KEY, Profile, offered
+from bags.recordings.remote import RemotePath, matching, place
 from nlsid_core.errors import BagError
 
 METADATA: Final = "metadata.yaml"
@@ -45,7 +46,7 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
     Raises BagError for a path that is not there or holds no bag.
     """
     found: list[Path] = []
-    for path in paths:
+    for path in (match for given in paths for match in _matches(place(given))):
         if not path.exists():
             raise BagError(f"there is no bag {path}; name a rosbag2 folder or an .mcap file")
         if path.is_file() or _is_bag(path):
@@ -60,6 +61,13 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
             raise BagError(f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)})")
         found += inside
     return list(dict.fromkeys(found))
+
+
+def _matches(path: Path) -> list[Path]:
+    found = matching(path)
+    if not found:
+        raise BagError(f"nothing matches {path}; name a rosbag2 folder or an .mcap file")
+    return found
 
 
 def trial_name(path: Path) -> str:
@@ -151,7 +159,10 @@ def _inside(folder: Path, name: str, version: int) -> Path:
     file = folder / name
     if version < 4:  # these named the file from the folder above
         file = folder / Path(name).name
-    there, home = Path(os.path.realpath(file)), folder.resolve()  # realpath bears loops of links
+    if isinstance(folder, RemotePath):
+        there, home = Path(os.path.normpath("/" / file)), Path(os.path.normpath("/" / folder))
+    else:  # realpath bears loops of links
+        there, home = Path(os.path.realpath(file)), folder.resolve()
     if not there.is_relative_to(home):
         raise _bad(folder / METADATA, f"it names {name}, which is outside the bag")
     if not file.is_file():

@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
 
@@ -21,10 +21,13 @@ from mcap.records import Attachment, Channel, Footer, Header, Metadata, Schema, 
 
 from bags.recordings.batch import Batch
 from bags.recordings.mcap_records import (
+    INDEX_ENTRY,
+    MAGIC,
     MESSAGE,
     MESSAGE_FIXED,
     RECORD,
     Block,
+    Contents,
     add_channel,
     add_schema,
     messages_at,
@@ -34,41 +37,24 @@ from bags.recordings.mcap_records import (
     walk_channels,
     walk_messages,
 )
+from bags.recordings.mcap_summary import ListedBlock, Prepared, summarised
+from bags.recordings.remote import RangeReader, RemotePath, place
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
-MAGIC: Final = b"\x89MCAP0\r\n"
 SUMMARISING: Final = (Opcode.MESSAGE_INDEX, Opcode.STATISTICS, Opcode.FOOTER)
 SEARCH_BYTES: Final = 2**20
 MAX_RECORD_BYTES: Final = (
     128 * 2**20
 )  # of the records read whole: schemas, metadata, loose messages
+MAX_WHOLE_BYTES: Final = 256 * 2**20  # of a remote file without a summary
 LOOSE_RUN_BYTES: Final = 4 * 2**20  # messages outside chunks are read in runs of about this size
 
 _CHUNK: Final = struct.Struct("<QQQII")
 _INDEX: Final = struct.Struct("<HI")
 _COMPRESSION: Final = re.compile(rb"\x04\0\0\0zstd|\x03\0\0\0lz4", re.DOTALL)
-_INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 
 Record = TypeVar("Record")
-
-
-@dataclass
-class Contents:
-    """What the walk found. `ending`: why the file stops early, None if it is finished."""
-
-    profile: str = ""
-    library: str = ""
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    counts: dict[int, int] = field(default_factory=dict)
-    blocks: list[Block] = field(default_factory=list)
-    metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)  # without their data
-    stated: dict[int, int] | None = None  # the statistics' count of messages per channel
-    ending: str | None = None
-    good_bytes: int = 0
-    lost: list[str] = field(default_factory=list)
 
 
 class McapFile:
@@ -80,13 +66,15 @@ class McapFile:
     """
 
     def __init__(self, path: Path | str, *, salvage: bool = False) -> None:
-        self.path = Path(path)
+        self.path = place(path)
         self._salvage = salvage
         self._size = self.path.stat().st_size
-        self._stream: BinaryIO = self.path.open("rb")
+        self._stream: BinaryIO | RangeReader = self.path.open("rb")
+        self._prepared: Prepared | None = None
         try:
-            self.contents = self._walk()
-            self._find_channels()
+            if not isinstance(self.path, RemotePath) or not self._read_summary(self.path):
+                self.contents = self._walk()
+                self._find_channels()
         except BaseException:
             self._stream.close()
             raise
@@ -100,6 +88,21 @@ class McapFile:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _read_summary(self, path: RemotePath) -> bool:
+        """Take what the summary says; False if the file, fetched whole, has to be walked."""
+        found = None if self._salvage else summarised(path)
+        if found is not None:
+            self.contents = found
+            self._prepared = Prepared(path, found.blocks)
+            return True
+        if self._size > MAX_WHOLE_BYTES:
+            raise BagError(
+                f"it has {self._size} bytes and no summary that lists its chunks; copy it to this "
+                "machine, and mend it with `nlsid bag recover`"
+            )
+        path.fetch([(0, self._size)])
+        return False
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """(channel id, messages) block by block, in the order of the file.
@@ -116,7 +119,14 @@ class McapFile:
         index = block.index if use_index else None
         if index is not None and not any(channel in index for channel in channels):
             return
-        buffer = self.content(block)
+        sparse = isinstance(block, ListedBlock) and not block.compression
+        if isinstance(block, ListedBlock) and self._prepared is not None:
+            block = self._prepared.block(block, channels)
+            index = block.index
+        if sparse and self._prepared is not None:
+            buffer = self._prepared.content(block)
+        else:
+            buffer = self.content(block)
         if index is None:
             offsets = {c: np.array(o, dtype=np.int64) for c, o in walk_messages(buffer).items()}
             where = f"the block at byte {block.offset}"
@@ -238,12 +248,12 @@ class McapFile:
 
     def _note_index(self, blocks: list[Block], content: int, length: int) -> None:
         channel, size = unpack(_INDEX, self._read(content, _INDEX.size))
-        if size % _INDEX_ENTRY.itemsize or _INDEX.size + size > length:
+        if size % INDEX_ENTRY.itemsize or _INDEX.size + size > length:
             raise BagError(f"the message index at byte {content} is damaged")
         block = blocks[-1]
         index = dict(block.index or {})
         if size:
-            index[channel] = (content + _INDEX.size, size // _INDEX_ENTRY.itemsize)
+            index[channel] = (content + _INDEX.size, size // INDEX_ENTRY.itemsize)
         blocks[-1] = replace(block, index=index)
 
     def _attachment(self, content: int, length: int) -> Attachment:
@@ -328,8 +338,8 @@ class McapFile:
                 )
 
     def _indexed(self, offset: int, count: int) -> IntArray:
-        raw = self._read(offset, count * _INDEX_ENTRY.itemsize)
-        entries = np.frombuffer(raw, _INDEX_ENTRY)
+        raw = self._read(offset, count * INDEX_ENTRY.itemsize)
+        entries = np.frombuffer(raw, INDEX_ENTRY)
         return entries["offset"].astype(np.int64)
 
     def _parse(self, read: Callable[[Any], Record], content: int, length: int) -> Record:

@@ -6,7 +6,7 @@ Source: the MCAP specification, https://mcap.dev/spec.
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BytesIO
 from typing import Any, Final, TypeVar
 
@@ -15,12 +15,13 @@ import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
+from mcap.records import Attachment, Channel, Metadata, Schema
 
 from bags.recordings.batch import Batch
 from nlsid_core.arrays import IntArray
 from nlsid_core.errors import BagError
 
+MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES: Final = 128 * 2**20  # recorders close a chunk at about 1 MB or after one message
 RECORD: Final = struct.Struct("<BQ")
 MESSAGE: Final = np.dtype(
@@ -33,6 +34,7 @@ MESSAGE: Final = np.dtype(
         ("publish", "<u8"),
     ]
 )
+INDEX_ENTRY: Final = np.dtype([("log", "<u8"), ("offset", "<u8")])
 MESSAGE_FIXED: Final = MESSAGE.itemsize - RECORD.size  # of a message's content, before its data
 
 Record = TypeVar("Record")
@@ -53,6 +55,24 @@ class Block:
     crc: int
     start_ns: int
     index: dict[int, tuple[int, int]] | None = None
+
+
+@dataclass
+class Contents:
+    """What a file holds. `ending`: why the file stops early, None if it is finished."""
+
+    profile: str = ""
+    library: str = ""
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    blocks: list[Block] = field(default_factory=list)
+    metadata: list[Metadata] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)  # without their data
+    stated: dict[int, int] | None = None  # the statistics' count of messages per channel
+    ending: str | None = None
+    good_bytes: int = 0
+    lost: list[str] = field(default_factory=list)
 
 
 def uncompressed(block: Block, raw: bytes) -> bytes:

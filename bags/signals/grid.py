@@ -3,9 +3,7 @@
 import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, overload
 
@@ -13,6 +11,7 @@ import numpy as np
 
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
+from bags.recordings.remote import place
 from bags.signals.expressions import Expression, factors, product
 from bags.signals.reader import (
     HEADER_STAMP,
@@ -282,7 +281,7 @@ def read_dataset(
     split_gaps: bool = False,
     unfinished: bool = False,
     definitions: Mapping[str, Definition] | None = None,
-    executor: Executor | None = None,
+    names: Sequence[str] | None = None,
     progress: Progress = silent,
 ) -> Dataset:
     """The signals (see `bags.signals.expressions`) of several bags, one trajectory a bag.
@@ -298,13 +297,14 @@ def read_dataset(
     split_gaps: a bag in which a signal is missing, or NaN, for more than `max_gap` gives one
     trajectory per stretch without such a gap (`name.1`, `name.2`, ...) instead of an error; they
     are no repeats, and `skipped_samples` counts what is in none of them. definitions: of message
-    types that the bags do not define (`bags.recordings.definitions`). executor:
-    reads bags in parallel (threads, processes, a Dask client's executor). progress: called after
-    each bag. Raises BagError and DataError as `read_signals`, `to_trajectories` and `Dataset` do.
+    types that the bags do not define (`bags.recordings.definitions`). names: of the trajectories
+    (None: their bags'). progress: told after each bag. Raises BagError and
+    DataError as `read_signals`, `to_trajectories` and `Dataset` do.
     """
-    paths = [Path(bag) for bag in bags]
-    names = list(map(trial_name, paths))
-    if len(twice := {name for name in names if names.count(name) > 1}):
+    paths = [place(bag) for bag in bags]
+    names = list(map(trial_name, paths)) if names is None else names
+    if len(set(names)) < len(names):
+        twice = {name for name in names if names.count(name) > 1}
         raise DataError(f"two bags are called '{min(twice)}'; trials are told apart by name")
     options = {
         "period": period,
@@ -318,11 +318,11 @@ def read_dataset(
         "unfinished": unfinished,
     }
     signals = {"responses": list(responses), "excitations": list(excitations)}
-    read = partial(_read_trials, signals=signals, options=options, definitions=definitions)
     trajectories: list[Trajectory] = []
-    found = (map if executor is None else executor.map)(read, paths, names)
-    for done, trials in enumerate(found, start=1):
-        trajectories += trials
+    for done, (path, name) in enumerate(zip(paths, names, strict=True), start=1):
+        trajectories += _read_trials(
+            path, name, signals=signals, options=options, definitions=definitions
+        )
         progress("reading bags", done / len(paths))
     return Dataset(tuple(trajectories))
 

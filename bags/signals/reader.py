@@ -11,6 +11,7 @@ from rosbags.typesys.store import Typestore
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.remote import RemotePath
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.expressions import Expression
 from bags.signals.timing import without_duplicates
@@ -119,10 +120,17 @@ def bag_digest(bag: Path | str) -> str:
 
 
 def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
-    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data."""
+    """What a dataset's provenance says of a bag: digest, files with their sizes, custom data.
+
+    The digest of a remote file is of what storage says of it and of its end (docs/decisions/0027):
+    its content is not read for it.
+    """
     with Bag(bag, unfinished=unfinished) as source:
         digest = hashlib.sha256()
         for file in source.files:
+            if isinstance(file, RemotePath):
+                digest.update(file.identity())
+                continue
             with file.open("rb") as stream:
                 while block := stream.read(2**20):
                     digest.update(block)

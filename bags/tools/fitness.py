@@ -16,6 +16,7 @@ from scipy.signal import welch
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.remote import place
 from bags.signals.columns import expand_paths, read_columns
 from bags.signals.delays import Delay, delay
 from bags.signals.expressions import Expression
@@ -91,7 +92,7 @@ def check_fitness(
     )
     results = []
     commands: list[tuple[str, FloatArray] | None] = []
-    for path in map(Path, bags):
+    for path in map(place, bags):
         findings: list[Finding] = []
         try:
             with Bag(path, unfinished=True, definitions=definitions) as bag:

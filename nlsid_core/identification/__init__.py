@@ -5,6 +5,7 @@ from nlsid_core.identification.block_cascade import (
     CascadeFit,
     identify_block_cascade,
 )
+from nlsid_core.identification.cells import CellClass
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import Selection, Tried, identify, select
 from nlsid_core.identification.implicit_class import ImplicitClass
@@ -46,6 +47,7 @@ __all__ = [
     "BlockCascadeClass",
     "Candidate",
     "CascadeFit",
+    "CellClass",
     "CertifiedRse",
     "CertifiedSem",
     "FirstRse",

@@ -230,6 +230,21 @@ class SchurBarrier:
         return -np.einsum("aai->i", inner), hessian
 
 
+def _newton_step(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
+    """-H⁺g in the scale of the diagonal; a parameter with hardly any curvature keeps its scale.
+
+    SolverError if that overflows: on what is not finite LAPACK's lstsq may not return.
+    """
+    diagonal, number = np.diag(hessian), np.finfo(float)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, max(diagonal.max() * number.eps**2, number.tiny)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        matrix, side = scale[:, None] * hessian * scale, gradient * scale
+    if not (np.isfinite(matrix).all() and np.isfinite(side).all()):
+        raise SolverError("Newton's method met derivatives beyond all numbers; try fewer lags")
+    step: FloatArray = -scale * np.linalg.lstsq(matrix, side, rcond=None)[0]
+    return step
+
+
 class Descent:
     """Damped Newton on J + μ·barriers in z = [θ; extra]; counts its steps."""
 
@@ -270,11 +285,7 @@ class Descent:
                     "the simulation of the model that the search starts from grows beyond all "
                     "numbers, so its derivatives are not known; try fewer lags or another method"
                 )
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), np.finfo(float).tiny))
-            step = (
-                -scale
-                * np.linalg.lstsq(hessian * np.outer(scale, scale), gradient * scale, rcond=None)[0]
-            )
+            step = _newton_step(gradient, hessian)
             decrement = -float(gradient @ step)
             enough = max(DECREMENT * point.J, (CENTRED if barrier is None else CENTRED_K) * mu)
             if decrement <= enough or self.perfect >= point.J:

@@ -13,6 +13,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.rollout import simulate_together
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -29,9 +30,13 @@ ROUNDING = 4 * float(np.finfo(float).eps)  # relative change of v below which it
 
 
 def history(model: Model) -> int:
-    """How many measured samples start a simulation: for a block cascade its second filter's."""
+    """How many measured samples start a simulation: a block cascade's second filter, a network's
+    hidden states.
+    """
     if isinstance(model, BlockCascade):
         return len(model.a2)
+    if isinstance(model, CellNetwork):
+        return model.start_samples
     return model.history if isinstance(model, MonotoneEquation | ImplicitModel) else len(model)
 
 
@@ -41,7 +46,7 @@ def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
     The input of a block cascade's first filter is held at its first value before the trial.
     """
     n = history(model)
-    if isinstance(model, StateAffineModel):
+    if isinstance(model, StateAffineModel | CellNetwork):
         return model.simulate(trial.u, trial.y[:n])
     if isinstance(model, BlockCascade):
         return model.simulate(trial.u[:, 0], trial.y[:n, 0])[:, None]
@@ -61,14 +66,14 @@ def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArr
 def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:
     """(N - n - horizon + 1, n_y): ŷ(t) from measurements up to t - horizon, t = n + horizon - 1 ….
 
-    n is the model's history. A block cascade's noise is that of the measurement, so outputs later
-    than the first n tell it nothing: its predictions are its simulation.
+    n is the model's history. The noise of a block cascade or a network is that of the measurement,
+    so outputs later than the first n tell it nothing: its predictions are its simulation.
     Raises DataError if the horizon is not positive or the trial is too short.
     """
     n, N = history(model), len(trial)
     if horizon < 1 or n + horizon > N:
         raise DataError(f"{trial.name}: a horizon of {horizon} needs 1 to {N - n} samples")
-    if isinstance(model, BlockCascade):
+    if isinstance(model, BlockCascade | CellNetwork):
         return simulate_trial(model, trial)[n + horizon - 1 :]
     step, lags = _step(model, trial)
     starts = N - n - horizon + 1

@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.linalg import LinAlgError
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_block_cascade
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
+from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import (
@@ -79,6 +81,7 @@ from nlsid_core.identification.trail import Task, Trail
 from nlsid_core.identification.validation import simulation_percent
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -120,16 +123,15 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
             thetas.insert(0, reflected(last.theta, radius))
             if not stable:
                 thetas.append(last.theta)
-        models = []
-        for theta in thetas:
+
+        def reached(theta: FloatArray) -> DifferenceEquation | None:
             start = regression.model(theta, SimulationError(regression.rows).at(theta).p)
-            if not stable or prove_stability(start) is not None:
-                models.append(
-                    minimise_simulation_error(regression, start, stable=stable, radius=radius)
-                )
-        if not models:
-            raise Infeasible("no start of the search has a proof of stability")
-        return min(models, key=lambda model: simulation_percent(model, train))
+            if stable and prove_stability(start) is None:
+                return None
+            return minimise_simulation_error(regression, start, stable=stable, radius=radius)
+
+        found = (_tried(theta.copy, reached) for theta in thetas)
+        return _least_error([model for model in found if model is not None], train)
 
     trail.add(Sem, lambda _: minimised(Rse().iterations, stable=False))
     trail.add(CertifiedSem, lambda method: minimised(method.iterations, stable=True))
@@ -191,6 +193,22 @@ def block_cascade(
         return found.model, found.proof
 
     trail.add_proved(Sem, search)
+    return trail
+
+
+def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwork]:
+    """Scalar states in a row that contract, saturate and flow over; one output."""
+    trail: Trail[CellNetwork] = Trail(task, lambda _: None, f"training error, rms [{_unit(train)}]")
+
+    def search(method: CertifiedSem) -> tuple[CellNetwork, Proof]:
+        model, proof, steps = identify_cells(
+            train, model_class, transient=task.transient, slowest=task.searched_rate,
+            steps=method.iterations,
+        )  # fmt: skip
+        trail.history = History(trail.history.value, steps)
+        return model, proof
+
+    trail.add_proved(CertifiedSem, search)
     return trail
 
 
@@ -257,15 +275,15 @@ def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | No
     """What a search makes of a start; None if there is no start, or it leads to nothing."""
     try:
         return minimised(start())
-    except (DataError, SolverError) as reason:
+    except (DataError, SolverError, LinAlgError) as reason:
         log.info("no model from this start: %s", reason)
         return None
 
 
 def _least_error(models: Sequence[T], train: Dataset) -> T:
-    """The proved model that simulates the training data best; Infeasible if there is none."""
+    """The model that simulates the training data best; Infeasible if there is none."""
     if not models:
-        raise Infeasible("no start of the search leads to a model with a proof of stability")
+        raise Infeasible("no start of the search leads to a model that can be used")
     return min(models, key=lambda model: simulation_percent(model, train))
 
 
@@ -369,6 +387,7 @@ OFFERS: dict[type, Offer] = {
         (LeastSquares, Rie, FirstRse, Rse),
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
+    CellClass: Offer(cells, (CertifiedSem,), ()),
     MonotoneClass: Offer(
         monotone,
         (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),

@@ -22,7 +22,7 @@ from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
 from .terms import derivative
 
 MAX_STATES = 120
-MAX_PHASES = 8  # a cascade has 2^phases matrices
+MAX_PHASES = 8  # a cascade or a network has 2^phases or 2^maps matrices
 MAX_POWER = 20  # of a variable of the window in a monomial
 MAX_WORK = 2 * 10**8  # order³ over all matrices that are decided: about a minute
 MAX_SLOPES = 10**7  # entries of all coefficients of ∂h/∂(v, x), in which a term may occur often
@@ -288,6 +288,50 @@ def _block_cascade(node: Node) -> Model:
     )  # fmt: skip
 
 
+def _cell_network(node: Node) -> Model:
+    """ν_j = f_j(into_j·s), x⁺ = next·s, y = output·s with s = [ν, x, u, 1]: E = [I - S_ν, -S_x].
+
+    S = diag(σ) into, σ_j between the least and the largest slope of f_j, linear between its knots
+    and on beyond them. into is strictly lower triangular in ν, so every output is determined.
+    """
+    parts = _members(node, "y u maps into next output start start_samples")
+    y, u = (tuple(_signal(s) for s in parts[key].items(i, 50)) for key, i in (("y", 1), ("u", 0)))
+    ends = [_slope_range(f) for f in parts["maps"].items(1, MAX_PHASES)]
+    m, n = len(ends), _size(len(parts["start"].array(None)), parts["start"])
+    parts["start_samples"].whole(1)
+    width = m + n + len(u) + 1
+    into = parts["into"].array(m, width)
+    F, H = parts["next"].array(n, width), parts["output"].array(len(y), width)
+    if any(any(row[j:m]) for j, row in enumerate(into)):
+        raise Rejected(f"{node.where} into: a map should depend on earlier maps only")
+
+    def corners(_: Box, __: Node | None) -> list[Matrix]:
+        return [
+            [
+                [one - slope * entry for one, entry in zip(_unit(j, m + n), into[j], strict=False)]
+                for j, slope in enumerate(slopes)
+            ]
+            for slopes in product(*ends)
+        ]
+
+    return Model(
+        _period(parts), y, u, [row[: m + n] for row in F], [row[: m + n] for row in H],
+        "for every input", [], corners,
+    )  # fmt: skip
+
+
+def _slope_range(node: Node) -> list[Fraction]:
+    """The least and the largest slope of a piecewise-linear map, ascending, each once."""
+    parts = node.members("knots values")
+    knots = parts["knots"].array(None)
+    values = parts["values"].array(len(knots))
+    if len(knots) < 2 or any(high <= low for low, high in pairwise(knots)):
+        raise Rejected(f"{node.where}: 2 knots or more, ascending")
+    steps = zip(pairwise(knots), pairwise(values), strict=True)
+    slopes = [(after - before) / (high - low) for (low, high), (before, after) in steps]
+    return sorted({min(slopes), max(slopes)})
+
+
 def _monotone_equation(node: Node) -> Model:
     """e(ȳ(t)) = affine in the past, ν = ȳ(t), E = [e', -a]: e' constant, or its least and a ray."""
     parts = _members(node, "y u e a b c window y_offset u_offset")
@@ -413,6 +457,7 @@ _READERS: dict[str, Callable[[Node], Model]] = {
     "difference_equation": _difference_equation,
     "state_affine": _state_affine,
     "block_cascade": _block_cascade,
+    "cell_network": _cell_network,
     "monotone_equation": _monotone_equation,
 }
 

@@ -3,6 +3,7 @@
 from typing import TypeAlias
 
 from nlsid_core.models.block_cascade import BlockCascade
+from nlsid_core.models.cell_network import CellNetwork, PiecewiseLinear
 from nlsid_core.models.difference_equation import DifferenceEquation
 from nlsid_core.models.implicit import ImplicitModel
 from nlsid_core.models.monotone_equation import MonotoneEquation
@@ -14,14 +15,21 @@ from nlsid_core.models.trapezoidal import TrapezoidalModel
 
 # Models of recorded inputs and outputs that may be proved to forget their start.
 StableModel: TypeAlias = (
-    DifferenceEquation | StateAffineModel | BlockCascade | MonotoneEquation | ImplicitModel
+    DifferenceEquation
+    | StateAffineModel
+    | BlockCascade
+    | CellNetwork
+    | MonotoneEquation
+    | ImplicitModel
 )
 
 __all__ = [
     "BlockCascade",
+    "CellNetwork",
     "DifferenceEquation",
     "ImplicitModel",
     "MonotoneEquation",
+    "PiecewiseLinear",
     "Signal",
     "Spline",
     "StableModel",

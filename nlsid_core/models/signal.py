@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.errors import DocumentError
 
 FORMAT = "nlsid/model"
 
@@ -26,3 +27,17 @@ class Signal:
         return cls(
             *(files.member(document, key, str, source=source) for key in ("name", "unit", "path"))
         )
+
+
+def objects(document: Json, key: str, *, source: str) -> list[Json]:
+    """The objects of the list `document[key]`. Raises DocumentError if it is none."""
+    entries: list[Json] = files.member(document, key, list, source=source)
+    if not all(isinstance(entry, dict) for entry in entries):
+        raise DocumentError(f"{source}: {key} should be a list of objects")
+    return entries
+
+
+def signals(document: Json, key: str, *, source: str) -> tuple[Signal, ...]:
+    """The signals of the list `document[key]`. Raises DocumentError if it is none."""
+    entries = objects(document, key, source=source)
+    return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

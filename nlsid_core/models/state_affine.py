@@ -17,7 +17,7 @@ from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, objects, signals
 
 KIND = "state_affine"
 OutOfRange = Literal["clip", "refuse"]
@@ -190,12 +190,12 @@ class StateAffineModel:
         kind = files.member(document, "kind", str, source=source)
         if kind != KIND:
             raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
-        y, u = (_signals(document, key, source) for key in ("y", "u"))
+        y, u = (signals(document, key, source=source) for key in ("y", "u"))
         window = files.array(document, "window", (None, 2), source=source)
         if (window % 1.0).any():
             raise DocumentError(f"{source}: window should hold integers")
         n_w, n_y = len(window), len(y)
-        left = _objects(files.member(document, "G", list, source=source), source)
+        left = objects(document, "G", source=source)
         right = files.member(document, "p", dict, source=source)
         bags = files.member(document, "bags", list, source=source)
         return cls(
@@ -228,15 +228,3 @@ def _recursion(gains: list[list[float]], forcing: list[float], past: list[float]
         past = [y, *past[:-1]]
         outputs.append(y)
     return outputs
-
-
-def _objects(entries: list[object], source: str) -> list[Json]:
-    for entry in entries:
-        if not isinstance(entry, dict):
-            raise DocumentError(f"{source}: expected a list of objects")
-    return entries  # type: ignore[return-value]
-
-
-def _signals(document: Json, key: str, source: str) -> tuple[Signal, ...]:
-    entries = _objects(files.member(document, key, list, source=source), source)
-    return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

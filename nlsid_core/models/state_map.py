@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, signals
 from nlsid_core.polynomial import Polynomial
 
 KIND = "state_map"
@@ -162,7 +162,7 @@ def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]
     kind = files.member(document, "kind", str, source=source)
     if kind != expected:
         raise DocumentError(f"{source}: kind is '{kind}', expected '{expected}'")
-    x, u = (_signals(document, key, source) for key in ("x", "u"))
+    x, u = (signals(document, key, source=source) for key in ("x", "u"))
     exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
     if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():
         raise DocumentError(f"{source}: exponents should be integers up to {MAX_DEGREE}")
@@ -183,10 +183,3 @@ def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]
         "bags": tuple(files.named_digests(bags, source=source)),
         **arrays,
     }
-
-
-def _signals(document: Json, key: str, source: str) -> tuple[Signal, ...]:
-    entries = files.member(document, key, list, source=source)
-    if not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise DocumentError(f"{source}: '{key}' should list at least one signal")
-    return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)

@@ -16,6 +16,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -197,6 +198,22 @@ class _Cascade:
         return y, np.hstack([first, after])
 
 
+class _Network:
+    """x of a cell network, from the first samples by least squares."""
+
+    delays = 0
+
+    def __init__(self, model: CellNetwork) -> None:
+        self._model = model
+        self.order, self.lags = len(model.start), model.start_samples
+
+    def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        return np.asarray(self._model.states(u, self._model.start_from(y, u))[1][-1])
+
+    def advance(self, x: FloatArray, past: deque[FloatArray]) -> tuple[FloatArray, FloatArray]:
+        return self._model.advance(x, past[-1])
+
+
 class _Monotone:
     """e(ȳ) = c + a'x + b'w, x the lagged ȳ."""
 
@@ -242,6 +259,7 @@ _KINDS: dict[type, Callable[..., Any]] = {
     DifferenceEquation: _Linear,
     StateAffineModel: _StateAffine,
     BlockCascade: _Cascade,
+    CellNetwork: _Network,
     MonotoneEquation: _Monotone,
     ImplicitModel: _Implicit,
 }

@@ -1,6 +1,5 @@
 """Clocks, gaps, delays, repeats, resampling."""
 
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -139,8 +138,7 @@ def test_a_bag_with_a_gap_gives_a_trajectory_per_stretch(tmp_path: Path) -> None
     options = {"responses": [SPEED], "excitations": [COMMAND]}
     with pytest.raises(DataError, match="a gap of"):
         bags.read([bag], **options)  # type: ignore[arg-type]
-    with ThreadPoolExecutor(2) as executor:
-        found = bags.read([bag], split_gaps=True, executor=executor, **options)  # type: ignore[arg-type]
+    found = bags.read([bag], split_gaps=True, **options)  # type: ignore[arg-type]
     assert [(trial.name, len(trial)) for trial in found] == [("x.1", 30), ("x.2", 40)]
     np.testing.assert_array_equal(found.trajectories[1].y[:, 0], np.arange(50.0, 90.0))
     np.testing.assert_array_equal(found.trajectories[1].u[:, 0], np.arange(50.0, 90.0))

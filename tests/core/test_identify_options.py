@@ -10,6 +10,7 @@ from nlsid_core.errors import DataError, OptionError
 from nlsid_core.identification import (
     METHODS,
     BlockCascadeClass,
+    CellClass,
     CertifiedRse,
     CertifiedSem,
     ImplicitClass,
@@ -24,7 +25,7 @@ from nlsid_core.identification.methods import alike
 
 LEAST_OPTIONS: dict[type, dict[str, Any]] = {
     LinearClass: {"lags": 1}, StateAffineClass: {"lags": 2}, MonotoneClass: {"lags": 1},
-    BlockCascadeClass: {}, ImplicitClass: {}, LinearStateClass: {},
+    BlockCascadeClass: {}, CellClass: {}, ImplicitClass: {}, LinearStateClass: {},
 }  # fmt: skip
 # class, option -> its smallest and largest allowed values, and the nearest that are refused
 LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
@@ -47,6 +48,11 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (BlockCascadeClass, "start_samples"): ((1,), (0,)),
     (BlockCascadeClass, "seed"): ((0,), (-1, 0.5)),
     (BlockCascadeClass, "begin"): (("measured", "rest"), ("motion",)),
+    (CellClass, "cells"): ((1, 3), (0, 4, 1.5)),
+    (CellClass, "intervals"): ((1, 30), (0, 31)),
+    (CellClass, "start_samples"): ((1, 10_000), (0, 10_001)),
+    (CellClass, "limit"): (("top", "friction", "none"), ("saturation",)),
+    (CellClass, "smoothing"): ((0.0, 1.0), (-1e-9, float("nan"), float("inf"))),
     (ImplicitClass, "lags"): ((1, 100), (0, 101)),
     (ImplicitClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
     (ImplicitClass, "set"): (("2.10", "2.11", "2.12", "2.13"), ("2.9",)),

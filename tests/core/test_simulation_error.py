@@ -11,8 +11,8 @@ from benchmarks.recorded import heat_exchanger, single
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.identification import CertifiedSem, LinearClass, identify, prove_stability
+from nlsid_core.errors import DataError, ShapeError, SolverError
+from nlsid_core.identification import CertifiedSem, LinearClass, identify, newton, prove_stability
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.linear import (
@@ -23,6 +23,7 @@ from nlsid_core.identification.linear import (
 from nlsid_core.identification.newton import minimise
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import Bound, robust_simulation_error
+from nlsid_core.identification.searches import _tried
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.starts import reduced_poles, reflected
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
@@ -320,3 +321,26 @@ def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
         for trial in stacked.dataset
     ]
     assert rms == pytest.approx(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+
+
+def test_a_start_whose_simulation_overflows_leaves_the_other_starts_to_be_tried() -> None:
+    """A pole at 1.3 over 2000 samples: its errors are beyond all numbers, and no traceback."""
+    rng, N = np.random.default_rng(0), 2000
+    walk = np.cumsum(rng.standard_normal((N, 1)), axis=0)
+    trial = Trajectory(t=np.arange(N) * 1.0, y=walk, u=rng.standard_normal((N, 1)))
+    rows = build_regression(Dataset((trial,)), 2).rows
+    starts = [np.array([1.0, -2.2, 1.17]), np.array([1.0, -1.4, 0.45])]
+    error = SimulationError(rows)
+    found = [_tried(start.copy, lambda theta: error.at(theta).J) for start in starts]
+    assert found[0] is None
+    assert found[1] is not None
+
+
+def test_a_parameter_whose_curvature_is_lost_in_rounding_keeps_its_place() -> None:
+    """On a matrix that is not finite LAPACK's least squares may never return."""
+    hessian = np.array([[2.0, 1e-17], [1e-17, -1e-17]])
+    step = newton._newton_step(np.array([1.0, 1e-17]), hessian)
+    assert step[0] == pytest.approx(-0.5)
+    assert abs(step[1]) < 1.0
+    with pytest.raises(SolverError, match="beyond all numbers"):
+        newton._newton_step(np.array([1e300, 0.0]), np.array([[1e-300, 1e300], [1e300, 1e-300]]))

@@ -18,7 +18,7 @@ DOWNWARD = {
 # The rooms of bags, each standing on those before it.
 ROOMS = (
     "recordings", "signals", "tools", "designs", "monitoring", "viewing", "pictures", "chain",
-    "setup", "commands",
+    "fleet", "setup", "commands",
 )  # fmt: skip
 # The rooms of nlsid_core by band, and the bands that each may import.
 BANDS = {

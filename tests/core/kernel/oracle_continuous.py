@@ -1,14 +1,24 @@
-"""What docs/certificate_continuous_funnel.md says that a piece claims, in Fractions, at points.
+"""Claim `continuous_funnel` decided a second time, in Fractions.
 
-Written from that page alone; shares no code with the kernel, the prover or the search.
+Written from docs/certificate_continuous_funnel.md alone; shares no code with the kernel, the prover
+or the search. What a piece claims is evaluated at points, or at the variables themselves (`P`),
+which leaves the polynomial: `agrees` decides all that the page asks, with nothing left out.
 """
 
+import json
+from collections.abc import Callable, Mapping
 from fractions import Fraction
-from itertools import product
+from functools import lru_cache
+from itertools import pairwise, product
 from math import comb
 from typing import Any
 
+from nlsid_core import files
+from tests.core.kernel.oracle_polynomial import P, left_over
+from tests.core.kernel.oracle_stability import is_definite, solved
+
 Document = dict[str, Any]
+Rows = list[list[Fraction]]
 
 
 def numbers(nested: Any) -> Any:
@@ -54,6 +64,34 @@ def squares(basis: list[list[int]], columns: list[int], node: Document, s: Fract
             total += sum((e * a for e, a in zip(entries, v, strict=True)), Fraction(0)) ** 2
         points.append(total / Fraction(4) ** node["unit"])
     return bernstein(points, s)
+
+
+class Degree:
+    """The degree that a formula states: of a sum the largest, of a product the sum."""
+
+    def __init__(self, degree: int) -> None:
+        self.degree = degree
+
+    def __add__(self, other: Any) -> "Degree":
+        return Degree(max(self.degree, degree_of(other)))
+
+    __radd__ = __sub__ = __rsub__ = __add__
+
+    def __mul__(self, other: Any) -> "Degree":
+        return Degree(self.degree + degree_of(other))
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, _: Fraction) -> "Degree":
+        return self
+
+    def __pow__(self, power: int) -> "Degree":
+        return Degree(self.degree * power)
+
+
+def degree_of(value: Any) -> int:
+    """Of a formula, or 0 of a number."""
+    return value.degree if isinstance(value, Degree) else 0
 
 
 class Oracle:
@@ -151,8 +189,9 @@ class Oracle:
         for j in self.pushing():
             low, high = numbers(self.field["uncertain"][j])
             unit = [Fraction(int(a == j)) for a in range(len(w))]
-            still = self.rate(k, t0, nominal, wanted, [Fraction(0)] * len(w))
-            g = [a - b for a, b in zip(self.rate(k, t0, nominal, wanted, unit), still, strict=True)]
+            nowhere = [Fraction(0)] * self.n, [Fraction(0)] * self.m
+            still = self.rate(k, t0, *nowhere, [Fraction(0)] * len(w))
+            g = [a - b for a, b in zip(self.rate(k, t0, *nowhere, unit), still, strict=True)]
             room -= (high - low) / 2 * max(abs(dot(gain[i], g)) for gain in K)
         P0, P1 = (numbers(self.funnel["P"][j]) for j in (k, k + 1))
         Pe = [dot([(1 - s) * a + s * b for a, b in zip(*rows, strict=True)], e)
@@ -241,3 +280,272 @@ def dot(a: list[Fraction], b: list[Fraction]) -> Fraction:
 def add(a: list[Fraction], b: list[Fraction]) -> list[Fraction]:
     """a + b."""
     return [p + q for p, q in zip(a, b, strict=True)]
+
+
+def agrees(document: Document, about: Mapping[str, Document]) -> bool:
+    """Whether a proof document about these files proves its claim."""
+    try:
+        named = document["claim"]["about"]
+        assert document["claim"]["kind"] == "continuous_funnel"
+        assert set(named) == {"vector_field", "policy", "funnel"}
+        field, policy, funnel = (
+            bound(named[role], about) for role in ("vector_field", "policy", "funnel")
+        )
+        return is_proved(document["claim"], document["proof"], field, policy, funnel)
+    except (ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
+        return False
+
+
+def bound(binding: Document, about: Mapping[str, Document]) -> Document:
+    """The document of a binding, whose digest has to be its own."""
+    document = about[binding["file"]]
+    assert files.digest(document) == binding["digest"]
+    return document
+
+
+def is_proved(
+    claim: Document, proof: Document, field: Document, policy: Document, funnel: Document
+) -> bool:
+    """Every obligation of the page, for the contents of the files."""
+    digest = files.digest(field)
+    if {policy["vector_field"], funnel["vector_field"]} != {digest}:
+        return False
+    if funnel["policy"] != files.digest(policy) or funnel["kind"] != "continuous":
+        return False
+    oracle = Oracle(field, policy, funnel, proof, claim)
+    return (
+        makes_sense(oracle)
+        and is_a_funnel(oracle)
+        and (("goal" in claim) == ("goal_multiplier" in proof))
+        and ("goal" not in claim or ends_inside(claim["goal"], proof, funnel))
+        and all(stays_valid(oracle, k) for k in range(len(funnel["t"]) - 1))
+        and is_covered(oracle, proof["pieces"], rates=False)
+        and all(holds(oracle, piece, rates=False) for piece in proof["pieces"])
+        and ("hold" not in claim or is_followed(oracle))
+    )
+
+
+def makes_sense(oracle: "Oracle") -> bool:
+    """What the page says of the members of the three files and of the claim and proof."""
+    field, policy, claim, proof = oracle.field, oracle.policy, oracle.claim, oracle.proof
+    n, m, w = oracle.n, oracle.m, len(field["uncertain"])
+    assert type(n) is type(m) is int
+    rows = [row for span in field["pieces"] for e in span for row in e["exponents"]]
+    first = 1 + n + m
+    limited = [int(row[0]) for row in policy["limits"]]
+    alone = all(sum(row) == 1 for row in rows if any(row[first:]))
+    affine = all(max(row[1 + n : first], default=0) <= 1 for row in rows)
+    return (
+        1 <= n <= 16
+        and 0 <= m <= 16
+        and w <= 32
+        and all(low <= high for low, high in numbers(field["uncertain"]))
+        and increasing(field["breaks"])
+        and len(field["pieces"]) == len(field["breaks"]) + 1
+        and all(len(span) == n for span in field["pieces"])
+        and all(len(row) == first + w and sum(row) <= 7 for row in rows)
+        and all(type(e) is int and e >= 0 for row in rows for e in row)
+        and all(max(row[first:], default=0) <= 1 for row in rows)
+        and all(
+            a < b for span in field["pieces"] for e in span for a, b in pairwise(e["exponents"])
+        )
+        and all(row[0] in range(n + m) for row in field["valid"])
+        and len(limited) <= 3
+        and len(set(limited)) == len(limited)
+        and all(row[0] in range(m) and row[1] < row[2] for row in policy["limits"])
+        and set(claim) <= {"kind", "about", "goal", "hold", "error"}
+        and (("kappa" not in proof) or (alone and w > 0))
+        and Fraction(proof["margin"]) > 0
+        and ("hold" not in claim or claim["hold"] > 0)
+        and min(claim.get("error", [0])) >= 0
+        and (affine or not {"hold", "error"} & set(claim))
+        and min((min(row) for row in proof.get("kappa", [[1]])), default=1) > 0
+    )
+
+
+def increasing(times: list[float]) -> bool:
+    """Whether they do."""
+    return all(Fraction(a) < Fraction(b) for a, b in pairwise(times))
+
+
+def is_a_funnel(oracle: "Oracle") -> bool:
+    """Knots, one nominal in policy and funnel, continuous; P ≻ 0 and ρ > 0 at every knot."""
+    field, policy, funnel, n, m = oracle.field, oracle.policy, oracle.funnel, oracle.n, oracle.m
+    t, x = numbers(funnel["t"]), numbers(funnel["x"])
+    K = len(t)
+    return (
+        K >= 2
+        and increasing(funnel["t"])
+        and numbers(policy["t"]) == t
+        and numbers(policy["x"]) == x
+        and all(len(curve) == K - 1 for curve in (x, policy["u"], policy["K"]))
+        and all(1 <= len(c) <= 4 for curve in (x, policy["u"], policy["K"]) for c in curve)
+        and all(len(point) == n for control in x for point in control)
+        and all(len(point) == m for control in policy["u"] for point in control)
+        and all(len(gain) == m for control in policy["K"] for gain in control)
+        and all(len(row) == n for control in policy["K"] for gain in control for row in gain)
+        and all(before[-1] == after[0] for before, after in pairwise(x))
+        and len(funnel["P"]) == len(funnel["rho"]) == K
+        and all(len(shape) == n and is_definite(numbers(shape)) for shape in funnel["P"])
+        and min(funnel["rho"]) > 0
+        and all(b in t for b in numbers(field["breaks"]) if t[0] < b < t[-1])
+    )
+
+
+def ends_inside(goal: Document, proof: Document, funnel: Document) -> bool:
+    """Obligation 3."""
+    shape, multiplier = numbers(goal["P"]), Fraction(proof["goal_multiplier"])
+    end = ellipsoid(funnel, -1)
+    return is_definite(shape) and is_inside(*end, numbers(goal["centre"]), shape, multiplier)
+
+
+def ellipsoid(funnel: Document, end: int) -> tuple[list[Fraction], Rows, Fraction]:
+    """Centre, P and ρ of a funnel at its start (0) or its end (-1)."""
+    return numbers(funnel["x"][end][end]), numbers(funnel["P"][end]), Fraction(funnel["rho"][end])
+
+
+def is_inside(
+    a: list[Fraction], P: Rows, rho: Fraction, b: list[Fraction], B: Rows, multiplier: Fraction
+) -> bool:
+    """λ >= 0 and [λP/ρ - B, -Bd; -(Bd)', 1 - λ - d'Bd] ⪰ 0, d = a - b."""
+    d = [p - q for p, q in zip(a, b, strict=True)]
+    Bd = [dot(row, d) for row in B]
+    M = [
+        [*(multiplier * p / rho - q for p, q in zip(left, right, strict=True)), -e]
+        for left, right, e in zip(P, B, Bd, strict=True)
+    ]
+    M.append([*(-e for e in Bd), 1 - multiplier - dot(d, Bd)])
+    size = range(len(M))
+    chosen = [[i for i in size if mask >> i & 1] for mask in range(1, 2 ** len(M))]
+    return multiplier >= 0 and all(
+        determinant([[M[i][j] for j in part] for i in part]) >= 0 for part in chosen
+    )
+
+
+def determinant(M: Rows) -> Fraction:
+    """By cofactors of the first row."""
+    if not M:
+        return Fraction(1)
+    return sum(
+        (
+            (-1) ** j * entry * determinant([row[:j] + row[j + 1 :] for row in M[1:]])
+            for j, entry in enumerate(M[0])
+        ),
+        Fraction(0),
+    )
+
+
+def stays_valid(oracle: "Oracle", k: int) -> bool:
+    """Obligation 4 on interval k."""
+    policy, funnel, n = oracle.policy, oracle.funnel, oracle.n
+    limits = {int(j): (low, high) for j, low, high in numbers(policy["limits"])}
+    for number, low, high, *spans in numbers(oracle.field["valid"]):
+        if spans and spans[0] not in range(len(oracle.field["pieces"])):
+            return False
+        if spans and spans[0] != oracle.span(k):
+            continue
+        j = int(number)
+        if j < n:
+            middle = [point[j] for point in numbers(funnel["x"][k])]
+            rows, off = [[Fraction(int(a == j)) for a in range(n)]], Fraction(0)
+        else:
+            middle = [point[j - n] for point in numbers(policy["u"][k])]
+            rows = [gain[j - n] for gain in numbers(policy["K"][k])]
+            off = oracle.width(k, j - n)
+        room = [min(middle) - low - off, high - max(middle) - off]
+        if j >= n and j - n in limits:
+            least, most = limits[j - n]
+            if low > most or least > high:
+                return False
+            room = [r for r, kept in zip(room, (least >= low, most <= high), strict=True)
+                    if not kept]  # fmt: skip
+        if not room:
+            continue
+        if min(room) < 0:
+            return False
+        for knot, g in product((k, k + 1), rows):
+            P, rho = numbers(funnel["P"][knot]), Fraction(funnel["rho"][knot])
+            form = dot(g, [row[0] for row in solved(P, [[e] for e in g])])
+            if rho * form > min(room) ** 2:
+                return False
+    return True
+
+
+def is_covered(oracle: "Oracle", pieces: list[Document], *, rates: bool) -> bool:
+    """Obligation 5, or that part of 8: every case at every time."""
+    limited = [int(row[0]) for row in oracle.policy["limits"]]
+    modes = list(product((-1, 0, 1), repeat=len(limited)))
+    cases: list[tuple[int, ...]] = modes
+    if rates:
+        vertices = oracle.rate_vertices()
+        cases = [
+            (i, sign, *mode)
+            for i, sign, mode in product(range(oracle.m), (-1, 1), modes)
+            if i not in limited or mode[limited.index(i)] == 0
+        ]
+    else:
+        corners = 1 if "kappa" in oracle.proof else 2 ** len(oracle.field["uncertain"])
+        vertices = corners * len(oracle.sides())
+    needed = set(product(range(len(oracle.funnel["t"]) - 1), range(vertices), cases))
+    parts: dict[Any, list[tuple[Fraction, Fraction]]] = {key: [] for key in needed}
+    for piece in pieces:
+        level, index = piece["level"], piece["index"]
+        assert type(level) is type(index) is type(piece["interval"]) is type(piece["vertex"]) is int
+        assert 0 <= level <= 16
+        assert 0 <= index < 2**level
+        case = tuple(piece["mode"]) if limited else ()
+        case = (piece["input"], piece["sign"], *case) if rates else case
+        length = Fraction(1, 2**level)
+        parts[piece["interval"], piece["vertex"], case].append((index * length, length))
+    for found in parts.values():
+        until = Fraction(0)
+        for start, length in sorted(found):
+            until = max(until, start + length) if start <= until else until
+        if until < 1:
+            return False
+    return True
+
+
+def is_followed(oracle: "Oracle") -> bool:
+    """Obligation 8: u₀ and K are continuous, and no input moves faster than its rate."""
+    policy, proof = oracle.policy, oracle.proof
+    curves = (numbers(policy["u"]), numbers(policy["K"]))
+    return (
+        all(before[-1] == after[0] for curve in curves for before, after in pairwise(curve))
+        and len(proof["rates"]) == len(oracle.funnel["t"]) - 1
+        and all(len(row) == oracle.m and min(row, default=1) > 0 for row in proof["rates"])
+        and is_covered(oracle, proof["rate_pieces"], rates=True)
+        and all(holds(oracle, piece, rates=True) for piece in proof["rate_pieces"])
+    )
+
+
+def holds(oracle: "Oracle", piece: Document, *, rates: bool) -> bool:
+    """Whether a piece is decided by its own witness."""
+    without = {
+        "pieces", "rate_pieces", "goal", "goal_multiplier", "about", "vector_field", "policy",
+    }  # fmt: skip
+    about = [
+        {key: part for key, part in document.items() if key not in without}
+        for document in (oracle.policy, oracle.funnel, oracle.proof, oracle.claim)
+    ]
+    field = {key: part for key, part in oracle.field.items() if key not in ("valid", "expansion")}
+    about.insert(0, field)
+    return _holds(json.dumps(about), json.dumps(piece), rates)
+
+
+@lru_cache(maxsize=50_000)
+def _holds(shared: str, stated: str, rates: bool) -> bool:
+    """`holds`, once for the same piece of the same proof about the same files."""
+    oracle, piece = Oracle(*json.loads(shared)), json.loads(stated)
+    n = oracle.n
+    s, *e = (P.variable(1 + n, i) for i in range(1 + n))
+    claimed: Callable[[Document, Any, Any], Any] = oracle.rate_left if rates else oracle.c
+    by_power: dict[int, P] = {}
+    for (power_of_s, *key), value in claimed(piece, s, e).terms.items():
+        part = P(n, {tuple(key): value})
+        by_power[power_of_s] = by_power.get(power_of_s, P(n)) + part
+    c = [by_power.get(i, P(n)) for i in range(max(by_power, default=0) + 1)]
+    formal = degree_of(claimed(piece, Degree(1), [Degree(0)] * n))
+    witness = {key: piece[key] for key in ("columns", "squares")}
+    left = left_over(c, witness | {"basis": oracle.proof["basis"]}, formal)
+    return left is not None and left.get((0,) * n, 0) > 0

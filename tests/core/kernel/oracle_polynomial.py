@@ -18,7 +18,9 @@ class P:
 
     def __init__(self, n: int, terms: Mapping[Key, Fraction | int] | None = None) -> None:
         self.n = n
-        self.terms = {k: Fraction(v) for k, v in (terms or {}).items() if v}
+        self.terms = {
+            k: v if type(v) is Fraction else Fraction(v) for k, v in (terms or {}).items() if v
+        }
 
     @classmethod
     def constant(cls, n: int, value: Fraction | int) -> "P":
@@ -28,14 +30,22 @@ class P:
     def variable(cls, n: int, i: int) -> "P":
         return cls(n, {tuple(int(j == i) for j in range(n)): 1})
 
-    def __add__(self, other: "P") -> "P":
+    def lifted(self, other: "P | Fraction | int") -> "P":
+        return other if isinstance(other, P) else P.constant(self.n, other)
+
+    def __add__(self, other: "P | Fraction | int") -> "P":
         total = dict(self.terms)
-        for k, v in other.terms.items():
+        for k, v in self.lifted(other).terms.items():
             total[k] = total.get(k, Fraction(0)) + v
         return P(self.n, total)
 
-    def __sub__(self, other: "P") -> "P":
-        return self + other * Fraction(-1)
+    __radd__ = __add__
+
+    def __sub__(self, other: "P | Fraction | int") -> "P":
+        return self + self.lifted(other) * Fraction(-1)
+
+    def __rsub__(self, other: "P | Fraction | int") -> "P":
+        return self.lifted(other) - self
 
     def __mul__(self, other: "P | Fraction | int") -> "P":
         if not isinstance(other, P):
@@ -46,6 +56,17 @@ class P:
                 k = tuple(i + j for i, j in zip(a, b, strict=True))
                 total[k] = total.get(k, Fraction(0)) + x * y
         return P(self.n, total)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: Fraction | int) -> "P":
+        return self * (Fraction(1) / other)
+
+    def __pow__(self, power: int) -> "P":
+        total = P.constant(self.n, 1)
+        for _ in range(power):
+            total = total * self
+        return total
 
     def __call__(self, point: Sequence[Fraction]) -> Fraction:
         total = Fraction(0)
@@ -139,16 +160,17 @@ def raised(points: Sequence[P], degree: int) -> list[P]:
     ]
 
 
-def left_over(c: Sequence[P], witness: Any) -> dict[Key, Fraction] | None:
+def left_over(c: Sequence[P], witness: Any, stated: int = 0) -> dict[Key, Fraction] | None:
     """What every Bernstein coefficient of r leaves on the diagonal; None if it is not dominant.
 
-    c: coefficients of s^0, s^1, …. Source: docs/certificate.md, "positive".
+    c: coefficients of s^0, s^1, …. stated: the degree in s that c has by its formula. Source:
+    docs/certificate.md, "positive".
     """
     n, basis = c[0].n, [tuple(row) for row in witness["basis"]]
     of_squares = squares(witness, n)
     while len(c) > 1 and not c[-1].terms:  # of the degree that c has
         c = c[:-1]
-    degree = max(len(c), len(of_squares)) - 1
+    degree = max(len(c) - 1, len(of_squares) - 1, stated)
     rest = [a - b for a, b in zip(bernstein(c, degree), raised(of_squares, degree), strict=True)]
     size = [Fraction(2) ** column for column in witness["columns"]]
     least: dict[Key, Fraction] = {}

@@ -1,14 +1,27 @@
-"""What a sampled funnel's proof says, computed from its documents alone and in Fractions.
+"""Claim `sampled_funnel` decided a second time, in Fractions.
 
-Written from docs/certificate_sampled_funnel.md; it shares no code with the kernel or the search.
-Everything is evaluated at points: no polynomial is ever multiplied out.
+Written from docs/certificate_sampled_funnel.md alone; it shares no code with the kernel or the
+search. What is claimed is evaluated at points, or at the variables themselves (`P`), which leaves
+the polynomial: `agrees` decides all that the page asks, with nothing left out.
 """
 
+import json
+from collections.abc import Mapping
 from fractions import Fraction
-from math import prod
+from functools import lru_cache
+from itertools import product
+from math import factorial, prod
 from typing import Any
 
+from nlsid_core import files
+from tests.core.kernel.oracle_continuous import bound as opened
+from tests.core.kernel.oracle_continuous import determinant
+from tests.core.kernel.oracle_polynomial import P, left_over
+from tests.core.kernel.oracle_stability import is_definite, solved
+from tests.core.kernel.oracle_tube import overlap, span
+
 Json = dict[str, Any]
+CHAINS = ("tube", "inlet")
 Vector = list[Fraction]
 Matrix = list[Vector]
 
@@ -72,22 +85,32 @@ def implicit_next(
 
 def monomial(point: Vector, exponents: list[int]) -> Fraction:
     """Π point^exponents."""
-    return Fraction(prod(p**e for p, e in zip(point, exponents, strict=True)))
+    result = Fraction(1)
+    for p, e in zip(point, exponents, strict=True):
+        result = result * p**e if e else result
+    return result
 
 
 def squares_at(entry: Json, basis: list[list[int]], point: Vector) -> Fraction:
-    """Σ (R V v)² / 4^unit of an entry {columns, squares}."""
+    """Σ weight (R V v)² / (scale 4^unit) of an entry {columns, squares}."""
     monomials = [
-        Fraction(2) ** shift
-        * prod((p**e for p, e in zip(point, row, strict=True)), start=Fraction(1))
+        Fraction(2) ** shift * monomial(point, row)
         for shift, row in zip(entry["columns"], basis, strict=True)
     ]
-    (factor,) = entry["squares"]["factors"]
-    unit, total = int(entry["squares"]["unit"]), Fraction(0)
-    for row in factor:
+    part = entry["squares"]
+    (factor,) = part["factors"]
+    weights, total = part.get("weights", [1] * len(factor)), Fraction(0)
+    for weight, row in zip(weights, factor, strict=True):
         used = monomials[len(monomials) - len(row) :]
-        total += sum((int(a) * m for a, m in zip(row, used, strict=True)), Fraction(0)) ** 2
-    return total * Fraction(1, 4) ** unit
+        line = dot([Fraction(a) for a in row], used)
+        total = total + Fraction(weight) * line**2
+    below: Fraction = Fraction(part.get("scale", 1)) * 4 ** part["unit"]
+    return total / below
+
+
+def dot(a: Vector, b: Vector) -> Fraction:
+    """a'b."""
+    return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
 
 
 def claimed_at(documents: dict[str, Json], proof: Json, chain: str, k: int, y: Vector) -> Fraction:
@@ -187,3 +210,311 @@ def _outside(model: Json, policy: Json, k: int, deviation: Vector, *, last: bool
         if not Fraction(low) <= value <= Fraction(high):
             return "box"
     return ""
+
+
+def agrees(document: Json, about: Mapping[str, Json]) -> bool:
+    """Whether a proof document about these files proves its claim."""
+    try:
+        named = document["claim"]["about"]
+        assert document["claim"]["kind"] == "sampled_funnel"
+        assert set(named) == {"model", "policy", "funnel"}
+        documents = {role: opened(named[role], about) for role in named}
+        model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
+        if {policy["model"], funnel["model"]} != {files.digest(model)}:
+            return False
+        if funnel["policy"] != files.digest(policy):
+            return False
+        proof, steps = document["proof"], len(policy["u"])
+        assert len(proof["steps"]) == steps
+        return (
+            makes_sense(model, policy, funnel)
+            and is_measured(model, funnel["assumption"])
+            and all(stays(model, policy, funnel, k) for k in range(steps + 1))
+            and all(follows(documents, proof, k) for k in range(steps))
+        )
+    except (ArithmeticError, AssertionError, LookupError, TypeError, ValueError):
+        return False
+
+
+def is_implicit(model: Json) -> bool:
+    """Whether its next rate is stated by an equation."""
+    return bool(model["kind"] == "trapezoidal")
+
+
+def makes_sense(model: Json, policy: Json, funnel: Json) -> bool:
+    """Obligations 1 and 2: kinds, shapes, radii and sizes."""
+    implicit, n, p, N = is_implicit(model), len(model["x"]), len(model["u"]), len(policy["u"])
+    outputs = n // 2 if implicit else n
+    rows = model["exponents"]
+    arrays = [
+        (model["coefficients"], (len(rows), outputs)),
+        (model["x_range"], (n, 2)), (model["u_range"], (p, 2)),
+        (policy["L"], (n, n)), (policy["u"], (N, p)), (policy["x"], (N + 1, n)),
+        (policy["K"], (N, p, n)), (funnel["S"], (N + 1, n, n)), (funnel["A"], (N, n, n)),
+        (funnel["half_widths"], (N + 1, n)), *((funnel[chain], (N + 1,)) for chain in CHAINS),
+    ]  # fmt: skip
+    if implicit:
+        arrays.append((funnel["roots"], (N + 1,)))
+    radii = [*funnel["tube"], *funnel["inlet"], *(funnel["roots"] if implicit else [])]
+    return (
+        (model["kind"], policy["kind"], funnel["kind"])
+        == ("trapezoidal" if implicit else "state_map", "sampled", "sampled")
+        and all(has_shape(value, shape) for value, shape in arrays)
+        and 1 <= n <= 16
+        and 1 <= p <= 16
+        and not (implicit and n % 2)
+        and N >= 1
+        and N * n**3 <= 10**6
+        and len({tuple(row) for row in rows}) == len(rows) >= 1
+        and all(len(row) == n + p for row in rows)
+        and all(type(e) is int and e >= 0 for row in rows for e in row)
+        and 0 < Fraction(model["period"]) == Fraction(policy["period"])
+        and min(radii) > 0
+        and funnel["tube"][0] <= funnel["inlet"][0]
+        and all(is_triangular(S) for S in funnel["S"])
+    )
+
+
+def has_shape(value: Any, shape: tuple[int, ...]) -> bool:
+    """Whether nested lists of numbers have it."""
+    if not shape:
+        return type(value) in (int, float)
+    return len(value) == shape[0] and all(has_shape(entry, shape[1:]) for entry in value)
+
+
+def is_triangular(M: list[list[float]]) -> bool:
+    """Upper, with a diagonal without zeros."""
+    size = range(len(M))
+    return all(M[i][i] != 0 and not any(M[i][:i]) for i in size)
+
+
+def is_measured(model: Json, assumption: Json) -> bool:
+    """Obligation 3."""
+    names = ("bound", "rate", "gain", "measured", "safety_factor")
+    bound, rate, gain, measured, factor = (Fraction(assumption[name]) for name in names)
+    form = assumption["form"]
+    forms = ["peak", "response"] + ([] if is_implicit(model) else ["energy", "fading"])
+    runs = [span(run["digest"]) for run in assumption["measured_on"]]
+    bags = [span(bag["digest"]) for bag in model["bags"]]
+    return (
+        form in forms
+        and bound >= 0
+        and factor >= 1
+        and measured >= 0
+        and factor * measured <= bound
+        and bool(runs)
+        and all(end == float("inf") for _, _, end in runs)
+        and not any(overlap(a, b) for a, b in product(runs, bags))
+        and 0 <= rate <= 1 <= gain
+        and (form == "fading" or rate == 1)
+        and (form in ("energy", "fading") or gain == 1)
+    )
+
+
+def widened(funnel: Json) -> Fraction:
+    """What the disturbance adds to a radius."""
+    a = funnel["assumption"]
+    return Fraction(0) if a["form"] == "peak" else Fraction(a["bound"])
+
+
+def stays(model: Json, policy: Json, funnel: Json, k: int) -> bool:
+    """Obligation 4 at sample k."""
+    n, S = len(model["x"]), fractions(funnel["S"][k])
+    SS = [[dot([r[i] for r in S], [r[j] for r in S]) for j in range(n)] for i in range(n)]
+    units = [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
+    widens = widened(funnel)
+    tube = Fraction(funnel["tube"][k]) + widens
+    both = max(tube, Fraction(funnel["inlet"][k]) + widens)
+    wanted = [(g, Fraction(w), tube) for g, w in zip(units, funnel["half_widths"][k], strict=True)]
+    signals = [(g, c, box) for g, c, box in
+               zip(units, policy["x"][k], model["x_range"], strict=True)]  # fmt: skip
+    if k < len(policy["u"]):
+        signals += zip(fractions(policy["K"][k]), policy["u"][k], model["u_range"], strict=True)
+    for g, c, (low, high) in signals:
+        room = min(Fraction(high) - Fraction(c), Fraction(c) - Fraction(low))
+        wanted.append((g, room, both))
+    return is_definite(SS) and all(
+        w >= 0 and R**2 * dot(g, [row[0] for row in solved(SS, [[e] for e in g])]) <= w**2
+        for g, w, R in wanted
+    )
+
+
+def follows(documents: dict[str, Json], proof: Json, k: int) -> bool:
+    """Obligations 5 to 9 at step k, once for the same step of the same proof."""
+    bases = {key: part for key, part in proof.items() if key != "steps"}
+    names = {
+        "model": "kind period x exponents coefficients",
+        "policy": "u x K",
+        "funnel": "assumption tube inlet S A roots",
+    }
+    used = {
+        role: {key: documents[role].get(key) for key in keys.split()}
+        for role, keys in names.items()
+    }
+    return _follows(json.dumps(used), json.dumps(bases), json.dumps(proof["steps"][k]), k)
+
+
+@lru_cache(maxsize=20_000)
+def _follows(files_of: str, bases: str, step_of: str, k: int) -> bool:
+    documents, step = json.loads(files_of), json.loads(step_of)
+    proof = json.loads(bases) | {"steps": {k: step}}
+    model, policy, funnel = (documents[role] for role in ("model", "policy", "funnel"))
+    n, implicit, form = len(model["x"]), is_implicit(model), funnel["assumption"]["form"]
+    d = n // 2 if implicit else 0
+    y: Any = [P.variable(n + d, i) for i in range(n + d)]
+    S, S_next = (fractions(funnel["S"][i]) for i in (k, k + 1))
+    T, A = fractions(step["T"]), fractions(funnel["A"][k])
+    bound = Fraction(funnel["assumption"]["bound"])
+    kappa, gammas = Fraction(step["kappa"]), fractions(step["curvature"])
+    scale, decay = (Fraction(funnel["assumption"][key]) for key in ("gain", "rate"))
+    if not (is_triangular(step["T"]) and min([kappa, *gammas]) >= 0):
+        return False
+    if not stretches_less(multiplied(S, T), kappa):
+        return False
+    deviation = times(T, y[:n])
+    free = times(S_next, times(A, deviation))
+    if implicit:
+        T_next = fractions(step["T_next"])
+        rates = [row[d:] for row in S_next[d:]]
+        if not stretches_less(multiplied(rates, T_next), Fraction(step["kappa_next"])):
+            return False
+        after, h = implicit_next(model, policy, k, deviation, times(T_next, y[n:]))
+        g, moved = times(S_next, after), times(fractions(step["inverse"]), h)
+        if not norms_hold(step, linear(moved), linear(g), linear(free), n):
+            return False
+        if not is_curved(moved, gammas, least=2):
+            return False
+    else:
+        g = times(S_next, explicit_next(model, policy, k, deviation))
+        if not is_curved(plus(g, free, -1) if form == "response" else g, gammas, least=1):
+            return False
+    for chain in CHAINS:
+        entry, radius = step[chain], Fraction(funnel[chain][k])
+        reach, following = Fraction(entry["reach"]), Fraction(funnel[chain][k + 1])
+        if reach < 0:
+            return False
+        if form == "peak":
+            added = bound
+        elif implicit:
+            far = Fraction(step["kappa_next"]) * Fraction(funnel["roots"][k + 1])
+            found = added_at_roots(step, entry, radius, bound, far)
+            if found is None:
+                return False
+            added = found
+        else:
+            mu = kappa * stretch(gammas, kappa * radius, kappa * bound, least=1)
+            added = mu * bound if form == "response" else Fraction(0)
+            if form != "response" and scale * mu**2 > (scale - 1) * decay:
+                return False
+        claimed: Any = claimed_at(documents, proof, chain, k, y)
+        witness = {"basis": proof["basis"], "columns": entry["columns"]}
+        if left_over([claimed], witness | {"squares": entry["squares"]}) is None:
+            return False
+        if reach + added > following:
+            return False
+    return True
+
+
+def multiplied(A: Matrix, B: Matrix) -> Matrix:
+    """A B."""
+    return [[dot(row, [r[j] for r in B]) for j in range(len(B[0]))] for row in A]
+
+
+def is_semidefinite(M: Matrix) -> bool:
+    """Every principal minor is 0 or more."""
+    size = range(len(M))
+    chosen = [[i for i in size if mask >> i & 1] for mask in range(1, 2 ** len(M))]
+    return all(determinant([[M[i][j] for j in part] for i in part]) >= 0 for part in chosen)
+
+
+def stretches_less(M: Matrix, kappa: Fraction) -> bool:
+    """κ² M'M - I ⪰ 0, so |z| <= κ|M z|."""
+    size = range(len(M))
+    columns = [[row[i] for row in M] for i in size]
+    return is_semidefinite(
+        [[kappa**2 * dot(columns[i], columns[j]) - int(i == j) for j in size] for i in size]
+    )
+
+
+def is_bounded(M: Matrix, c: Fraction) -> bool:
+    """c²I - MM' ⪰ 0."""
+    size = range(len(M))
+    return c >= 0 and is_semidefinite(
+        [[c**2 * int(i == j) - dot(M[i], M[j]) for j in size] for i in size]
+    )
+
+
+def linear(p: list[Any]) -> Matrix:
+    """The coefficients of degree 1."""
+    n = p[0].n
+    units = [tuple(int(i == j) for j in range(n)) for i in range(n)]
+    return [[q.terms.get(unit, Fraction(0)) for unit in units] for q in p]
+
+
+def norms_hold(step: Json, h: Matrix, after: Matrix, free: Matrix, n: int) -> bool:
+    """The four bounds of obligation 9, and that M is invertible."""
+    B, C = [row[:n] for row in h], [row[n:] for row in h]
+    C = [[e - int(i == j) for j, e in enumerate(row)] for i, row in enumerate(C)]
+    L_z, L_w = [row[:n] for row in after], [row[n:] for row in after]
+    turned = multiplied(L_w, B)
+    direct = [
+        [a - b - c for a, b, c in zip(*rows, strict=True)]
+        for rows in zip(L_z, turned, [row[:n] for row in free], strict=True)
+    ]
+    return all(
+        is_bounded(M, Fraction(step[name]))
+        for name, M in (("state", B), ("rates", C), ("direct", direct), ("through", L_w))
+    )
+
+
+def is_curved(p: list[Any], gammas: Vector, least: int) -> bool:
+    """Obligation 7: γ_m bounds the part of degree m, from `least` on."""
+    for m in range(least, max([sum(e) for q in p for e in q.terms], default=0) + 1):
+        keys = {e for q in p for e in q.terms if sum(e) == m}
+        if m - least >= len(gammas):
+            return not keys
+        size = range(len(p))
+        M = [[gammas[m - least] ** 2 * int(i == j) for j in size] for i in size]
+        for e in keys:
+            share = Fraction(prod(factorial(k) for k in e), factorial(m))
+            c = [q.terms.get(e, Fraction(0)) for q in p]
+            for i, j in product(size, size):
+                M[i][j] -= share * c[i] * c[j]
+        if not is_semidefinite(M):
+            return False
+    return True
+
+
+def stretch(gammas: Vector, s: Fraction, t: Fraction, least: int) -> Fraction:
+    """μ(s, t)."""
+    return sum(
+        (
+            gamma * (s + t) ** i * s ** (m - 1 - i)
+            for m, gamma in enumerate(gammas, start=least)
+            for i in range(m)
+        ),
+        Fraction(0),
+    )
+
+
+def added_at_roots(
+    step: Json, entry: Json, radius: Fraction, bound: Fraction, far: Fraction
+) -> Fraction | None:
+    """What a response adds to the reach of an implicit step; None where an inequality fails."""
+    names = ("state", "rates", "direct", "through", "kappa", "kappa_next")
+    state, rates, direct, through, kappa, kappa_next = (Fraction(step[name]) for name in names)
+    rho, D = kappa * bound, Fraction(entry["spread"])
+    wide, near = fractions(entry["extents"])
+    mu = stretch(step_gammas := fractions(step["curvature"]), wide, (1 + D) * rho, least=2)
+    if rates >= 1 or D < 0 or min(wide, near) < 0:
+        return None
+    if (kappa * radius) ** 2 + (far + D * rho) ** 2 > wide**2:
+        return None
+    if state + rates * D + mu * (1 + D) > D:
+        return None
+    if (kappa * radius) ** 2 + (kappa_next * Fraction(entry["reach"])) ** 2 > near**2:
+        return None
+    m = stretch(step_gammas, near, (1 + D) * rho, least=2)
+    if 1 - rates - m > 0:
+        D = min(D, (state + m) / (1 - rates - m))
+    return (direct + through * (rates * D + m * (1 + D))) * rho

@@ -124,6 +124,9 @@ def increments(model: Json) -> tuple[Rows, int, list[tuple[Fraction, Fraction]]]
             low, high = (exact(end) for end in model["u_range"][i])
             box.append(((low - offset) / scale, (high - offset) / scale))
         return F, p, box
+    if kind == "cell_network":
+        m, n = len(model["maps"]), len(model["start"])
+        return [[exact(model["next"][i][k]) for k in range(m + n)] for i in range(n)], m, []
     M, n1, n2, _, g = cascade(model)
     F = zeros(n1 + n2, M + n1 + n2)
     a1, a2 = padded(model["a1"], n1), padded(model["a2"], n2)
@@ -244,6 +247,8 @@ def vertices(model: Json, box: list[tuple[Fraction, Fraction]]) -> list[Rows] | 
             return None
         least = e1 - e2 * e2 / (3 * e3) if e3 else e1
         return [[[least] + [-exact(entry) for entry in model["a"]]]]
+    if kind == "cell_network":
+        return network_vertices(model)
     M, n1, n2, C, _ = cascade(model)
     found = []
     for s in product(slopes(model), repeat=M):
@@ -254,6 +259,31 @@ def vertices(model: Json, box: list[tuple[Fraction, Fraction]]) -> list[Rows] | 
                 E[j][M + k] = -s[j] * C[j][k]
         found.append(E)
     return found
+
+
+def network_vertices(model: Json) -> list[Rows] | None:
+    """[I 0] - diag(σ) into at every corner of the slopes; None where a map uses a later one."""
+    m, n = len(model["maps"]), len(model["start"])
+    ends = []
+    for f in model["maps"]:
+        knots, values = ([exact(v) for v in f[key]] for key in ("knots", "values"))
+        if len(knots) < 2 or any(knots[k] >= knots[k + 1] for k in range(len(knots) - 1)):
+            return None
+        found = [
+            (values[k + 1] - values[k]) / (knots[k + 1] - knots[k]) for k in range(len(knots) - 1)
+        ]
+        ends.append((min(found), max(found)))
+    if any(model["into"][j][k] != 0 for j in range(m) for k in range(j, m)):
+        return None
+    matrices = []
+    for s in product(*ends):
+        E = zeros(m, m + n)
+        for j in range(m):
+            E[j][j] = Fraction(1)
+            for k in range(m + n):
+                E[j][k] -= s[j] * exact(model["into"][j][k])
+        matrices.append(E)
+    return matrices
 
 
 def gap(F: Rows, m: int, P: Rows, rate: Fraction, N: Rows | None, E: Rows | None) -> Rows:

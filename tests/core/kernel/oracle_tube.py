@@ -44,6 +44,8 @@ def outputs(model: Json, m: int, n: int) -> Rows:
         if n2:
             row[M + n1] = Fraction(1)
         return [row]
+    if kind == "cell_network":
+        return [[exact(entry) for entry in row[: m + n]] for row in model["output"]]
     scales = model.get("y_scale", [1.0] * m)
     if kind == "monotone_equation" or kind == "implicit":
         scales = [1.0] * m

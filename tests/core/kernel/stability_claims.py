@@ -11,7 +11,14 @@ import numpy as np
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.identification import prove_stability
-from nlsid_core.models import DifferenceEquation, MonotoneEquation, Signal, StateAffineModel
+from nlsid_core.models import (
+    CellNetwork,
+    DifferenceEquation,
+    MonotoneEquation,
+    PiecewiseLinear,
+    Signal,
+    StateAffineModel,
+)
 from nlsid_core.models.polynomials import Polynomials
 from tests.cascades import two_phases
 
@@ -102,6 +109,21 @@ def straight() -> MonotoneEquation:
     return replace(monotone(), e=np.array([2.0, 0.0, 0.0]), a=np.array([3.6, -1.9]))
 
 
+def network() -> CellNetwork:
+    """Two cells: z = φ(x₁) + u, x₁⁺ = min(z, 1), x₂⁺ = ψ(x₂) + x₁ + 0.5 (z - 1)₊."""
+    return CellNetwork(
+        maps=(
+            PiecewiseLinear(np.array([-1.0, 0.0, 1.0]), np.array([-0.5, 0.0, 0.75])),
+            PiecewiseLinear(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 1.0])),
+            PiecewiseLinear(np.array([-1.0, 0.5, 1.0]), np.array([-0.25, 0.125, 0.5])),
+        ),
+        into=np.array([[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 1, 0, 0]]),
+        next=np.array([[0, 1, 0, 0, 0, 0, 0], [0.5, -0.5, 1, 1, 0, 0.5, 0]]),
+        output=np.array([[0, 0, 0, 0, 2, 0, 0.25]]),
+        start=np.zeros(2), start_samples=3, period=0.025, y=(Y,), u=(U,),
+    )  # fmt: skip
+
+
 MODELS: dict[str, Callable[[], Any]] = {
     "linear": linear,
     "quadratic": quadratic,
@@ -111,6 +133,7 @@ MODELS: dict[str, Callable[[], Any]] = {
     "ends": ends,
     "split": split,
     "cascade": two_phases,
+    "network": network,
     "monotone": monotone,
     "straight": straight,
 }

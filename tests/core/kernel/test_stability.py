@@ -27,7 +27,7 @@ from tests.core.kernel.stability_claims import (
 )
 
 NAMES = list(MODELS)
-NO_INPUT = ("cascade", "monotone", "straight", "linear")  # in the increments of these
+NO_INPUT = ("cascade", "network", "monotone", "straight", "linear")  # in the increments of these
 MATHEMATICS = ("decrease", "P is not")  # what a proof is refused for though its form is right
 
 
@@ -37,7 +37,7 @@ def where(name: str, model: Json) -> str:
         low, high = oracle.slopes(model)
         covered = f"[{rounded(low, 'ROUND_FLOOR')}, {rounded(high, 'ROUND_CEILING')}]"
         return f"for every input (the slopes of its nonlinearity are in {covered} everywhere)"
-    if name in ("linear", "monotone", "straight"):
+    if name in ("linear", "monotone", "straight", "network"):
         return "for every input"
     low, high = map(Fraction, model["u_range"][0])
     inner = f"[{rounded(low, 'ROUND_CEILING')}, {rounded(high, 'ROUND_FLOOR')}]"
@@ -103,6 +103,9 @@ def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
             _move(_a_leaf(proof["proof"]["multipliers"], rng)["N"], size, rng)
         elif name == "cascade":
             _move([model["f"]["coefficients"], model["b1"][0]], size, rng)
+        elif name == "network":
+            parts = [f[key] for f in model["maps"] for key in ("knots", "values")]
+            _move([*parts, *model["next"], *model["into"]], size, rng)
         elif name in ("monotone", "straight"):
             _move([model["e"], model["a"]], size, rng)
         elif name == "linear":
@@ -325,6 +328,15 @@ CHANGES: dict[str, tuple[str, Callable[[Json, Json], None], str]] = {
     "pole outside": ("cascade", lambda m, _: m.update(a1=[1.9, -1.05]), "decrease"),
     "pole on the circle": ("cascade", lambda m, _: m.update(a2=[1.0]), "decrease"),
     "closer knots": ("cascade", lambda m, _: m["f"].update(spacing=0.05), "decrease"),
+    "steeper map": ("network", lambda m, _: m["maps"][0]["values"].__setitem__(2, 1.25),
+                    "decrease"),
+    "rising cap": ("network", lambda m, _: m["maps"][1]["values"].__setitem__(2, 3.0), "decrease"),
+    "a loop of maps": ("network", lambda m, _: m["into"][0].__setitem__(1, 0.1), "earlier maps"),
+    "knots that fall": ("network", lambda m, _: m["maps"][2]["knots"].reverse(), "ascending"),
+    "one knot": ("network", lambda m, _: m["maps"][2].update(knots=[0.0], values=[0.0]),
+                 "2 knots"),
+    "fewer maps": ("network", lambda m, _: m["maps"].pop(), "shape"),
+    "no start": ("network", lambda m, _: m.update(start_samples=0), "from 1"),
     "no spacing": ("cascade", lambda m, _: m["f"].update(spacing=0.0), "spacing"),
     "stronger": ("cascade", lambda m, _: m["b1"][1].__setitem__(0, 50.0), "decrease"),
     "ragged": ("cascade", lambda m, _: m["b1"][1].append(0.0), "equal lengths"),

@@ -31,7 +31,8 @@ def recorded(model: ImplicitModel, *window: tuple[int, int]) -> ImplicitModel:
 
 MODELS: dict[str, Callable[[], Any]] = {
     **{name: stability_claims.MODELS[name] for name in
-       ("linear", "quadratic", "moving_lags", "two_outputs", "split", "cascade", "monotone")},
+       ("linear", "quadratic", "moving_lags", "two_outputs", "split", "cascade", "network",
+        "monotone")},
     "implicit_ray": lambda: recorded(implicit_models.lagged(), (0, 0)),
     "implicit_linear": lambda: recorded(
         implicit_models.linear(np.array([[0.6, 0.3], [-0.2, 0.5]])), (0, 1)

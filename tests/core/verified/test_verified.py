@@ -1,21 +1,27 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
+import hashlib
 import json
 import re
 import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
-from nlsid_core import proofs
+from bags.commands.cli import app
+from nlsid_core import proofs, second
 from nlsid_core.errors import CertificateRejected
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
 
+Json = dict[str, Any]
 ROOT = Path(__file__).resolve().parents[3]
 VERIFIED = ROOT / "verified"
-CLIPPED = ROOT / "tests" / "core" / "kernel" / "corpus" / "continuous_funnel" / "clipped"
+CORPUS = ROOT / "tests" / "core" / "kernel" / "corpus"
+CLIPPED = CORPUS / "continuous_funnel" / "clipped"
 GAPS = re.compile(r"\b(Admitted|admit|Axiom|Parameter|Conjecture|Unset Guard Checking)\b")
 
 needs_coq = pytest.mark.skipif(
@@ -108,3 +114,132 @@ def test_both_kernels_refuse_a_forgery(
     done = accepted(tmp_path / PROOF, build)
     assert done.returncode != 0
     assert "theorem.v" in done.stderr, "refused by Coq, not before"
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(
+    "name",
+    ["tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
+     "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
+     "stability/moving_lags", "stability/split", "stability/two_outputs"],
+)  # fmt: skip
+def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
+    done = accepted(CORPUS / name / "claim.proof.json", build)
+    assert done.returncode == 0, done.stderr
+    assert "accepted: " in done.stdout
+
+
+def fades_faster(files: Files) -> None:
+    """The innovations are forgotten by 0.6 a sample."""
+    files["funnel.json"]["tubes"][0]["rho"] *= 0.6
+
+
+def narrower(files: Files) -> None:
+    """Half-widths by 10 %: the level does not allow it."""
+    widths = files["funnel.json"]["tubes"][0]["half_widths"]
+    widths[:] = [0.9 * width for width in widths]
+
+
+def tau_larger(files: Files) -> None:
+    """By half: the output is not bounded by the storage so."""
+    tau = files["funnel.json"]["tubes"][0]["tau"]
+    tau[:] = [1.5 * entry for entry in tau]
+
+
+def storage_of_another_size(files: Files) -> None:
+    """P ten times smaller: it takes innovations in that it forgets."""
+    P = files["funnel.json"]["tubes"][0]["P"]
+    P[:] = [[entry / 10 for entry in row] for row in P]
+
+
+def indefinite(files: Files) -> None:
+    """P changes its sign."""
+    P = files["funnel.json"]["tubes"][0]["P"]
+    P[:] = [[-entry for entry in row] for row in P]
+
+
+def outputs_counted_twice(files: Files) -> None:
+    """A model whose outputs are in another unit."""
+    scales = files["model.json"]["y_scale"]
+    scales[:] = [2 * scale for scale in scales]
+
+
+def multipliers_gone(files: Files) -> None:
+    """Zeros in their place."""
+    N = files["claim.proof.json"]["proof"]["multipliers"][0]["N"]
+    N[:] = [[[0.0 for _ in row] for row in matrix] for matrix in N]
+
+
+@pytest.fixture(scope="module")
+def program(build: Path) -> Path:
+    """The extracted checker."""
+    zarith = ["ocamlfind", "query", "zarith"]
+    if shutil.which("ocamlfind") is None or subprocess.run(zarith, check=False).returncode:
+        pytest.skip("no OCaml (Debian: apt install ocaml-nox ocaml-findlib libzarith-ocaml-dev)")
+    command = ["make", "-C", str(VERIFIED), f"BUILD={build}", "second"]
+    subprocess.run(command, check=True, capture_output=True)
+    return build / "nlsid-second"
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(
+    "forge",
+    [fades_faster, narrower, tau_larger, storage_of_another_size, indefinite,
+     outputs_counted_twice, multipliers_gone],
+)  # fmt: skip
+def test_both_kernels_refuse_a_forged_tube(
+    forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
+) -> None:
+    folder = CORPUS / "tube" / "lasting_two_outputs"
+    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    forge(files)
+    digests: dict[str, str] = {}
+    for name in ("model.json", "funnel.json", "claim.proof.json"):
+        content = json.dumps(rebound(files[name], digests))
+        digests[name] = "sha256:" + hashlib.sha256(content.encode()).hexdigest()
+        (tmp_path / name).write_text(content)
+    proof = tmp_path / "claim.proof.json"
+    with pytest.raises(CertificateRejected):
+        proofs.check(proof)
+    assert second.opinion(proof, program).verdict == "refused"
+    done = accepted(proof, build)
+    assert done.returncode != 0
+    assert "theorem.v" in done.stderr, "refused by Coq, not before"
+
+
+def rebound(document: Json, digests: dict[str, str]) -> Json:
+    """With the digests of the files that it names."""
+    if "model" in document and document["format"] == "nlsid/funnel":
+        document["model"] = digests["model.json"]
+    for entry in document.get("claim", {}).get("about", {}).values():
+        entry["digest"] = digests[entry["file"]]
+    return document
+
+
+@needs_coq
+@pytest.mark.coq
+def test_check_asks_the_second_kernel(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(second, "BUILT", program)
+    proved = CORPUS / "tube" / "lasting_linear" / "claim.proof.json"
+    told = CliRunner().invoke(app, ["check", "--second", str(proved)])
+    assert told.exit_code == 0
+    assert "second kernel: accepted by the checker that Coq proves right" in told.output
+    beyond = CORPUS / "tube" / "lasting_cascade" / "claim.proof.json"
+    told = CliRunner().invoke(app, ["check", "--second", str(beyond)])
+    assert told.exit_code == 2
+    assert "no theorem (models of kind block_cascade are not covered)" in told.output
+    assert "PROVED" in told.output
+
+
+def test_without_the_second_kernel_check_says_so(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(second, "BUILT", tmp_path / "nothing")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    proved = CORPUS / "tube" / "lasting_linear" / "claim.proof.json"
+    told = CliRunner().invoke(app, ["check", "--second", str(proved)])
+    assert told.exit_code == 2
+    assert "PROVED tube" in told.output
+    assert "not built here" in told.output

@@ -1,0 +1,1 @@
+"""Many bags, wherever they lie: read by workers, kept in a manifest, reduced at home."""

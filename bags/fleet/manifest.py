@@ -1,0 +1,72 @@
+"""What a run has read so far, in one SQLite file: a killed run goes on, a second reads what is new.
+
+A row is one bag's result, under a key made of what was asked and of what storage says of the bag.
+A row is there whole or not at all; nothing in it is ever executed.
+"""
+
+import hashlib
+import json
+import sqlite3
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from bags.recordings.remote import RemotePath
+from nlsid_core.errors import DataError
+
+
+class Manifest:
+    """Results by key; `path` None keeps none. Use as a context manager.
+
+    Raises DataError if the file is something else.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._rows = sqlite3.connect(":memory:" if path is None else path, isolation_level=None)
+            self._rows.execute("pragma journal_mode = wal")
+            self._rows.execute("pragma synchronous = normal")
+            self._rows.execute(
+                "create table if not exists bags (key text primary key, bag text, content blob)"
+            )
+        except sqlite3.DatabaseError as error:
+            raise DataError(f"{path}: not a manifest of bags ({error}); remove it") from error
+
+    def find(self, key: str) -> bytes | None:
+        """The result under a key."""
+        row = self._rows.execute("select content from bags where key = ?", (key,)).fetchone()
+        return None if row is None else bytes(row[0])
+
+    def keep(self, key: str, bag: str, content: bytes) -> None:
+        """Write a result; it replaces one under the same key."""
+        if self._path is not None:
+            self._rows.execute("insert or replace into bags values (?, ?, ?)", (key, bag, content))
+
+    def __enter__(self) -> "Manifest":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._rows.close()
+
+
+def key_of(bag: Path, name: str, asked: str) -> str:
+    """The key of what is asked of a bag: it changes when its files do. OSError if it is gone."""
+    files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
+    states: list[Any] = [(file.name, *_state(file)) for file in files]
+    text = json.dumps([asked, name, str(bag), states])
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _state(file: Path) -> tuple[int, str]:
+    if isinstance(file, RemotePath):
+        return file.entry.size, file.entry.tag
+    found = file.stat()
+    return found.st_size, str(found.st_mtime_ns)

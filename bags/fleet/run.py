@@ -1,0 +1,192 @@
+"""One task a bag, by whatever executor; what went wrong with a bag is an answer, not an end."""
+
+import time
+from collections import deque
+from collections.abc import Generator, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+from bags.fleet.manifest import Manifest, key_of
+from bags.fleet.workers import Workers
+from bags.recordings.remote import RemotePath
+from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import Progress, silent
+
+DEATHS: Final = 3  # of the worker that reads a bag; from the second time on, of that bag alone
+
+
+class Task(Protocol):
+    """What is asked of every bag; it travels to the workers."""
+
+    @property
+    def asked(self) -> str:
+        """What is asked, as text: another text is another question."""
+
+    def __call__(self, bag: Path, name: str) -> bytes:
+        """The answer, some kilobytes. Whatever it raises is the reason why there is none."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Of one bag: content, or the reason why there is none.
+
+    kept: it was in the manifest. seconds; requests, fetched (bytes): what reading it took.
+    """
+
+    bag: Path
+    name: str
+    content: bytes = b""
+    reason: str = ""
+    kept: bool = False
+    seconds: float = 0.0
+    requests: int = 0
+    fetched: int = 0
+
+
+def ask(
+    task: Task,
+    bags: Mapping[str, Path],
+    workers: Workers,
+    manifest: Manifest,
+    *,
+    strict: bool = False,
+    progress: Progress = silent,
+) -> list[Answer]:
+    """The answers in the order of `bags` (by name), whoever gave them and whenever they came.
+
+    A bag of which the worker dies is asked of again, alone, and given up when it dies again. With
+    `strict` the first bag without an answer raises BagError. Raises DataError if the workers are
+    gone for good; what was answered by then is in the manifest.
+    """
+    answers: dict[str, Answer] = {}
+    keys: dict[str, str] = {}
+    fresh: deque[str] = deque()
+    for name, bag in bags.items():
+        try:
+            keys[name] = key_of(bag, name, task.asked)
+        except (OSError, BagError) as error:
+            answers[name] = Answer(bag, name, reason=_said(error))
+            continue
+        content = manifest.find(keys[name])
+        if content is None:
+            fresh.append(name)
+        else:
+            answers[name] = Answer(bag, name, content, kept=True)
+    if strict and (lost := [answer for answer in answers.values() if answer.reason]):
+        raise BagError(f"{lost[0].bag}: {lost[0].reason}")
+    with closing(_asked(task, {name: bags[name] for name in fresh}, workers)) as given:
+        for answer in given:
+            answers[answer.name] = answer
+            if answer.reason and strict:
+                raise BagError(f"{answer.bag}: {answer.reason}")
+            if not answer.reason:
+                manifest.keep(keys[answer.name], str(answer.bag), answer.content)
+            progress(f"{len(answers)} of {len(bags)} bags: {answer.name}", len(answers) / len(bags))
+    return [answers[name] for name in bags]
+
+
+def _asked(task: Task, bags: Mapping[str, Path], workers: Workers) -> Generator[Answer, None, None]:
+    """An answer for each bag, as they come."""
+    if not bags:
+        return
+    waiting, suspects = deque(bags), deque[str]()
+    deaths = dict.fromkeys(bags, 0)
+    executor = workers.open()
+    running: dict[Future[Answer], str] = {}
+    try:
+        while waiting or suspects or running:
+            while suspects and not running:
+                name = suspects.popleft()
+                running[_submitted(executor, task, bags[name], name)] = name
+            while waiting and not suspects and len(running) < workers.window:
+                name = waiting.popleft()
+                running[_submitted(executor, task, bags[name], name)] = name
+                if next(reversed(running)).done():
+                    break  # in this process: said at once
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            broken = False
+            for future in done:
+                name = running.pop(future)
+                error = _error(future)
+                if error is None:
+                    yield future.result()
+                elif not isinstance(error, BrokenExecutor):
+                    yield Answer(bags[name], name, reason=_said(error))
+                else:
+                    broken = True
+                    deaths[name] += 1
+                    if deaths[name] < DEATHS:
+                        suspects.append(name)
+                    else:
+                        yield Answer(bags[name], name, reason=f"its worker died {DEATHS} times")
+            if broken:
+                suspects.extend(running.values())
+                for name in running.values():
+                    deaths[name] += 1
+                running.clear()
+                workers.close(executor)
+                executor = workers.open()
+    finally:
+        workers.close(executor)
+
+
+def _submitted(executor: Executor, task: Task, bag: Path, name: str) -> "Future[Answer]":
+    try:
+        return executor.submit(answered, task, bag, name)
+    except BrokenExecutor as error:  # a worker has died since the last look
+        failed: Future[Answer] = Future()
+        failed.set_exception(error)
+        return failed
+
+
+def answered(task: Task, bag: Path, name: str) -> Answer:
+    """What a worker does: the task, with whatever it raises as the reason."""
+    started = time.monotonic()
+    content, reason = b"", ""
+    try:
+        content = task(bag, name)
+    except Exception as error:  # bags are untrusted: whatever one of them causes is about it alone
+        reason = _said(error)
+    requests, fetched = _traffic(bag)
+    if isinstance(bag, RemotePath):
+        bag.forget()
+    seconds = time.monotonic() - started
+    return Answer(bag, name, content, reason, False, seconds, requests, fetched)
+
+
+def _traffic(bag: Path) -> tuple[int, int]:
+    """Requests and bytes of a bag and of the files in it."""
+    if not isinstance(bag, RemotePath):
+        return 0, 0
+    inside = [_traffic(child) for child in bag.known]
+    return (
+        bag.requests + sum(requests for requests, _ in inside),
+        bag.fetched + sum(fetched for _, fetched in inside),
+    )
+
+
+def _error(future: "Future[Answer]") -> BaseException | None:
+    try:
+        return future.exception()
+    except CancelledError as error:
+        raise DataError(
+            "the scheduler has lost its tasks; start it and this command again: what was read by "
+            "now is kept"
+        ) from error
+
+
+def _said(error: BaseException) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "it is not there any more"
+    text = str(error)[:500]
+    return text if isinstance(error, (DataError, OSError)) else f"{type(error).__name__}: {text}"

@@ -1,0 +1,103 @@
+"""Identification from many bags: each is read by a worker, which sends its samples home.
+
+What is sent is the trials themselves, resampled: 16 bytes a sample of a response and an excitation
+(docs/decisions/0027 has the sizes of what else could be). Everything after that is what one machine
+does, on the same numbers in the same order, so its result is the same to the last bit.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from bags.chain.config import Config
+from bags.chain.steps import Identified, by_use, identify_trials, read_signals_of
+from bags.chain.training import decoded, encoded
+from bags.fleet.manifest import Manifest
+from bags.fleet.run import Answer, ask
+from bags.fleet.workers import Workers
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import BagError, DataError, NlsidError
+from nlsid_core.progress import Progress, part, silent
+
+MANIFEST = "fleet.sqlite"
+
+
+@dataclass(frozen=True)
+class ReadTrials:
+    """The configured signals of a bag, as trials called by its name."""
+
+    config: Config
+
+    @property
+    def asked(self) -> str:
+        """Signals, grid and clock; another version may read otherwise."""
+        keys = {"signals", "grid", "clock", "definitions"}
+        return f"trials {version('nlsid')} {self.config.model_dump_json(include=keys)}"
+
+    def __call__(self, bag: Path, name: str) -> bytes:
+        """The trials, as `training.encoded` writes them."""
+        return encoded({"": read_signals_of([bag], self.config, names=[name])})
+
+
+@dataclass(frozen=True, eq=False)
+class FleetIdentified:
+    """What was identified, every bag's answer, and those that are left out, with the reason."""
+
+    identified: Identified
+    answers: tuple[Answer, ...]
+    left_out: dict[str, str]
+
+
+def identify_fleet(
+    bags: Mapping[str, Path],
+    config: Config,
+    out: Path,
+    *,
+    workers: Workers,
+    strict: bool = False,
+    progress: Progress = silent,
+) -> FleetIdentified:
+    """`identify_bags` of bags by name, read by workers; what they read is kept in OUT/fleet.sqlite.
+
+    A bag that cannot be read or used is left out, and so is a second copy of one recording; with
+    `strict` the first of them raises. Raises DataError if no bag is left, and as `identify_bags`.
+    """
+    reading = part(progress, 0.0, 0.5)
+    with Manifest(out / MANIFEST) as manifest:
+        answers = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=reading)
+    left_out = {answer.name: answer.reason for answer in answers if answer.reason}
+    trials = usable_trials(answers, left_out)
+    if strict and left_out:
+        name, reason = next(iter(left_out.items()))
+        raise BagError(f"{bags[name]}: {reason}")
+    if not trials:
+        some = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
+        raise DataError(f"none of {len(bags)} bags can be used: {some}")
+    found = by_use(Dataset(tuple(trials)), config)
+    return FleetIdentified(
+        identify_trials(found, config, out, progress=progress), tuple(answers), left_out
+    )
+
+
+def usable_trials(answers: list[Answer], left_out: dict[str, str]) -> list[Trajectory]:
+    """The trials of the answers in their order; adds to `left_out` what does not go with the first,
+    and the second copy of a recording.
+    """
+    trials: list[Trajectory] = []
+    recorded: dict[str, str] = {}
+    for answer in answers:
+        if answer.reason:
+            continue
+        own = decoded(answer.content, source=f"{answer.name}: not trials")[""].trajectories
+        first = recorded.setdefault(own[0].digest, answer.name)
+        if first != answer.name:
+            left_out[answer.name] = f"the same recording as {first}"
+            continue
+        try:
+            Dataset((*trials[:1], *own))
+        except NlsidError as error:
+            left_out[answer.name] = str(error)
+            continue
+        trials += own
+    return trials

@@ -1,0 +1,376 @@
+"""Bags in object storage or on a web server, as paths: `s3://bucket/drive.mcap`, `https://...`.
+
+A RemotePath is a Path for whoever names, lists and opens bags. What is opened delivers the bytes
+that are asked for and no others: ranges that lie close together are one request, several requests
+run beside each other, and a request that fails is repeated for a stated time. fsspec knows the
+protocols; credentials are those it finds in the environment, and are never part of a name.
+"""
+
+import hashlib
+import os
+import random
+import re
+import stat
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path, PosixPath
+from typing import Any, Final, TypeVar
+
+from nlsid_core.errors import BagError
+
+GAP_BYTES: Final = 16 * 2**10  # ranges closer than this are one request, whose price they share
+HELD_BYTES: Final = 64 * 2**20  # of a file that stay in memory for who opens it again
+TAIL_BYTES: Final = 8 * 2**10  # the first request: footer and most summaries
+PATIENCE: Final = 60.0  # s that may be lost with failing requests, of each bag
+FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before each next
+LONGEST_WAIT: Final = 10.0
+REFUSALS: Final = (FileNotFoundError, PermissionError, ImportError, ValueError, TypeError)
+MAY_PASS: Final = (408, 425, 429)  # of the HTTP statuses 400 to 499
+
+_URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):/{1,2}(?=[^/])")
+_WILD: Final = re.compile(r"[*?\[]")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What storage says of a name: bytes, whether it is a folder, and what changes with content.
+
+    tag: the ETag, or the time of the last change; empty if storage says neither.
+    """
+
+    size: int
+    folder: bool
+    tag: str
+
+
+class RemotePath(PosixPath):
+    """A file or a folder that fsspec reads; the parts of its URL are the parts of the path.
+
+    patience: s that may be lost with failing requests. Instances keep what they fetched, at most
+    HELD_BYTES a file; `requests` and `fetched` (bytes) count what was asked of storage. A copy in
+    another process knows the entry, and has fetched nothing.
+    """
+
+    patience: float = PATIENCE
+    requests: int = 0
+    fetched: int = 0
+    _entry: Entry | None = None
+    _lost: float = 0.0  # s
+
+    def __str__(self) -> str:
+        protocol, *rest = self.parts
+        return f"{protocol}//{'/'.join(rest)}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (str(self), self.patience, self._entry)
+
+    def __truediv__(self, name: Any) -> "RemotePath":
+        known: dict[str, RemotePath] = self.__dict__.setdefault("_children", {})
+        if str(name) not in known:
+            child = known[str(name)] = super().__truediv__(name)
+            child.patience = self.patience
+        return known[str(name)]
+
+    @property
+    def known(self) -> tuple["RemotePath", ...]:
+        """The paths below it that were asked for."""
+        return tuple(self.__dict__.get("_children", {}).values())
+
+    def forget(self) -> None:
+        """Hold nothing any more, of it and of what is below."""
+        for key in ("_parts_held", "_order_held"):
+            self.__dict__.pop(key, None)
+        for child in self.known:
+            child.forget()
+
+    @property
+    def entry(self) -> Entry:
+        """What storage says of it. FileNotFoundError if it is gone, BagError without an answer."""
+        if self._entry is None:
+            self._entry = _entry(self._asked(lambda fs, name, _: fs.info(name)))
+        return self._entry
+
+    def exists(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002 - as Path has it
+        """Whether storage has it."""
+        try:
+            return self.entry is not None
+        except FileNotFoundError:
+            return False
+
+    def is_file(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002
+        """Whether it is there and no folder."""
+        return self.exists() and not self.entry.folder
+
+    def is_dir(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002
+        """Whether names begin with it."""
+        return self.exists() and self.entry.folder
+
+    def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:  # noqa: ARG002
+        """Its kind and its size; nothing else is known."""
+        kind = stat.S_IFDIR if self.entry.folder else stat.S_IFREG
+        return os.stat_result((kind, 0, 0, 0, 0, 0, self.entry.size, 0, 0, 0))
+
+    def resolve(self, strict: bool = False) -> "RemotePath":  # noqa: ARG002 - as Path has it
+        """Itself: storage has no links."""
+        return self
+
+    def iterdir(self) -> Iterator["RemotePath"]:  # type: ignore[override]
+        """What is in the folder."""
+        for found in self._asked(lambda fs, name, _: fs.ls(name, detail=True)):
+            name = str(found["name"]).rstrip("/").rpartition("/")[2]
+            if name and name != self.name:
+                child = self / name
+                if found.get("size") is not None or found.get("type") == "directory":
+                    child._entry = _entry(found)
+                yield child
+
+    def open(self, mode: str = "r", buffering: int = -1) -> "RangeReader":  # type: ignore[override]  # noqa: ARG002
+        """A stream of its bytes, for mode `rb`."""
+        if mode != "rb":
+            raise BagError(f"{self} can only be read; write to a folder of this machine")
+        return RangeReader(self)
+
+    def read_bytes(self) -> bytes:
+        """All of it."""
+        return self.read_range(0, self.entry.size)
+
+    def read_range(self, start: int, end: int) -> bytes:
+        """The bytes from `start` to `end`, fetched unless they are held."""
+        if end <= start:
+            return b""
+        found = self._held_range(start, end)
+        if found is None:
+            self.fetch([(start, end)])
+            found = self._held_range(start, end)
+            assert found is not None
+        return found
+
+    def fetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Hold these (start, end) from now on, with as few requests as GAP_BYTES makes of them.
+
+        Raises FileNotFoundError if the file is gone, BagError if storage does not deliver.
+        """
+        missing = {self._not_held(*r) for r in ranges if self._held_range(*r) is None}
+        merged: list[list[int]] = []
+        for start, end in sorted(missing):
+            if merged and start <= merged[-1][1] + GAP_BYTES:
+                merged[-1][1] = max(merged[-1][1], end)
+            else:
+                merged.append([start, end])
+        if not merged:
+            return
+        starts, ends = ([span[k] for span in merged] for k in (0, 1))
+        size = self.entry.size
+
+        def ask(fs: Any, name: str, limit: dict[str, float]) -> list[bytes]:
+            self.requests += len(starts)
+            parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
+            return [
+                _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
+            ]
+
+        for start, part in zip(starts, self._asked(ask), strict=True):
+            self.fetched += len(part)
+            self._hold(start, part)
+
+    def identity(self) -> bytes:
+        """What tells the file from others without reading it: its entry, and its last bytes."""
+        size = self.entry.size
+        tail = self.read_range(max(0, size - TAIL_BYTES), size)
+        return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}\n".encode()
+
+    def _held_range(self, start: int, end: int) -> bytes | None:
+        found, at = [], start
+        while at < end:
+            part = self._part_at(at)
+            if part is None:
+                return None
+            first, content = part
+            found.append(content[at - first : end - first])
+            at += len(found[-1])
+        return found[0] if len(found) == 1 else b"".join(found)
+
+    def _not_held(self, start: int, end: int) -> tuple[int, int]:
+        """The range without what is held at its two ends."""
+        while (part := self._part_at(start)) is not None:
+            start = part[0] + len(part[1])
+        while (part := self._part_at(end - 1)) is not None:
+            end = part[0]
+        return start, end
+
+    def _part_at(self, byte: int) -> tuple[int, bytes] | None:
+        held: list[tuple[int, bytes]] = self.__dict__.get("_parts_held", [])
+        at = bisect_right(held, byte, key=lambda part: part[0]) - 1
+        return held[at] if at >= 0 and byte < held[at][0] + len(held[at][1]) else None
+
+    def _hold(self, start: int, content: bytes) -> None:
+        """Keep a part; the oldest leave when there is too much."""
+        order: list[tuple[int, bytes]] = self.__dict__.setdefault("_order_held", [])
+        order.append((start, content))
+        while len(order) > 1 and sum(len(part) for _, part in order) > HELD_BYTES:
+            order.pop(0)
+        longest = dict(sorted(order, key=lambda part: (part[0], len(part[1]))))
+        self.__dict__["_parts_held"] = sorted(longest.items())
+
+    def _asked(self, ask: Callable[[Any, str, dict[str, float]], T]) -> T:
+        """The answer of storage, asked again with growing waits while the patience lasts."""
+        wait = FIRST_WAIT
+        while True:
+            started = time.monotonic()
+            try:
+                fs, name = _storage(str(self))
+                left = max(1.0, self.patience - self._lost)
+                return ask(fs, name, {"timeout": left} if fs.async_impl else {})
+            except REFUSALS:
+                raise
+            except Exception as error:  # every protocol raises its own
+                status = getattr(error, "status", None)
+                if isinstance(status, int) and 400 <= status < 500 and status not in MAY_PASS:
+                    raise BagError(f"{self}: storage refuses it: {_short(error)}") from error
+                if "Credentials" in type(error).__name__:
+                    raise BagError(f"{self}: {_short(error)}") from error
+                self._lost += time.monotonic() - started + wait
+                if self._lost > self.patience:
+                    raise BagError(
+                        f"{self}: storage did not deliver; {self.patience:g} s were lost with "
+                        f"failing requests: {_short(error)}"
+                    ) from error
+                time.sleep(wait * random.uniform(0.5, 1.0))
+                wait = min(2.0 * wait, LONGEST_WAIT)
+
+
+class RangeReader:
+    """A remote file as a binary stream whose reads are ranges."""
+
+    def __init__(self, path: RemotePath) -> None:
+        self.path = path
+        self._at = 0
+        self._size = path.entry.size
+
+    def seek(self, offset: int) -> int:
+        """Where the next read begins."""
+        self._at = offset
+        return offset
+
+    def read(self, size: int = -1) -> bytes:
+        """Up to `size` bytes from there; fewer at the end of the file."""
+        end = self._size if size < 0 else min(self._size, self._at + size)
+        content = self.path.read_range(self._at, end)
+        self._at += len(content)
+        return content
+
+    def close(self) -> None:
+        """Nothing stays open between requests."""
+
+    def __enter__(self) -> "RangeReader":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def place(given: Path | str, *, patience: float | None = None) -> Path:
+    """The path that is meant: a RemotePath for a URL, of this machine otherwise.
+
+    patience: s that may be lost with failing requests (None: PATIENCE, or as it is). A Path that
+    was made of a URL, `s3:/bucket/...`, is taken for it. Raises BagError for a URL that carries a
+    password, a token or a query: names of bags are written into files.
+    """
+    text = str(given)
+    if not isinstance(given, RemotePath):
+        found = _URL.match(text)
+        if text.startswith("file:/"):
+            return Path("/" + text.removeprefix("file:").lstrip("/"))
+        if found is None:
+            return Path(given)
+        protocol, rest = found.group(1).lower(), text[found.end() :]
+        if protocol in ("http", "https") and "?" in rest:
+            raise BagError(
+                f"{protocol}://{rest.partition('?')[0]}: a query may hold a secret, and names are "
+                "written into files; give a URL without it, and credentials in the environment"
+            )
+        if "@" in rest.partition("/")[0]:
+            raise BagError(
+                f"a password does not belong into a URL ({protocol}://...@...); give credentials "
+                "in the environment"
+            )
+        given = RemotePath(f"{protocol}:/{rest}")
+    if patience is not None:
+        given.patience = patience
+    return given
+
+
+def is_url(given: Path | str) -> bool:
+    """Whether `place` takes it for something that is not on this machine."""
+    return isinstance(place(given), RemotePath)
+
+
+def matching(path: Path) -> list[Path]:
+    """The files and folders that a pattern with `*`, `?` or `[...]` means, by name.
+
+    A path without a pattern, or of a file with such a name on this machine, means itself.
+    """
+    if not _WILD.search(str(path)) or (not isinstance(path, RemotePath) and path.exists()):
+        return [path]
+    if not isinstance(path, RemotePath):
+        start = Path(path.anchor)
+        return sorted(start.glob(str(path.relative_to(start))))
+    found = path._asked(lambda fs, name, _: fs.glob(name, detail=True))
+    protocol = path.parts[0]
+    places: list[Path] = []
+    for name, described in sorted(found.items()):
+        inside = name if _URL.match(name) is None else name.partition("://")[2]
+        known = described.get("size") is not None or described.get("type") == "directory"
+        entry = _entry(described) if known else None
+        places.append(_rebuilt(f"{protocol}//{inside}", path.patience, entry))
+    return places
+
+
+def _rebuilt(text: str, patience: float, entry: Entry | None) -> RemotePath:
+    path = place(text, patience=patience)
+    assert isinstance(path, RemotePath)
+    path._entry = entry
+    return path
+
+
+def _storage(url: str) -> tuple[Any, str]:
+    """The file system of a URL, and its name for the file."""
+    try:
+        from fsspec.core import url_to_fs
+
+        found: tuple[Any, str] = url_to_fs(url)
+    except (ImportError, ValueError) as error:
+        raise BagError(
+            f"{url} cannot be read: {error}; bags in object storage need `pip install "
+            "'nlsid[fleet]'`"
+        ) from error
+    return found
+
+
+def _entry(described: dict[str, Any]) -> Entry:
+    size, folder = described.get("size"), described.get("type") == "directory"
+    if size is None and not folder:
+        raise BagError(f"{described.get('name')}: its server does not say how long it is")
+    tags = ("ETag", "etag", "Content-MD5", "LastModified", "Last-Modified", "mtime")
+    tag = next((str(described[key]) for key in tags if described.get(key)), "")
+    return Entry(int(size or 0), folder, tag.strip('"'))
+
+
+def _whole(part: Any, start: int, end: int, size: int) -> bytes:
+    """The bytes of one range; OSError if they are not what was asked for, so that it is again."""
+    if isinstance(part, BaseException):
+        raise part
+    content = bytes(part)
+    if len(content) == size and (start, end) != (0, size):  # the server knows no ranges
+        content = content[start:end]
+    if len(content) != end - start:
+        raise OSError(f"{len(content)} bytes came of the {end - start} from byte {start} on")
+    return content
+
+
+def _short(error: BaseException) -> str:
+    return f"{type(error).__name__}: {str(error)[:200]}"

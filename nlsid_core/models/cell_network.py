@@ -1,0 +1,236 @@
+"""`CellNetwork`: states and static piecewise-linear maps, joined by an acyclic graph of weights.
+
+With s = [ν (m), x (n), u (q), 1],
+    ν_j = f_j(into_j·s), by ν_1 … ν_{j-1} at most,    x⁺ = next·s,    y = output·s.
+Each f_j is linear between its knots and, with the slopes of its ends, beyond them. So scalar cells
+that saturate and flow over into the next, filters around nonlinearities in series or in parallel,
+and feedback through a nonlinearity are networks. States may be hidden.
+"""
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.models.signal import FORMAT, Signal, objects, signals
+
+KIND = "cell_network"
+MAX_MAPS = 8  # a proof visits 2^m vertices
+START_STEPS, FIRST_DAMPING, DIFFERENCE = 40, 1e-3, 1e-7
+PRIOR = 1e-3  # weight of the usual start beside one measured sample, both in their spreads
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewiseLinear:
+    """knots (K,) ascending, values (K,), K >= 2. Raises ShapeError or DataError otherwise."""
+
+    knots: FloatArray
+    values: FloatArray
+    slopes: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        knots, values = (np.array(v, dtype=np.float64) for v in (self.knots, self.values))
+        if knots.ndim != 1 or len(knots) < 2 or values.shape != knots.shape:
+            raise ShapeError(f"knots {knots.shape}, values {values.shape}: both (K,), K >= 2")
+        if not (np.isfinite(knots).all() and np.isfinite(values).all()):
+            raise DataError("knots and values should be finite")
+        if not (np.diff(knots) > 0).all():
+            raise DataError("knots should ascend")
+        for name, array in (
+            ("knots", knots), ("values", values), ("slopes", np.diff(values) / np.diff(knots)),
+        ):  # fmt: skip
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """f(x), the shape of x."""
+        i = self.index(x)
+        return np.asarray(self.values[i] + self.slopes[i] * (x - self.knots[i]))
+
+    def index(self, x: FloatArray) -> FloatArray:
+        """The interval that x is in, the outer ones reaching to infinity."""
+        return np.clip(np.searchsorted(self.knots, x, "right") - 1, 0, len(self.slopes) - 1)
+
+    def document(self) -> Json:
+        """The JSON form."""
+        return {"knots": self.knots.tolist(), "values": self.values.tolist()}
+
+
+@dataclass(frozen=True, eq=False)
+class CellNetwork:
+    """maps: f_j. into (m, m+n+q+1), next (n, m+n+q+1), output (p, m+n+q+1), period in s.
+
+    start (n,): the usual state at the start; it is estimated from the first `start_samples`.
+    bags, training as in `DifferenceEquation`.
+    Raises ShapeError or DataError on arrays that do not fit or are not finite.
+    """
+
+    maps: tuple[PiecewiseLinear, ...]
+    into: FloatArray
+    next: FloatArray
+    output: FloatArray
+    start: FloatArray
+    start_samples: int
+    period: float
+    y: tuple[Signal, ...]
+    u: tuple[Signal, ...]
+    bags: tuple[tuple[str, str], ...] = ()
+    training: str = ""
+
+    def __post_init__(self) -> None:
+        m, n = len(self.maps), np.size(self.start)
+        width = m + n + len(self.u) + 1
+        shapes = {
+            "into": (m, width), "next": (n, width), "output": (len(self.y), width), "start": (n,),
+        }  # fmt: skip
+        for key, shape in shapes.items():
+            values = np.array(getattr(self, key), dtype=np.float64)
+            if values.shape != shape:
+                raise ShapeError(f"{key} should be {shape}; is {values.shape}")
+            if not np.isfinite(values).all():
+                raise DataError(f"{key} should be finite")
+            values.setflags(write=False)
+            object.__setattr__(self, key, values)
+        if not 1 <= m <= MAX_MAPS or not n or not self.y:
+            raise DataError(f"{m} maps, {n} states, {len(self.y)} outputs; 1 to {MAX_MAPS} maps")
+        if np.triu(self.into[:, :m]).any():
+            raise DataError("a map should depend on earlier maps only")
+        if self.start_samples < 1:
+            raise DataError(f"start_samples is {self.start_samples}; should be 1 or more")
+        if not (np.isfinite(self.period) and self.period > 0):
+            raise DataError(f"period {self.period} s is not positive")
+
+    def __str__(self) -> str:
+        return (
+            f"cell network: {len(self.start)} states, {len(self.maps)} piecewise-linear maps, "
+            f"started from {self.start_samples} samples, {self.period:g} s a sample"
+        )
+
+    def advance(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs (B, p) and next states (B, n) of states x (B, n) under one input u (q,)."""
+        m, n = len(self.maps), len(self.start)
+        s = np.empty((len(x), self.next.shape[1]))
+        s[:, :m], s[:, m : m + n], s[:, m + n : -1], s[:, -1] = 0.0, x, u, 1.0
+        for j, f in enumerate(self.maps):
+            s[:, j] = f(s @ self.into[j])
+        return s @ self.output.T, s @ self.next.T
+
+    def states(self, u: ArrayLike, x: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Outputs (N, p) and states (N + 1, n) for inputs u (N, q) from the state x (n,)."""
+        inputs, m, n = np.asarray(u, dtype=np.float64), len(self.maps), len(self.start)
+        if inputs.ndim != 2 or inputs.shape[1] != len(self.u) or np.shape(x) != (n,):
+            raise ShapeError(
+                f"u should be (N, {len(self.u)}) and x ({n},); are {inputs.shape}, {np.shape(x)}"
+            )
+        from_u = inputs @ np.vstack([self.into, self.next])[:, m + n : -1].T
+        from_u += np.vstack([self.into, self.next])[:, -1]
+        own = [*self.into[:, : m + n], *self.next[:, : m + n]]
+        weights = [[(int(k), float(row[k])) for k in np.flatnonzero(row)] for row in own]
+        maps = [
+            (f.knots[1:-1].tolist(), f.knots.tolist(), f.values.tolist(), f.slopes.tolist())
+            for f in self.maps
+        ]
+        kept = np.empty((len(inputs) + 1, m + n))
+        s = [0.0] * m + np.asarray(x, dtype=np.float64).tolist()
+        for t, given in enumerate(from_u.tolist()):
+            for j, (inner, knots, values, slopes) in enumerate(maps):
+                z = given[j]
+                for k, weight in weights[j]:
+                    z += weight * s[k]
+                i = bisect_right(inner, z)
+                s[j] = values[i] + slopes[i] * (z - knots[i])
+            kept[t] = s
+            s[m:] = [
+                sum([weight * s[k] for k, weight in weights[m + i]], given[m + i]) for i in range(n)
+            ]
+        kept[-1] = s
+        y = kept[:-1] @ self.output[:, : m + n].T + inputs @ self.output[:, m + n : -1].T
+        return y + self.output[:, -1], kept[:, m:]
+
+    def start_from(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        """x(0) by least squares on the outputs y (k, p) under u (k, q), near the usual start.
+
+        Levenberg-Marquardt steps with differences, which are exact where no knot is passed.
+        """
+        spread = np.maximum(np.std(y, axis=0), np.abs(self.output[:, len(self.maps) : -1]).max())
+
+        def residual(x: FloatArray) -> FloatArray:
+            error = (self.states(u, x)[0] - y) / spread
+            return np.concatenate([error.ravel(), PRIOR * (x - self.start)])
+
+        x, damping = np.array(self.start), FIRST_DAMPING
+        r, moves = residual(x), DIFFERENCE * np.eye(len(x))
+        for _ in range(START_STEPS):
+            J = np.column_stack([(residual(x + move) - r) / DIFFERENCE for move in moves])
+            normal = J.T @ J
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
+            after = residual(x + step)
+            better = after @ after < r @ r
+            damping *= 0.1 if better else 10.0
+            if better:
+                x, r = x + step, after
+            if np.abs(step).max() < DIFFERENCE * (1.0 + np.abs(x).max()):
+                break
+        return x
+
+    def simulate(self, u: ArrayLike, y_start: ArrayLike) -> FloatArray:
+        """Outputs (N, p) for inputs u (N, q), from the state that the first outputs y_start show.
+
+        y_start: (k, p), k <= N, such as the first `start_samples`.
+        """
+        inputs, first = np.asarray(u, dtype=np.float64), np.asarray(y_start, dtype=np.float64)
+        if first.ndim != 2 or first.shape[1] != len(self.y) or not 1 <= len(first) <= len(inputs):
+            raise ShapeError(f"y_start should be (k, {len(self.y)}), k from 1; is {first.shape}")
+        return self.states(inputs, self.start_from(first, inputs[: len(first)]))[0]
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "kind": KIND,
+            "period": self.period,
+            "y": [signal.document() for signal in self.y],
+            "u": [signal.document() for signal in self.u],
+            "maps": [f.document() for f in self.maps],
+            "into": self.into.tolist(),
+            "next": self.next.tolist(),
+            "output": self.output.tolist(),
+            "start": self.start.tolist(),
+            "start_samples": self.start_samples,
+            "training": self.training,
+            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "model") -> "CellNetwork":
+        """Raises DocumentError if the document is not a cell network."""
+        files.header(document, FORMAT, source=source)
+        kind = files.member(document, "kind", str, source=source)
+        if kind != KIND:
+            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        maps = objects(document, "maps", source=source)
+        arrays = {
+            key: files.array(document, key, (None, None), source=source)
+            for key in ("into", "next", "output")
+        }
+        bags = files.member(document, "bags", list, source=source)
+        return cls(
+            maps=tuple(
+                PiecewiseLinear(
+                    *(files.array(f, key, (None,), source=source) for key in ("knots", "values"))
+                )
+                for f in maps
+            ),
+            **arrays,
+            start=files.array(document, "start", (None,), source=source),
+            start_samples=files.member(document, "start_samples", int, source=source),
+            period=files.number(document, "period", source=source),
+            y=signals(document, "y", source=source),
+            u=signals(document, "u", source=source),
+            training=files.member(document, "training", str, source=source),
+            bags=tuple(files.named_digests(bags, source=source)),
+        )

@@ -1,0 +1,125 @@
+"""A web server and an S3 server of this machine, and bags for them to serve."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType, Writer
+
+from tests.bag_messages import (
+    CMD,
+    CMD_TYPE,
+    ODOM,
+    ODOM_TYPE,
+    PERIOD_NS,
+    START_NS,
+    command,
+    odometry,
+)
+
+IMAGE = "/camera"
+IMAGE_TYPE = "std_msgs/msg/ByteMultiArray"
+Fault = Callable[[str, int], int | None]  # (path, number of the request) -> status, None: serve
+
+
+def drive(
+    file: Path,
+    *,
+    samples: int = 200,
+    seed: int = 0,
+    compression: CompressionType = CompressionType.NONE,
+    image_bytes: int = 0,
+    chunk_size: int = 64 * 2**10,
+) -> Path:
+    """An MCAP file of a car's speed that follows commands, in chunks, with images between."""
+    from bags.recordings.definitions import standard_definition
+
+    rng = np.random.default_rng(seed)
+    commands = np.repeat(rng.uniform(-1.0, 1.0, 1 + samples // 10), 10)[:samples]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    speed = 0.0
+    with file.open("wb") as stream:
+        writer = Writer(
+            stream, chunk_size=chunk_size, compression=compression, index_types=IndexType.ALL
+        )
+        writer.start(profile="ros2")
+        channels = {}
+        for topic, kind in ((CMD, CMD_TYPE), (ODOM, ODOM_TYPE), (IMAGE, IMAGE_TYPE)):
+            schema = writer.register_schema(
+                kind, "ros2msg", standard_definition(kind).text.encode()
+            )
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for k, u in enumerate(commands.tolist()):
+            at = START_NS + k * PERIOD_NS
+            speed = 0.8 * speed + 0.2 * u + 1e-3 * rng.standard_normal()
+            writer.add_message(channels[CMD], at, command(at, u), at)
+            writer.add_message(channels[ODOM], at, odometry(at, speed), at)
+            if image_bytes:
+                writer.add_message(channels[IMAGE], at, b"\0\1\0\0" + rng.bytes(image_bytes), at)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return file
+
+
+@contextmanager
+def web_server(folder: Path, fault: Fault | None = None) -> Iterator[str]:
+    """The files of a folder over HTTP with ranges and ETags; yields the URL.
+
+    fault: what a GET is answered with instead. Status 200 to it means: half of the bytes.
+    """
+    count: dict[str, int] = {}
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_HEAD(self) -> None:
+            self._answer(body=False)
+
+        def do_GET(self) -> None:
+            self._answer(body=True)
+
+        def _answer(self, *, body: bool) -> None:
+            file = folder / self.path.lstrip("/")
+            number = count[self.path] = count.get(self.path, 0) + int(body)
+            status = fault(self.path, number) if fault is not None and body else None
+            if status is not None and status != 200:
+                self._send(status, b"")
+                return
+            if not file.is_file():
+                self._send(404, b"")
+                return
+            content, start = file.read_bytes(), 0
+            size, wanted = len(content), self.headers.get("Range")
+            code = 200
+            if wanted:
+                first, _, last = wanted.removeprefix("bytes=").partition("-")
+                start, end = int(first), int(last) + 1
+                content, code = content[start:end], 206
+            if status == 200:
+                content = content[: len(content) // 2]
+            tag = f'"{size}-{file.stat().st_mtime_ns}"'
+            self._send(code, content, body=body, tag=tag)
+
+        def _send(self, code: int, content: bytes, *, body: bool = True, tag: str = "") -> None:
+            self.send_response(code)
+            self.send_header("Content-Length", str(len(content)))
+            if tag:
+                self.send_header("ETag", tag)
+            self.end_headers()
+            if body:
+                self.wfile.write(content)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

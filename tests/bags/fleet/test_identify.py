@@ -1,0 +1,211 @@
+"""Many bags give what one machine's run gives, whoever reads them, and a bad one ends nothing."""
+
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from bags.chain.config import load_config
+from bags.chain.steps import identify_bags
+from bags.designs import documents
+from bags.fleet.bags import named_bags, robot_of
+from bags.fleet.manifest import Manifest
+from bags.fleet.run import Answer, ask
+from bags.fleet.trials import MANIFEST, identify_fleet
+from bags.fleet.workers import Workers
+from bags.samples import f1tenth
+from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import silent
+from tests.bags.fleet.conftest import Bucket
+from tests.bags.fleet.deadly import Deadly
+from tests.bags.fleet.storage import drive
+
+CONFIG = """\
+robot: car
+signals:
+  response: {name: speed, unit: m/s, path: "/odom:twist.twist.linear.x"}
+  excitation: {name: command, unit: m/s, path: "/cmd_vel:twist.linear.x"}
+grid: {period: 0.025, max_gap: 0.1}
+split: {test: ["*_0"]}
+identification: {lags: 2, method: rse_first}
+"""
+FILES = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    file = tmp_path / "robot.yaml"
+    file.write_text(CONFIG)
+    return file
+
+
+def fleet(folder: Path, count: int = 6) -> Path:
+    for k in range(count):
+        drive(folder / f"robot_{k % 2}" / f"drive_{k}.mcap", seed=k, samples=120)
+    return folder
+
+
+def run(bags: Path, config: Path, out: Path, workers: Workers = Workers(), strict: bool = False):  # type: ignore[no-untyped-def]  # noqa: B008
+    return identify_fleet(
+        named_bags([bags]), load_config(config), out,
+        workers=workers, strict=strict,
+    )  # fmt: skip
+
+
+def contents(out: Path) -> list[bytes]:
+    return [(out / name).read_bytes() for name in FILES]
+
+
+def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> None:
+    folder = fleet(tmp_path / "fleet", 3)
+    pattern = folder / "*" / "drive_*.mcap"
+    assert list(named_bags([pattern])) == ["robot_0/drive_0", "robot_0/drive_2", "robot_1/drive_1"]
+    assert list(named_bags([folder / "robot_*" / "*_1.mcap"])) == ["robot_1/drive_1"]
+    assert list(named_bags([folder / "robot_0"])) == ["drive_0", "drive_2"]
+    assert list(named_bags([folder / "robot_0" / "drive_2.mcap"])) == ["drive_2"]
+    assert (robot_of("robot_0/drive_2"), robot_of("drive_2")) == ("robot_0", "-")
+    with pytest.raises(DataError, match="two bags are called 'drive_0'"):
+        named_bags([folder / "robot_0", drive(tmp_path / "drive_0.mcap")])
+
+
+def test_the_result_is_the_same_to_the_bit_whoever_reads(tmp_path: Path, config: Path) -> None:
+    pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"
+    run(pattern, config, tmp_path / "here")
+    run(pattern, config, tmp_path / "two", Workers(2))
+    assert contents(tmp_path / "here") == contents(tmp_path / "two")
+
+
+def test_a_fleet_of_one_folder_gives_what_identify_gives(tmp_path: Path) -> None:
+    config = load_config(Path("config/f1tenth.yaml"))
+    bags = f1tenth()
+    identify_bags(bags, config, tmp_path / "alone", progress=silent)
+    identify_fleet(
+        {path.name: path for path in bags}, config, tmp_path / "fleet",
+        workers=Workers(),
+    )  # fmt: skip
+    assert contents(tmp_path / "alone") == contents(tmp_path / "fleet")
+
+
+def test_storage_gives_the_same_numbers_and_digests_of_its_own(
+    tmp_path: Path, config: Path, bucket: Bucket
+) -> None:
+    folder = fleet(tmp_path / "fleet", 4)
+    for file in folder.glob("*/*.mcap"):
+        bucket.put(file, str(file.relative_to(folder)))
+    here = run(folder / "*" / "*.mcap", config, tmp_path / "here")
+    there = run(Path(f"s3://{bucket.name}/*/*.mcap"), config, tmp_path / "there", Workers(1))
+    models = [str(found.identified.fit.model.document()["a"]) for found in (here, there)]
+    assert models[0] == models[1]
+    digests = [[trial.digest for trial in found.identified.train] for found in (here, there)]
+    assert not set(digests[0]) & set(digests[1])
+    assert all(answer.requests for answer in there.answers)
+
+
+def test_a_dask_cluster_gives_the_same(tmp_path: Path, config: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"
+    run(pattern, config, tmp_path / "here")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        run(pattern, config, tmp_path / "dask", Workers(scheduler=cluster.scheduler_address))
+    assert contents(tmp_path / "here") == contents(tmp_path / "dask")
+    with pytest.raises(DataError, match="name one of them"):
+        Workers(2, "tcp://host:1")
+
+
+def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) -> None:
+    folder = fleet(tmp_path / "fleet")
+    good = (folder / "robot_0" / "drive_2.mcap").read_bytes()
+    (folder / "robot_0" / "cut.mcap").write_bytes(good[: len(good) // 2])
+    (folder / "robot_0" / "text.mcap").write_bytes(b"no bag")
+    (folder / "robot_1" / "copy.mcap").write_bytes(good)
+    found = run(folder / "*" / "*.mcap", config, tmp_path / "out")
+    assert set(found.left_out) == {"robot_0/cut", "robot_0/text", "robot_1/copy"}
+    assert "truncated or unfinished" in found.left_out["robot_0/cut"]
+    assert "is not an MCAP file" in found.left_out["robot_0/text"]
+    assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
+    assert len(found.identified.train) + len(found.identified.test) == 6
+    with pytest.raises(BagError, match=r"cut\.mcap"):
+        run(folder / "*" / "*.mcap", config, tmp_path / "strict", strict=True)
+
+
+def test_a_second_run_reads_only_what_is_new(tmp_path: Path, config: Path) -> None:
+    folder = fleet(tmp_path / "fleet")
+    pattern = folder / "*" / "*.mcap"
+    run(pattern, config, tmp_path / "out")
+    drive(folder / "robot_9" / "drive_9.mcap", seed=9, samples=120)
+    drive(folder / "robot_0" / "drive_2.mcap", seed=10, samples=130)
+    again = run(pattern, config, tmp_path / "out")
+    assert {a.name for a in again.answers if not a.kept} == {"robot_9/drive_9", "robot_0/drive_2"}
+    run(pattern, config, tmp_path / "fresh")
+    assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+
+
+def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
+    (tmp_path / MANIFEST).write_bytes(b"x" * 5000)
+    with pytest.raises(DataError, match="not a manifest of bags"):
+        Manifest(tmp_path / MANIFEST)
+
+
+def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Path) -> None:
+    bags = {}
+    for name in "abcdef":
+        bags[name] = tmp_path / name
+        bags[name].write_text(name)
+    with Manifest(tmp_path / MANIFEST) as manifest:
+        answers = ask(Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest)
+    assert [a.name for a in answers] == list("abcdef")
+    assert [a.name for a in answers if a.reason] == ["c"]
+    assert "its worker died" in answers[2].reason
+    assert [a.content.decode() for a in answers if not a.reason] == list("abdef")
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, config: Path) -> None:
+    pattern = fleet(tmp_path / "fleet", 30) / "*" / "*.mcap"
+    out = tmp_path / "out"
+    command = [
+        sys.executable, "-m", "bags.commands.cli", "identify", str(pattern),
+        "--config", str(config), "--out", str(out), "--workers", "1",
+    ]  # fmt: skip
+    started = subprocess.Popen(command)
+    deadline = time.monotonic() + 60.0
+    while _rows(out / MANIFEST) < 3 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    started.send_signal(signal.SIGKILL)
+    started.wait()
+    kept = _rows(out / MANIFEST)
+    assert kept >= 3
+    again = run(pattern, config, out)
+    assert sum(answer.kept for answer in again.answers) >= kept
+    run(pattern, config, tmp_path / "fresh")
+    assert contents(out) == contents(tmp_path / "fresh")
+
+
+def _rows(manifest: Path) -> int:
+    if not manifest.exists():
+        return 0
+    try:
+        with sqlite3.connect(manifest) as rows:
+            return int(rows.execute("select count(*) from bags").fetchone()[0])
+    except sqlite3.OperationalError:
+        return 0
+
+
+def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
+    bags = {"a": drive(tmp_path / "a.mcap", samples=20)}
+
+    class Name:
+        asked = "name"
+
+        def __call__(self, bag: Path, name: str) -> bytes:
+            return f"{bag.name} {name}".encode()
+
+    with Manifest(None) as manifest:
+        (answer,) = ask(Name(), bags, Workers(), manifest)
+    assert isinstance(answer, Answer)
+    assert (answer.content, answer.requests, answer.kept) == (b"a.mcap a", 0, False)

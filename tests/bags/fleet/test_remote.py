@@ -1,0 +1,260 @@
+"""Bags are read where they lie, by the ranges that are needed, and refused by name if they fail."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from bags.recordings.bag import Bag
+from bags.recordings.folders import expand_bags
+from bags.recordings.mcap_file import McapFile
+from bags.recordings.remote import RemotePath, is_url, place
+from bags.samples import f1tenth
+from bags.signals.reader import bag_origin, read_signals
+from nlsid_core.errors import BagError
+from tests.bag_messages import CMD, COMMAND, ODOM, SPEED
+from tests.bags.fleet.conftest import Bucket
+from tests.bags.fleet.storage import IMAGE, drive, web_server
+
+WANTED = [SPEED, COMMAND]
+
+
+def remote(url: str, patience: float = 5.0) -> RemotePath:
+    path = place(url, patience=patience)
+    assert isinstance(path, RemotePath)
+    return path
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_remote_file_gives_the_same_signals(
+    bucket: Bucket, tmp_path: Path, compression: CompressionType
+) -> None:
+    local = drive(tmp_path / "d.mcap", compression=compression, image_bytes=3000)
+    found = read_signals(bucket.put(local, "a/d.mcap"), WANTED)
+    wanted = read_signals(local, WANTED)
+    for text in WANTED:
+        np.testing.assert_array_equal(found[text].values, wanted[text].values)
+        np.testing.assert_array_equal(found[text].stamp_ns, wanted[text].stamp_ns)
+
+
+def test_a_remote_bag_gives_the_same_messages_in_the_same_order(
+    bucket: Bucket, tmp_path: Path
+) -> None:
+    local = drive(tmp_path / "d.mcap", image_bytes=500)
+    with Bag(bucket.put(local, "d.mcap")) as there, Bag(local) as here:
+        assert there.topics == here.topics
+        assert [there.count(topic) for topic in there.topics] == [200, 200, 200]
+        assert list(there.messages()) == list(here.messages())
+
+
+def test_of_an_uncompressed_file_only_the_wanted_messages_are_fetched(
+    bucket: Bucket, tmp_path: Path
+) -> None:
+    local = drive(tmp_path / "d.mcap", samples=100, image_bytes=100_000, chunk_size=800_000)
+    path = remote(bucket.put(local, "d.mcap"))
+    read_signals(path, WANTED)
+    bag_origin(path)
+    assert path.fetched < 0.01 * local.stat().st_size
+    assert path.requests <= 1 + 13 + 100  # the end, an index a chunk, what is between two images
+
+
+def test_of_a_compressed_file_only_the_chunks_with_wanted_topics_are_fetched(
+    bucket: Bucket, tmp_path: Path
+) -> None:
+    local = drive(
+        tmp_path / "d.mcap", samples=60, image_bytes=100_000, chunk_size=50_000,
+        compression=CompressionType.ZSTD,
+    )  # fmt: skip
+    path = remote(bucket.put(local, "d.mcap"))
+    with Bag(path) as bag:
+        images = [message.data for message in bag.messages([IMAGE])]
+    assert len(images) == 60
+    assert path.fetched == pytest.approx(local.stat().st_size, rel=0.05)
+
+
+def test_a_small_file_is_one_request(bucket: Bucket, tmp_path: Path) -> None:
+    path = remote(bucket.put(drive(tmp_path / "d.mcap", samples=10), "d.mcap"))
+    read_signals(path, WANTED)
+    assert path.requests == 1
+    assert path.fetched == path.entry.size
+
+
+def test_a_rosbag2_folder_is_read_from_storage(bucket: Bucket) -> None:
+    folder = f1tenth()[0]
+    for file in folder.iterdir():
+        url = bucket.put(file, f"{folder.name}/{file.name}").rpartition("/")[0]
+    found = read_signals(url, [SPEED])
+    np.testing.assert_array_equal(found[SPEED].values, read_signals(folder, [SPEED])[SPEED].values)
+
+
+def test_patterns_mean_the_bags_that_match(bucket: Bucket, tmp_path: Path) -> None:
+    local = drive(tmp_path / "d.mcap", samples=10)
+    urls = [bucket.put(local, f"robot_{k}/drive_{k}.mcap") for k in (2, 1)]
+    bucket.put(local, "robot_1/other.mcap")
+    found = expand_bags([Path(f"s3://{bucket.name}/*/drive_*.mcap")])
+    assert [str(path) for path in found] == sorted(urls)
+    with pytest.raises(BagError, match="nothing matches s3://"):
+        expand_bags([Path(f"s3://{bucket.name}/*/none_*.mcap")])
+    with pytest.raises(BagError, match="there is no bag s3://"):
+        expand_bags([Path(f"s3://{bucket.name}/none.mcap")])
+
+
+def test_a_path_keeps_its_entry_on_the_way_to_another_process(tmp_path: Path) -> None:
+    drive(tmp_path / "d.mcap", samples=10)
+    with web_server(tmp_path) as url:
+        path = remote(f"{url}/d.mcap", patience=3.0)
+        assert path.entry.size == (tmp_path / "d.mcap").stat().st_size
+    again = pickle.loads(pickle.dumps(path))
+    assert (again, again.entry, again.patience) == (path, path.entry, 3.0)
+
+
+def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
+    assert type(place("file:///a/b.mcap")) is type(place("/a/b.mcap")) is type(Path("x"))
+    assert str(place("file:///a/b.mcap")) == "/a/b.mcap"
+    assert is_url(Path("s3://bucket/key"))
+    assert not is_url(tmp_path)
+    path = remote("s3://bucket/a/b.mcap")
+    assert (str(path), path.name, str(path.parent)) == (
+        "s3://bucket/a/b.mcap", "b.mcap", "s3://bucket/a",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "url", ["https://host/d.mcap?X-Amz-Signature=secret", "https://user:secret@host/d.mcap"]
+)
+def test_a_url_with_a_secret_is_refused_without_repeating_it(url: str) -> None:
+    with pytest.raises(BagError) as refusal:
+        place(url)
+    assert "secret" not in str(refusal.value).replace("may hold a secret", "")
+
+
+def test_a_server_that_is_busy_is_asked_again(tmp_path: Path) -> None:
+    local = drive(tmp_path / "d.mcap")
+    with web_server(tmp_path, lambda _, number: 503 if number <= 2 else None) as url:
+        found = read_signals(f"{url}/d.mcap", [SPEED])
+    np.testing.assert_array_equal(found[SPEED].values, read_signals(local, [SPEED])[SPEED].values)
+
+
+def test_half_an_answer_is_asked_for_again(tmp_path: Path) -> None:
+    local = drive(tmp_path / "d.mcap")
+    with web_server(tmp_path, lambda _, number: 200 if number == 1 else None) as url:
+        found = read_signals(f"{url}/d.mcap", [SPEED])
+    np.testing.assert_array_equal(found[SPEED].values, read_signals(local, [SPEED])[SPEED].values)
+
+
+def test_a_server_that_stays_busy_is_given_up_after_the_patience(tmp_path: Path) -> None:
+    drive(tmp_path / "d.mcap")
+    with (
+        web_server(tmp_path, lambda *_: 503) as url,
+        pytest.raises(BagError, match=r"did not deliver; 1 s were lost .*503"),
+    ):
+        read_signals(remote(f"{url}/d.mcap", patience=1.0), [SPEED])
+
+
+def test_what_is_forbidden_is_not_asked_again(tmp_path: Path) -> None:
+    drive(tmp_path / "d.mcap")
+    asked = []
+
+    def forbid(path: str, _: int) -> int:
+        asked.append(path)
+        return 403
+
+    with (
+        web_server(tmp_path, forbid) as url,
+        pytest.raises(BagError, match=r"storage refuses it: .*403"),
+    ):
+        read_signals(f"{url}/d.mcap", [SPEED])
+    assert len(asked) == 1
+
+
+def test_an_object_that_vanishes_is_no_bag(bucket: Bucket, tmp_path: Path) -> None:
+    path = remote(bucket.put(drive(tmp_path / "d.mcap"), "d.mcap"))
+    assert path.entry.size
+    bucket.remove("d.mcap")
+    with pytest.raises(FileNotFoundError):
+        read_signals(path, [SPEED])
+
+
+def test_a_truncated_remote_file_is_refused_by_name(bucket: Bucket, tmp_path: Path) -> None:
+    whole = drive(tmp_path / "d.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    url = bucket.put(tmp_path / "cut.mcap", "cut.mcap")
+    with pytest.raises(BagError, match=rf"{url} is truncated or unfinished"):
+        read_signals(url, [SPEED])
+    with Bag(url, unfinished=True) as bag:
+        assert 0 < bag.count(ODOM) < 200
+
+
+def test_a_file_without_a_summary_is_read_whole(bucket: Bucket, tmp_path: Path) -> None:
+    from mcap.data_stream import RecordBuilder
+    from mcap.records import Footer
+
+    whole = drive(tmp_path / "d.mcap").read_bytes()
+    stated = int.from_bytes(whole[-28:-20], "little")
+    builder = RecordBuilder()
+    Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
+    footer: bytes = builder.end()  # type: ignore[no-untyped-call]
+    (tmp_path / "bare.mcap").write_bytes(whole[:stated] + footer + whole[-8:])
+    url = bucket.put(tmp_path / "bare.mcap", "bare.mcap")
+    found = read_signals(url, [SPEED])
+    np.testing.assert_array_equal(
+        found[SPEED].values, read_signals(tmp_path / "d.mcap", [SPEED])[SPEED].values
+    )
+
+
+@pytest.mark.parametrize("part", ["summary", "index", "chunk"])
+def test_damage_anywhere_is_an_error_that_names_the_file(
+    bucket: Bucket, tmp_path: Path, part: str
+) -> None:
+    local = drive(tmp_path / "d.mcap", compression=CompressionType.ZSTD, samples=400)
+    content = bytearray(local.read_bytes())
+    with McapFile(local) as file:
+        block = file.contents.blocks[1]
+    channel, (index, _) = next(iter((block.index or {}).items()))
+    summary = int.from_bytes(content[-28:-20], "little")
+    at = {"summary": summary + 30, "index": index - 6, "chunk": block.offset + 1000}[part]
+    assert part != "index" or content[at] == channel
+    content[at] ^= 0x55
+    local.write_bytes(content)
+    url = bucket.put(local, "d.mcap")
+    with pytest.raises(BagError, match=f"^{url} is damaged"):
+        read_signals(url, WANTED)
+
+
+def test_any_changed_byte_gives_the_same_signals_or_an_error(tmp_path: Path) -> None:
+    """Untrusted files: nothing but a BagError, and no other numbers from a compressed one."""
+    content = drive(tmp_path / "d.mcap", compression=CompressionType.LZ4, samples=30).read_bytes()
+    wanted = read_signals(tmp_path / "d.mcap", [SPEED])[SPEED].values
+    rng = np.random.default_rng(1)
+    refused = 0
+    summary = int.from_bytes(content[-28:-20], "little")
+    with web_server(tmp_path) as url:
+        for k in range(150):
+            changed = bytearray(content)
+            start = 0 if k % 2 else summary
+            changed[int(rng.integers(start, len(content)))] ^= int(rng.integers(1, 256))
+            (tmp_path / f"{k}.mcap").write_bytes(changed)
+            try:
+                found = read_signals(remote(f"{url}/{k}.mcap"), [SPEED])[SPEED].values
+            except BagError:
+                refused += 1
+            else:
+                np.testing.assert_array_equal(found, wanted)
+    assert refused > 50
+
+
+def test_a_bag_of_sqlite_is_refused_in_storage(bucket: Bucket, tmp_path: Path) -> None:
+    (tmp_path / "x.db3").write_bytes(b"SQLite format 3\0")
+    with pytest.raises(BagError, match="only MCAP is read from where it lies"):
+        Bag(bucket.put(tmp_path / "x.db3", "x.db3"))
+
+
+def test_commands_are_found_where_no_image_is(bucket: Bucket, tmp_path: Path) -> None:
+    """Channels that stand in some chunks only."""
+    local = drive(tmp_path / "d.mcap", image_bytes=30_000, chunk_size=4000)
+    path = remote(bucket.put(local, "d.mcap"))
+    with Bag(path) as bag:
+        assert sum(len(batch) for _, batch in bag.batches([CMD])) == 200
+    assert path.fetched < 0.1 * local.stat().st_size
