@@ -37,16 +37,20 @@ class Nominal:
         return self.x.t
 
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
-        """The largest |f(t, x₀, u₀) - ẋ₀| sampled, its interval's start (s), and the state."""
-        gaps = self.gaps(field)
-        k, i = np.unravel_index(int(gaps.argmax()), gaps.shape)
-        return float(gaps[k, i]), float(self.t[k]), int(i)
+        """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""
+        when, gaps = self._sampled(field)
+        j, i = np.unravel_index(int(gaps.argmax()), gaps.shape)
+        return float(gaps[j, i]), float(when[j]), int(i)
 
     def gaps(self, field: VectorField | Rates) -> FloatArray:
-        """(K-1, n) the largest |f(t, x₀, u₀) - ẋ₀| over fine samples of every interval."""
-        rate, gaps = self.x.derivative(), np.zeros((len(self.t) - 1, self.x.control.shape[2]))
-        for k, (start, end) in enumerate(zip(self.t[:-1], self.t[1:], strict=True)):
-            for t in np.linspace(start, end, SAMPLES, endpoint=k == len(gaps) - 1):
-                gap = np.abs(field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t))
-                gaps[k] = np.maximum(gaps[k], gap)
-        return gaps
+        """(K-1,) the largest of those within each interval."""
+        gaps = self._sampled(field)[1][:-1]
+        return np.asarray(gaps.reshape(len(self.t) - 1, -1).max(axis=1))
+
+    def _sampled(self, field: VectorField | Rates) -> tuple[FloatArray, FloatArray]:
+        """(S,) times and (S, n) |f(t, x₀, u₀) - ẋ₀| there."""
+        share = np.arange(SAMPLES) / SAMPLES
+        when = np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * share).ravel(), self.t[-1])
+        rate = self.x.derivative()
+        gaps = [field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t) for t in when.tolist()]
+        return when, np.abs(gaps)

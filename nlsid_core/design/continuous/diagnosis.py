@@ -13,6 +13,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.errors import SolverError
 
+NOISE = 1e-6  # of the linear part: less is rounding
 CLOSE = 1e-4  # of the boundary's size: there differences of rates are linear
 TERMS = ("remainder", "disturbance", "saturation", "hold", "curvature", "motion")
 NAMES = {
@@ -52,15 +53,15 @@ class Diagnosis:
     @property
     def dominant(self) -> str:
         """The term to act on."""
-        if self.linear <= 0:
-            return "linear"
-        return max(TERMS, key=lambda name: self.taken[name])
+        largest = max(TERMS, key=lambda name: self.taken[name])
+        return "linear" if self.taken[largest] <= -self.linear else largest
 
     def __str__(self) -> str:
         total = sum(part for part in self.taken.values() if part > 0) or 1.0
         shares = sorted(((p, name) for name, p in self.taken.items() if p > 0), reverse=True)
+        least = max(0.01 * total, NOISE * abs(self.linear))
         taking = "; ".join(f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
-                           for p, n in shares if p >= 0.01 * total)  # fmt: skip
+                           for p, n in shares if p >= least)  # fmt: skip
         sizes = ", ".join(f"{width:.3g}" for width in self.widths)
         cause = "that" if self.dominant == "linear" else NAMES[self.dominant].rstrip(",")
         return (

@@ -89,7 +89,7 @@ def plan_motion(
     z = mesh.started(straight)
     while True:
         found = mesh.nominal(z)
-        gaps = found.gaps(rates).max(axis=1)
+        gaps = found.gaps(rates)
         wanted = DEFECT * float(np.abs(found.x.derivative().control).max())
         if (gaps <= GOOD * wanted).all() or (knots is not None and (gaps <= wanted).all()):
             return found
