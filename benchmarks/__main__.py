@@ -63,6 +63,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "executors": Benchmark("executors"),
         "faults": Benchmark("faults"),
         "first_order_bias": Benchmark("first_order_bias"),
+        "fleet": Benchmark("fleet"),
         "funnel_scaling": Benchmark("funnel_scaling"),
         "heat_exchanger": Benchmark("heat_exchanger", data="exchanger"),
         "known_problems": Benchmark("known_problems"),
@@ -99,13 +100,18 @@ def measured(benchmark: Benchmark, data: Path | None, limit: float) -> dict[str,
         text=True,
     )  # fmt: skip
     return {
-        "command": ["python", *command[1:]],
+        "command": ["python", *(_without(data, word) for word in command[1:])],
         "date": date.isoformat(timespec="seconds"),
         "machine": describe(),
         "commit": commit(),
         "seconds": round(time.monotonic() - started, 1),
         "result": json.loads(done.stdout.strip().rpartition("\n")[2]),
     }
+
+
+def _without(data: Path | None, word: str) -> str:
+    """A word of the command that names no folder of this machine."""
+    return word if data is None else word.replace(str(data), "DATA")
 
 
 def commit() -> str:

@@ -3,8 +3,7 @@
 python -m benchmarks.heat_exchanger --data DIR [--json]
 
 q(w) quadratic, p cubic in w = [u(t) … u(t-n)]; trained on the first 1500 of 4000 samples, scored on
-all of them from the training mean. Published: Tobenkin (2014), Table 4.1. (The thesis prints w from
-u(t-1) in places; with u(t) first its numbers come out.)
+all of them from the training mean. Published: Tobenkin (2014), Table 4.1.
 """
 
 import os

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
-from examples.one_dimensional import PUBLISHED_AREA, designed, problem, radius, true_sets
+from examples.one_dimensional import BEST_AREA, designed, problem, radius, true_sets
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
 
@@ -85,7 +85,7 @@ def main() -> None:
     result = run()
     print(f"one-dimensional example; {describe()}")
     for key, value in result.items():
-        known = f"   (known {PUBLISHED_AREA})" if key == "best_area" else ""
+        known = f"   (known {BEST_AREA})" if key == "best_area" else ""
         print(f"{key:24} {value:.5g}{known}")
     if arguments.plot is not None:
         draw(arguments.plot)

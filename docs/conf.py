@@ -48,6 +48,7 @@ def _read(app: Any, name: str, source: list[str]) -> None:
         source[0] = f"---\norphan: true\n---\n{source[0]}"
     if name.startswith("theory"):
         source[0] = linking.linked(source[0], _documented)[0]
+    source[0] = measured.filled(source[0], ROOT / "benchmarks" / "results")
     if running.FRONT.match(source[0]):
         folder = PAGES / name.replace("/", "-")
         page = running.run_page(source[0], folder, ROOT)

@@ -11,7 +11,7 @@ from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implic
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 
-PUBLISHED = 1.819  # |∂a(5/4)|²
+KNOWN = 1.819  # |∂a(5/4)|², computed by hand; the thesis says that it is larger than 1
 DELTA = 0.5  # any 0 < δ < 1
 
 model = ImplicitModel.separable(
@@ -25,10 +25,10 @@ model = ImplicitModel.separable(
 
 
 def example() -> tuple[float, float]:
-    """(|∂a(5/4)|², what is published): larger than one, so a is not a contraction."""
+    """(|∂a(5/4)|², what is known): larger than one, so a is not a contraction."""
     x, no_input = np.array([[1.25]]), np.zeros((1, 0))
     slope = model.jacobian(model.step(x, no_input), x, no_input)
-    return float(slope[0, 0, 0]) ** 2, PUBLISHED
+    return float(slope[0, 0, 0]) ** 2, KNOWN
 
 
 def proof() -> ImplicitProof:

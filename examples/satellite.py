@@ -1,7 +1,7 @@
 """The tumbling satellite of thesis Chapter 7: dynamics, nominal motion, TVLQR, and its L-steps.
 
 State x = [σ; ω]: modified Rodrigues parameters (dimensionless) and body rates in rad/s; input u:
-torques in N m. P_G is used as printed (MATHS.md section 9, variant "printed").
+torques in N m. P_G is used as printed.
 """
 
 from dataclasses import dataclass

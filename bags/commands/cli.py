@@ -341,6 +341,9 @@ def report(
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
     ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also as PDF beside the page; needs Chromium or Chrome.")
+    ] = False,
 ) -> None:
     """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
 
@@ -350,7 +353,7 @@ def report(
     from bags.commands import show
     from bags.designs import documents
     from bags.monitoring.replay import replay_bag
-    from bags.pictures.folder_report import write_folder_report
+    from bags.pictures.folder_report import print_page, write_folder_report
     from bags.pictures.report import report_available
     from bags.recordings.folders import expand_bags
 
@@ -372,6 +375,9 @@ def report(
             drawn = plots.svg(plots.margins(replays))
     write_folder_report(folder, target, replays=replays, drawn=drawn)
     out.print(f"wrote {target}", soft_wrap=True)
+    if pdf:
+        print_page(target, target.with_suffix(".pdf"))
+        out.print(f"wrote {target.with_suffix('.pdf')}", soft_wrap=True)
 
 
 @app.command()

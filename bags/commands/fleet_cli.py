@@ -5,18 +5,23 @@ A command imports what it runs when it is called.
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from bags.chain.config import Config
+    from bags.fleet.monitor import FleetVerdict
 
-LISTED = 20  # bags that are left out, by name; all are in fleet.json
+LISTED = 20  # bags that are left out, by name
+ROWS = 30  # of a table on the screen
 
 fleet_app = typer.Typer(
     name="fleet",
@@ -25,6 +30,13 @@ fleet_app = typer.Typer(
 )
 console = Console()
 
+BagsArgument = Annotated[
+    list[Path], typer.Argument(help="Bags, folders of bags, URLs and patterns (quote them).")
+]
+ManifestOption = Annotated[
+    Path | None,
+    typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
+]
 WorkersOption = Annotated[
     int, typer.Option("--workers", min=0, help="Processes that read; 0: this one.")
 ]
@@ -40,6 +52,150 @@ PatienceOption = Annotated[
         min=1.0, help="Seconds that a bag may lose with failing requests before it is left out."
     ),
 ]
+
+
+@fleet_app.command()
+def check(
+    bags: BagsArgument,
+    config: Annotated[Path, typer.Option(help="The robot's YAML configuration: its signals.")],
+    table: Annotated[
+        Path | None, typer.Option("--out", help="A .parquet file for all rows and findings.")
+    ] = None,
+    manifest: ManifestOption = None,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
+    patience: PatienceOption = 60.0,
+) -> None:
+    """Fitness, clock trouble and losses of every bag as one table.
+
+    Status 1 if a bag is bad, 2 if one cannot be read.
+    """
+    from bags.chain.config import load_config
+    from bags.commands.progress import progress_bar
+    from bags.fleet.bags import named_bags
+    from bags.fleet.check import UNREAD, check_fleet, write_parquet
+    from bags.fleet.workers import Workers
+
+    settings = load_config(config)
+    named = named_bags(bags, patience=patience)
+    with progress_bar("checking") as progress:
+        rows = check_fleet(
+            named, settings,
+            workers=Workers(workers, scheduler), manifest=manifest, progress=progress,
+        )  # fmt: skip
+    if table is not None:
+        write_parquet(rows, table)
+    shown = Table(title=f"{len(rows)} bags", title_justify="left")
+    for column in ("bag", "verdict", "start (UTC)", "lost", "what to look at"):
+        shown.add_column(column, overflow="fold")
+    serious = {UNREAD: 0, "bad": 1, "look": 2, "good": 3}
+    for row in sorted(rows, key=lambda row: serious[row.verdict])[:ROWS]:
+        lost = "-" if row.lost is None else str(row.lost)
+        shown.add_row(row.bag, row.verdict, row.start[:19], lost, escape(row.trouble))
+    console.print(shown)
+    if len(rows) > ROWS:
+        console.print(f"and {len(rows) - ROWS} more, none more serious; --out writes all of them")
+    counts = Counter(row.verdict for row in rows)
+    console.print(", ".join(f"{counts[verdict]} {verdict}" for verdict in serious))
+    if table is not None:
+        console.print(f"wrote {table}", soft_wrap=True)
+    if counts["bad"] or counts[UNREAD]:
+        raise typer.Exit(1 if counts["bad"] else 2)
+
+
+@fleet_app.command()
+def monitor(
+    bags: BagsArgument,
+    funnel: Annotated[Path, typer.Option(help="The funnel.json that `nlsid funnel` wrote.")],
+    config: Annotated[
+        Path | None, typer.Option(help="Takes `monitor.nominal` and `definitions`.")
+    ] = None,
+    table: Annotated[
+        Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
+    ] = None,
+    manifest: ManifestOption = None,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
+    patience: PatienceOption = 60.0,
+) -> None:
+    """Hold every bag against one proved design: which robots, which days, which assumption.
+
+    How much of what is assumed each bag spends, the worst ten, what that says of the next bag, and
+    whether the newest month is like the calibration. Status 0 if all are inside with the assumption
+    kept, 1 if one is not, 2 if one was not judged whole.
+    """
+    from bags.chain.config import load_config
+    from bags.commands import show
+    from bags.commands.progress import progress_bar
+    from bags.designs import documents
+    from bags.fleet.bags import named_bags
+    from bags.fleet.check import write_parquet
+    from bags.fleet.monitor import monitor_fleet
+    from bags.fleet.workers import Workers
+    from bags.recordings.definitions import read_definitions
+    from nlsid_core.running.reading import Status
+
+    settings = load_config(config) if config is not None else None
+    proved = documents.load_proved(funnel)
+    named = named_bags(bags, patience=patience)
+    with progress_bar("judging") as progress:
+        found = monitor_fleet(
+            named, funnel, proved,
+            centre=show.centre_of(settings),
+            definitions=read_definitions(settings.definitions if settings else ()),
+            workers=Workers(workers, scheduler), manifest=manifest, progress=progress,
+        )  # fmt: skip
+    if table is not None:
+        write_parquet(found.rows, table)
+    _say_verdicts(found)
+    if table is not None:
+        console.print(f"wrote {table}", soft_wrap=True)
+    verdicts = {row.verdict for row in found.rows}
+    if verdicts & {Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value} or any(
+        row.alarm for row in found.rows
+    ):
+        raise typer.Exit(1)
+    if verdicts != {Status.INSIDE.value}:
+        raise typer.Exit(2)
+
+
+def _say_verdicts(found: FleetVerdict) -> None:
+    counts = Counter(row.verdict for row in found.rows)
+    console.print(
+        f"{len(found.rows)} bags: " + ", ".join(f"{n} {what}" for what, n in counts.most_common())
+    )
+    for key, title in (("robot", "robots"), ("day", "days")):
+        table = Table(title=f"{title}, those with the most trouble first", title_justify="left")
+        for column in (key, "bags", *counts):
+            table.add_column(column, overflow="fold")
+        groups = found.by(key)
+        for name, own in list(groups.items())[:ROWS]:
+            table.add_row(name or "-", str(own.total()), *(str(own[what]) for what in counts))
+        console.print(table)
+    for what, count in Counter(r.assumption for r in found.rows if r.assumption).most_common():
+        console.print(f"broken in {count} bags: {what}", soft_wrap=True, markup=False)
+    if any(found.histogram):
+        console.print("of what is assumed, spent by so many bags:")
+    most = max(found.histogram)
+    for k, count in enumerate(found.histogram):
+        label = f"{10 * k:3d} to {10 * k + 10:3d} %" if k < 10 else "   over 100 %"
+        if most:
+            console.print(f"{label:>14} {count:6d} {'#' * round(40 * count / most)}")
+    table = Table(title="the ten that spent the most", title_justify="left")
+    for column in ("bag", "spent", "at", "verdict", "bad from", "margin"):
+        table.add_column(column, overflow="fold")
+    for row in found.worst:
+        table.add_row(
+            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s", row.verdict,
+            row.bad_from or "-", "-" if row.margin is None else f"{row.margin:.3f}",
+        )  # fmt: skip
+    console.print(table)
+    for line in found.ranks:
+        console.print(line, soft_wrap=True, highlight=False)
+    drift = found.drift
+    said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
+    console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
+    say_left_out(console, {row.bag: row.reason for row in found.rows if row.verdict == "not read"})
 
 
 def identify(

@@ -1,14 +1,17 @@
 """The picture of what a funnel catches (extra `report`: matplotlib)."""
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from bags.monitoring.catching import Catching
 from bags.pictures.plots import BLUE, INK, LINE, ORANGE, tidy
 
+TITLE = 60  # letters of a line
 SHADES = ("#5f6b73", "#9aa0a6", "#cfd3d6")  # of the other detectors
 
 
@@ -48,11 +51,11 @@ def _errors(axes: Axes, found: Catching, j: int) -> None:
                      label="half the range" if sign > 0 else None)  # fmt: skip
     widest = width.half_width if width.most is None else width.most
     most = 1.15 * min(max(widest, width.range / 2), 2.0 * max(width.half_width, width.range / 2))
-    axes.set_ylim(-most, 1.35 * most)
+    axes.set_ylim(-most, most)
     axes.set_ylabel(f"error of {width.name} [{width.unit}]", fontsize=8)
-    title = f"half-width {width.said}:\n{width.part}"
-    axes.set_title(title, fontsize=9, loc="left")
-    axes.legend(frameon=False, fontsize=7, loc="upper right", ncols=3)
+    said = f"half-width {width.said}: {width.part}"
+    axes.set_title(fill(said, TITLE), fontsize=8, loc="left", pad=36)
+    axes.legend(frameon=False, fontsize=7, loc="lower left", bbox_to_anchor=(-0.02, 1), ncols=2)
 
 
 def _caught(axes: Axes, found: Catching) -> None:
@@ -76,5 +79,6 @@ def _caught(axes: Axes, found: Catching) -> None:
     axes.set_yticks(places + 1.5 * height, [row.fault for row in rows])
     axes.invert_yaxis()
     axes.set_xlim(0, found.trials)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"caught, of {found.trials} held-back trials", fontsize=8)
     axes.legend(frameon=False, fontsize=7, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))

@@ -5,6 +5,10 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 """
 
 import base64
+import os
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -14,15 +18,20 @@ from bags.designs import documents
 from bags.monitoring.replay import Replay
 from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE
 from nlsid_core import files, kernel
-from nlsid_core.errors import DocumentError
+from nlsid_core.errors import DataError, DocumentError
 
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 PRINT = """
 nav a { margin-right: 1rem } figure { margin: 1rem 0 } figure img { max-width: 100% }
 section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
-@media print { nav { display: none } h2 { break-after: avoid } figure, table { break-inside: avoid }
-  body { max-width: none; margin: 0 } }
+td code { white-space: nowrap } .digests td code { white-space: normal }
+@media (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem } }
+@page { size: A4; margin: 15mm }
+@media print { nav { display: none } h2, h3 { break-after: avoid }
+  figure, tr, svg { break-inside: avoid } section { overflow: visible }
+  table { font-size: .8em } th, td { padding: .2rem .4rem; white-space: normal }
+  body { max-width: none; margin: 0; font-size: 11pt } }
 """
 PICTURES = {
     documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
@@ -35,6 +44,8 @@ PICTURES = {
 }
 REJECTED = "REJECTED"
 LARGEST_PICTURE = 20 * 2**20  # bytes
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PATIENCE = 120.0  # s for one of them to print a page
 
 
 def write_folder_report(
@@ -46,6 +57,32 @@ def write_folder_report(
     DocumentError if the folder has neither a proof nor a report.
     """
     files.write_atomically(out, folder_page(folder, replays=replays, drawn=drawn).encode())
+
+
+def print_page(page: Path, out: Path) -> None:
+    """Print a page to a PDF file by Chromium or Chrome; DataError if there is none, or it fails."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        raise DataError(
+            f"a PDF is printed by Chromium or Chrome; none of {', '.join(BROWSERS)} is on PATH; "
+            f"install one (Debian, Ubuntu: apt install chromium), or open {page} and print it"
+        )
+    with tempfile.TemporaryDirectory() as scratch:
+        printed = Path(scratch) / "page.pdf"
+        options = ["--headless", "--disable-gpu", "--no-first-run", "--no-pdf-header-footer",
+                   f"--user-data-dir={scratch}/profile", f"--print-to-pdf={printed}"]  # fmt: skip
+        if os.geteuid() == 0:  # as root it does not start with one; the page may run nothing anyway
+            options.append("--no-sandbox")
+        command = [browser, *options, page.resolve().as_uri()]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=PATIENCE, check=False
+            )
+        except subprocess.TimeoutExpired as error:
+            raise DataError(f"{browser} did not print {page} in {PATIENCE:g} s") from error
+        if not printed.is_file():
+            raise DataError(f"{browser} printed no {out.name}: {done.stderr[-500:].strip()}")
+        files.write_atomically(out, printed.read_bytes())
 
 
 def folder_page(folder: Path, *, replays: Sequence[Replay] = (), drawn: str = "") -> str:
@@ -100,7 +137,7 @@ def _proof(path: Path) -> str:
     )
     return (
         f'<h3>{name}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
-        f'<table class="left"><tbody>{digests}</tbody></table>'
+        f'<table class="left digests"><tbody>{digests}</tbody></table>'
     )
 
 

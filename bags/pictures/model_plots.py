@@ -13,7 +13,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Fit, History, Model, Validation, simulate_trial
 from nlsid_core.identification.prediction import history
-from nlsid_core.models import BlockCascade, DifferenceEquation, MonotoneEquation
+from nlsid_core.models import BlockCascade, CellNetwork, DifferenceEquation, MonotoneEquation
 from nlsid_core.models.monotone_equation import solve_increasing
 
 MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
@@ -140,6 +140,17 @@ def structure(chosen: Candidate[Model]) -> Figure | None:
         right.set_xlabel("between the filters", fontsize=8)
         right.set_title("static nonlinearity f, linear beyond", fontsize=8, loc="left")
         tidy([right])
+    elif isinstance(model, CellNetwork):
+        count = len(model.maps)
+        figure = Figure(figsize=(min(7.2, 2.4 * count), 2.2 * ((count + 2) // 3)),
+                        layout="constrained")  # fmt: skip
+        grid = figure.subplots((count + 2) // 3, min(count, 3), squeeze=False)
+        for number, (axes, f) in enumerate(zip(grid.flat, model.maps, strict=False), 1):
+            axes.plot(f.knots, f.values, ".-", color=BLUE, lw=LINE, ms=4)
+            axes.set_title(f"map {number}", fontsize=8, loc="left")
+        for axes in grid.flat[count:]:
+            axes.set_visible(False)
+        tidy(list(grid.flat[:count]))
     elif isinstance(model, MonotoneEquation):
         figure = Figure(figsize=(3.8, 3.2), layout="constrained")
         axes = figure.subplots()

@@ -108,6 +108,11 @@ class Bag:
         """The bag's own metadata: `custom_data` of metadata.yaml or of the MCAP file."""
         return dict(self._described.custom if self.path.is_dir() else self._storage.custom)
 
+    @property
+    def start_ns(self) -> int:
+        """The first log time in ns; 0 if there are no messages."""
+        return self._storage.start_ns
+
     def types_on(self, topic: str) -> tuple[str, Typestore]:
         """The message type on `topic`, and the types it is made of.
 

@@ -13,7 +13,7 @@ import re
 import stat
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PosixPath
 from typing import Any, Final, TypeVar
@@ -23,6 +23,7 @@ from nlsid_core.errors import BagError
 GAP_BYTES: Final = 16 * 2**10  # ranges closer than this are one request, whose price they share
 HELD_BYTES: Final = 64 * 2**20  # of a file that stay in memory for who opens it again
 TAIL_BYTES: Final = 8 * 2**10  # the first request: footer and most summaries
+TOGETHER: Final = 16  # requests that run beside each other, and fail or succeed together
 PATIENCE: Final = 60.0  # s that may be lost with failing requests, of each bag
 FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before each next
 LONGEST_WAIT: Final = 10.0
@@ -161,9 +162,11 @@ class RemotePath(PosixPath):
                 merged[-1][1] = max(merged[-1][1], end)
             else:
                 merged.append([start, end])
-        if not merged:
-            return
-        starts, ends = ([span[k] for span in merged] for k in (0, 1))
+        for first in range(0, len(merged), TOGETHER):
+            self._fetch_all(merged[first : first + TOGETHER])
+
+    def _fetch_all(self, spans: Sequence[Sequence[int]]) -> None:
+        starts, ends = ([span[k] for span in spans] for k in (0, 1))
         size = self.entry.size
 
         def ask(fs: Any, name: str, limit: dict[str, float]) -> list[bytes]:
@@ -208,13 +211,14 @@ class RemotePath(PosixPath):
         return held[at] if at >= 0 and byte < held[at][0] + len(held[at][1]) else None
 
     def _hold(self, start: int, content: bytes) -> None:
-        """Keep a part; the oldest leave when there is too much."""
+        """Keep a part in the place of those inside it; the oldest leave when there is too much."""
         order: list[tuple[int, bytes]] = self.__dict__.setdefault("_order_held", [])
+        end = start + len(content)
+        order[:] = [p for p in order if p[0] < start or p[0] + len(p[1]) > end]
         order.append((start, content))
         while len(order) > 1 and sum(len(part) for _, part in order) > HELD_BYTES:
             order.pop(0)
-        longest = dict(sorted(order, key=lambda part: (part[0], len(part[1]))))
-        self.__dict__["_parts_held"] = sorted(longest.items())
+        self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
     def _asked(self, ask: Callable[[Any, str, dict[str, float]], T]) -> T:
         """The answer of storage, asked again with growing waits while the patience lasts."""

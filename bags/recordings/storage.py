@@ -74,6 +74,10 @@ class Storage(Protocol):
     custom: dict[str, str]
     ending: str | None
 
+    @property
+    def start_ns(self) -> int:
+        """The first log time; 0 if there are no messages."""
+
     def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """(channel key, messages), in the order of the files."""
 
@@ -128,6 +132,11 @@ class McapStorage:
                 )
             )
         self._keys.append(keys)
+
+    @property
+    def start_ns(self) -> int:
+        """The first log time, as the chunks state it; 0 if there are no messages."""
+        return min((b.start_ns for file in self.files for b in file.contents.blocks), default=0)
 
     def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """(channel key, messages), in the order of the files."""
@@ -205,6 +214,12 @@ class RosbagsStorage:
             self._readers.append((path, reader, connections))
             for connection in connections:
                 self.channels.append(_channel(len(self.channels), connection, ros1=ros1))
+
+    @property
+    def start_ns(self) -> int:
+        """The first log time; 0 if there are no messages."""
+        starts = [reader.start_time for _, reader, _ in self._readers if reader.message_count]
+        return int(min(starts, default=0))
 
     def batches(self, keys: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """(channel key, messages), in the order of log time."""

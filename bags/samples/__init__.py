@@ -3,7 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-__all__ = ["dart", "f1tenth", "schunk"]
+__all__ = ["dart", "dart_tables", "f1tenth", "kuka", "schunk"]
 
 
 def dart(floor: str = "*") -> list[Path]:
@@ -15,10 +15,21 @@ def dart(floor: str = "*") -> list[Path]:
     return sorted(folder.glob(f"{floor}_20*"))
 
 
+def dart_tables() -> Path:
+    """Archive (tar, xz) of 17 of the DART car's drives as its makers' thinned CSV files."""
+    return Path(str(files("bags.samples"))) / "dart" / "tables.tar.xz"
+
+
 def f1tenth() -> list[Path]:
     """The 41 bags of a F1TENTH car, trial_01 to trial_41; see the README beside them."""
     folder = Path(str(files("bags.samples"))) / "f1tenth"
     return sorted(folder.glob("trial_*"))
+
+
+def kuka() -> list[Path]:
+    """Three bags of a KUKA arm's tracked motions, motion_a to motion_c; see the README there."""
+    folder = Path(str(files("bags.samples"))) / "kuka"
+    return sorted(folder.glob("motion_*"))
 
 
 def schunk() -> list[Path]:

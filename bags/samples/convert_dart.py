@@ -1,4 +1,4 @@
-"""Convert the drives of the DART car (CSV) into the bags that ship in `dart/`.
+"""Convert the drives of the DART car (CSV) into what ships in `dart/`: bags, and thinned tables.
 
     python -m bags.samples.convert_dart --data DATA/dart --out bags/samples/dart
 
@@ -6,6 +6,8 @@ The same input gives the same bytes. Source of the data and what was done to it:
 """
 
 import argparse
+import io
+import tarfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -30,6 +32,26 @@ SLOW: Final = 0.1  # m/s: before and after the car moves, LEAD s are kept
 LEAD: Final = 1.0  # s
 SHORTEST: Final = 5.0  # s of a drive that is kept
 SHIPPED: Final = 90.0  # s: longer drives are left out of what ships, to keep it small
+TABLES: Final = "tables.tar.xz"
+THINNED: Final = 5  # of the rows at 100 Hz every fifth is in the tables, of those at 20 Hz all
+FIRST_COLUMNS: Final = 7  # of the files at 20 Hz: what follows is computed from these
+IN_TABLES: Final = (
+    "81_throttle_ramps/*_15_46_50*.csv",
+    "81_throttle_ramps/*_16_05_28*.csv",
+    "81_throttle_ramps/*_16_09_11*.csv",
+    "81_throttle_ramps/*_16_15_13*.csv",
+    "80_circles_rubbery_floor/*_12_34_30.csv",
+    "80_circles_rubbery_floor/*_12_37_59.csv",
+    "91_free_driving_16_sept_2024/*_10_01_01.csv",
+    "91_free_driving_16_sept_2024/*_10_12_05.csv",
+    "free_driving_steer_rate_testing_16_sept_2024/*.csv",
+    "circles_27_sept_2024_fast_ramp/*.csv",
+    "81_circles_tape_and_tiles/*.csv",
+    "83_16_april_2025_slippery_floor/*-15-56-43.csv",
+    "83_16_april_2025_slippery_floor/*-16-21-24.csv",
+    "83_16_april_2025_slippery_floor/*-17-02-48.csv",
+    "83_9_april_2025_MPCCPP_rosbag/*.csv",
+)
 TWIST: Final = "geometry_msgs/msg/TwistStamped"
 FLOORS: Final = {
     "81_throttle_ramps": "rubbery",
@@ -66,10 +88,38 @@ def main() -> None:
     parser.add_argument("--longest", type=float, default=SHIPPED, help="s; longer drives are not")
     arguments = parser.parse_args()
     try:
+        write_tables(arguments.data, arguments.out / TABLES)
         for drive in drives(arguments.data):
             convert(drive, arguments.out / drive.name, longest=arguments.longest)
     except (NlsidError, OSError) as error:
         raise SystemExit(f"error: {error}") from error
+
+
+def write_tables(data: Path, out: Path) -> None:
+    """Write the thinned files, LICENSE and all, as one archive; DataError if one is absent."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(out, "w:xz", preset=9) as archive:
+        for pattern in ("LICENSE", *IN_TABLES):
+            files = sorted(data.glob(pattern))
+            if not files:
+                raise DataError(f"{data}: no {pattern}")
+            for file in files:
+                content = _thinned(file).encode()
+                entry = tarfile.TarInfo(f"dart/{file.relative_to(data)}")
+                entry.size = len(content)
+                archive.addfile(entry, io.BytesIO(content))
+
+
+def _thinned(file: Path) -> str:
+    text = file.read_text(encoding="utf-8-sig")
+    if file.suffix != ".csv":
+        return text
+    titles, *rows = text.splitlines()
+    if titles.startswith("vicon time"):
+        lines = [",".join(row.split(",")[:FIRST_COLUMNS]) for row in (titles, *rows)]
+    else:
+        lines = [titles, *rows[::THINNED]]
+    return "\n".join(lines) + "\n"
 
 
 def drives(data: Path) -> Iterator[Drive]:

@@ -1,13 +1,15 @@
-"""The page of all benchmarks, from the files that `make benchmarks` writes."""
+"""The page of all benchmarks, and figures in other pages, from what `make benchmarks` writes."""
 
 import ast
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 LONGEST = 48  # characters of one value
 DEPTH = 3  # of keys in keys
+FIGURE = re.compile(r"\{\{(\w+) ([\w.]+) ([\w.]+)\}\}")
 
 
 def page(results: Path, benchmarks: Path) -> str:
@@ -43,6 +45,22 @@ def page(results: Path, benchmarks: Path) -> str:
         lines += [f"`{command}` on {found['machine']}:", "", "| key | value |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in _flat(found["result"], "", DEPTH)]
     return "\n".join([*lines, ""])
+
+
+def filled(text: str, results: Path) -> str:
+    """The page with figures in the place of `{{benchmark key.key format}}`; - where one is missing.
+
+    A benchmark's figures are in results/benchmark.json; format is Python's, `.2f`.
+    """
+
+    def figure(match: re.Match[str]) -> str:
+        path = results / f"{match[1]}.json"
+        value: Any = json.loads(path.read_text())["result"] if path.is_file() else None
+        for key in match[2].split("."):
+            value = value.get(key) if isinstance(value, dict) else None
+        return "-" if value is None else format(value, match[3])
+
+    return FIGURE.sub(figure, text)
 
 
 def _docstring(module: Path) -> tuple[str, str]:

@@ -1,4 +1,4 @@
-"""`ContinuousFunnel`: {x : V(t, x) ≤ 1} with V = |x - x₀(t)|²_{P(t)} / ρ(t), thesis Section 5.2."""
+"""`ContinuousFunnel`: {x : V(t, x) ≤ 1} with V = |x - x₀(t)|²_{P(t)} / ρ(t), thesis Section 6.1."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -29,7 +29,7 @@ RANK_TOLERANCE = 1e-10  # relative singular value below which a regressor repeat
 
 @dataclass(frozen=True)
 class LinearClass:
-    """Linear difference equations of one input and one output. Source: thesis Section 1.2.
+    """Linear difference equations of one input and one output. Source: thesis (4.1).
 
     lags: n of both, 1 to 100 samples. Raises OptionError, which names an option, its value and what
     is allowed, as every model class does.
@@ -150,7 +150,7 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
 def least_squares(regression: Regression) -> DifferenceEquation:
     """Minimise Σ (y(t) - Σ a_k y(t-k) - Σ b_j u(t-j) - c)².
 
-    Source: thesis Section 1.2 (equation error).
+    Source: thesis Section 3.2 (equation error).
     """
     lags = regression.lags
     columns = np.column_stack([regression.Y[:, 1:], regression.Q])

@@ -31,7 +31,7 @@ class LeastSquares:
     """Minimise the sum of squares of the equation error.
 
     Noise in the outputs biases it, and nothing makes the model stable, except for a class that
-    holds stable models only. Source: thesis Section 1.2.
+    holds stable models only. Source: thesis Section 1.1.1.
     """
 
     name: ClassVar[str] = "least_squares"
@@ -106,7 +106,7 @@ class CertifiedRse:
 class Sem:
     """Minimise the simulation error from several starts: the best of the local minima they reach.
 
-    Source: thesis Definition 2.2 and Section 1.2.
+    Source: thesis Definition 2.2 and Section 1.1.1.
     """
 
     name: ClassVar[str] = "sem"

@@ -4,7 +4,7 @@ With Δ = ŷ - ỹ over all rows, G Δ = -ε: the simulation error |Δ|²_W = |L
 robust bound with L = G C, W⁻¹ = CC', instead of a convex K. Its exact sensitivities are
     ∂(L⁻¹ε)/∂θ_i = L⁻¹(ε_i - G_i r),   r = G⁻¹ε = -Δ,
 and p, which enters linearly, is projected out: Gauss-Newton in the left parameters only.
-Nothing makes the minimiser global. Source: thesis Definition 2.2 and Section 1.2.
+Nothing makes the minimiser global. Source: thesis Definition 2.2 and Section 1.1.1.
 """
 
 from collections.abc import Callable

@@ -104,8 +104,10 @@ class CellNetwork:
             raise DataError(f"period {self.period} s is not positive")
 
     def __str__(self) -> str:
+        counts = {"state": len(self.start), "piecewise-linear map": len(self.maps)}
+        states, maps = (f"{n} {what}" + "s" * (n > 1) for what, n in counts.items())
         return (
-            f"cell network: {len(self.start)} states, {len(self.maps)} piecewise-linear maps, "
+            f"cell network: {states}, {maps}, "
             f"started from {self.start_samples} samples, {self.period:g} s a sample"
         )
 

@@ -1,5 +1,6 @@
 """The shipped DART drives: the published numbers, and floors told apart by a proved tube."""
 
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import replay_bag
-from bags.samples import convert_dart, dart
+from bags.samples import convert_dart, dart, dart_tables
 from bags.signals.reader import bag_metadata, read_signals
 from nlsid_core.errors import DataError
 from nlsid_core.progress import silent
@@ -56,6 +57,24 @@ def test_the_shipped_bags_are_what_the_published_tables_convert_to(tmp_path: Pat
     long = next(drive for drive in found.values() if drive.name == "rubbery_20240909_123056")
     assert not convert_dart.convert(long, tmp_path / "long", longest=90.0)
     assert not (tmp_path / "long").exists()
+
+
+def test_the_shipped_tables_are_rows_of_the_published_ones(tmp_path: Path) -> None:
+    assert dart_tables().stat().st_size < 1e6
+    with tarfile.open(dart_tables()) as archive:
+        archive.extractall(tmp_path, filter="data")
+    root = tmp_path / "dart"
+    assert "Copyright (c) 2024 Lorenzo Lyons" in (root / "LICENSE").read_text()
+    tables = sorted(root.glob("*/*.csv"))
+    assert len(tables) == 17
+    for table in tables:
+        assert np.all(np.diff(convert_dart.read(table)["t"]) > 0)
+    if SOURCE.is_dir():
+        published = {SOURCE / table.relative_to(root): table for table in tables}
+        for original, table in published.items():
+            rows = set(original.read_text(encoding="utf-8-sig").splitlines())
+            starts = {",".join(row.split(",")[:7]) for row in rows}
+            assert set(table.read_text().splitlines()) <= rows | starts
 
 
 def test_without_the_tables_nothing_is_converted(tmp_path: Path) -> None:

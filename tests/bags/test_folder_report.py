@@ -1,6 +1,7 @@
 """The page of a design folder says what the kernel decides now, and runs nothing."""
 
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,10 +10,10 @@ from typer.testing import CliRunner
 
 from bags.commands.cli import app
 from bags.designs import documents
-from bags.pictures.folder_report import folder_page
+from bags.pictures.folder_report import BROWSERS, folder_page, print_page
 from bags.samples import f1tenth
 from nlsid_core import kernel
-from nlsid_core.errors import DocumentError
+from nlsid_core.errors import DataError, DocumentError
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "f1tenth.yaml"
 
@@ -85,3 +86,22 @@ def test_a_picture_that_is_none_is_left_out(design: Path) -> None:
 def test_a_folder_without_a_design_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DocumentError, match=r"no proof and no report\.html"):
         folder_page(tmp_path)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="needs Chromium or Chrome")
+def test_the_page_is_printed_as_pdf(design: Path, tmp_path: Path) -> None:
+    page = tmp_path / "design.html"
+    assert "design.pdf" in nlsid("report", design, "--out", page, "--pdf")
+    printed = (tmp_path / "design.pdf").read_bytes()
+    assert printed.startswith(b"%PDF-")
+    assert printed.count(b"/Type /Page\n") >= 2
+    assert 10_000 < len(printed) < 5_000_000
+
+
+def test_without_a_browser_the_pdf_is_refused_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(DataError, match="apt install chromium"):
+        print_page(tmp_path / "design.html", tmp_path / "design.pdf")
+    assert not (tmp_path / "design.pdf").exists()

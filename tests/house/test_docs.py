@@ -1,8 +1,11 @@
 """The map of the house and its glossary are true, and every page leads to them."""
 
+import json
 import re
+from pathlib import Path
 
-from docs.site import linking
+from benchmarks.__main__ import BENCHMARKS
+from docs.site import linking, measured
 from tests.house.sources import ROOT
 
 DOCS = ROOT / "docs"
@@ -36,6 +39,7 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
         for target in re.findall(r"\]\(([\w./-]+\.\w+)[#)]", page.read_text())
         if not (page.parent / target).exists()
         and not target.startswith("run/")  # a block of the page makes it when the site is built
+        and target != "benchmarks.md"  # written then, too
     ]
     assert not broken
 
@@ -44,3 +48,28 @@ def test_what_the_pages_of_theory_name_is_there() -> None:
     pages = sorted(DOCS.glob("theory*.md"))
     assert len(pages) > 2
     assert not {page.name: found for page in pages if (found := linking.unknown(page.read_text()))}
+
+
+def test_figures_of_pages_are_what_the_benchmarks_wrote(tmp_path: Path) -> None:
+    (tmp_path / "satellite.json").write_text(json.dumps({"result": {"n1": {"rho": 11.26}}}))
+    page = "{{satellite n1.rho .1f}} s, {{satellite n1.other d}}, {{lstep n1 d}}"
+    assert measured.filled(page, tmp_path) == "11.3 s, -, -"
+
+
+def test_a_figure_of_a_page_names_a_benchmark_and_a_key_that_its_file_has() -> None:
+    results = ROOT / "benchmarks" / "results"
+    named = [
+        found for page in DOCS.glob("*.md") for found in measured.FIGURE.finditer(page.read_text())
+    ]
+    assert len(named) > 50
+    assert {found[1] for found in named} <= set(BENCHMARKS)
+    empty = [found[0] for found in named if (results / f"{found[1]}.json").is_file()
+             and measured.filled(found[0], results) == "-"]  # fmt: skip
+    assert not empty
+
+
+def test_no_result_names_a_folder_of_the_machine_it_was_measured_on() -> None:
+    commands = [json.loads(path.read_text())["command"]
+                for path in (ROOT / "benchmarks" / "results").glob("*.json")]  # fmt: skip
+    assert commands
+    assert not [word for command in commands for word in command if word.startswith("/")]

@@ -2,7 +2,7 @@
 
 It starts from a funnel that holds at its knots and stops when the volume grows by less than 2.5 %.
 What holds at knots alone proves nothing: the last funnel that can be proved for every t is taken.
-Source: thesis Section 6.3.
+Source: thesis (6.8).
 """
 
 from concurrent.futures import Executor

@@ -1,6 +1,6 @@
 """Time-varying LQR and Lyapunov functions along a nominal motion: Riccati and Lyapunov equations.
 
-Source: thesis Sections 5.2 and 6.1, (6.2).
+Source: thesis Section 6.1, (6.2).
 """
 
 import itertools

@@ -2,7 +2,7 @@
 
 At each end of each interval, in the coordinates z in which the present funnel is |z| ≤ 1, a new
 P_κ = T⁻ᵀ(I + D)T⁻¹ changes c(z) = -Ẇ + μ(1 - W) linearly in D; c - margin = v'Qv with Q ⪰ 0.
-Source: thesis (6.8) and Section 6.3; the linearised-volume objective needs the trust region.
+Source: thesis (6.8); the linearised-volume objective needs the trust region.
 """
 
 from dataclasses import dataclass

@@ -21,7 +21,7 @@ from tests.bags.fleet.storage import IMAGE, drive, web_server
 WANTED = [SPEED, COMMAND]
 
 
-def remote(url: str, patience: float = 5.0) -> RemotePath:
+def remote(url: str, patience: float = 60.0) -> RemotePath:
     path = place(url, patience=patience)
     assert isinstance(path, RemotePath)
     return path

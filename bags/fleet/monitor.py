@@ -1,0 +1,295 @@
+"""Every bag of a fleet held against one design: who left it, when, and is the fleet what it was."""
+
+import hashlib
+import json
+import math
+import pickle
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from scipy.stats import mannwhitneyu
+
+from bags.chain.training import load_held_back, load_training
+from bags.designs import documents
+from bags.designs.design import AnyDesign
+from bags.designs.documents import Proved
+from bags.fleet.bags import robot_of
+from bags.fleet.check import iso
+from bags.fleet.manifest import Manifest
+from bags.fleet.run import ask
+from bags.fleet.workers import Workers
+from bags.monitoring.replay import Definitions, replay_bag
+from bags.signals.reader import bag_origin
+from nlsid_core import files
+from nlsid_core.data.calibration import recording
+from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.progress import Progress, silent
+from nlsid_core.running.comparison import Centre
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
+
+RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
+BINS = 10  # of the histogram, of what the assumption allows
+LEAST = 3  # bags of a month, and calibration trials, that are compared
+UNREAD = "not read"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One bag: its verdict, and the numbers behind it.
+
+    verdict: of `Replay`, or `not read`. reason: why it is not inside. assumption: which one was
+    broken first, in words. spent: the largest part of what is assumed that was used (None: not
+    measured), spent_at: s of the run. margin: the least (None: nothing judged), margin_at: s.
+    start: of the bag and bad_from: of the first bad sample, ISO 8601 in UTC. alarm: of the second
+    alarm. judged, span: s. digest: of the recording.
+    """
+
+    bag: str
+    robot: str
+    verdict: str
+    reason: str = ""
+    assumption: str = ""
+    spent: float | None = None
+    spent_at: float = 0.0
+    margin: float | None = None
+    margin_at: float = 0.0
+    start: str = ""
+    bad_from: str = ""
+    alarm: str = ""
+    judged: float = 0.0
+    span: float = 0.0
+    digest: str = ""
+
+    @property
+    def month(self) -> str:
+        """The month of its start, `2026-11`; empty if unknown."""
+        return self.start[:7]
+
+
+@dataclass(frozen=True, eq=False)
+class JudgeBag:
+    """What `nlsid monitor` says of a bag, in a few numbers. The design was decided at home."""
+
+    proved: Proved[AnyDesign]
+    centre: Centre
+    definitions: Definitions
+
+    @cached_property
+    def asked(self) -> str:
+        """The design and what it is around."""
+        types = sorted((name, found.text) for name, found in self.definitions.items())
+        wiring = hashlib.sha256(pickle.dumps(self.proved.design.wiring)).hexdigest()
+        digest = self.proved.design.digest
+        return f"monitor {version('nlsid')} {digest} {self.centre} {wiring} {types}"
+
+    def __call__(self, bag: Path, name: str) -> bytes:
+        """A Judged, as JSON."""
+        replay = replay_bag(self.proved, bag, centre=self.centre, definitions=self.definitions)
+        stamps = dict(zip(map(id, replay.readings), replay.stamps_ns, strict=True))
+        most, worst, bad = most_spent(replay.judged), replay.worst, replay.first_bad
+        alarm = replay.first_alarm
+        judged = Judged(
+            bag=name,
+            robot=robot_of(name),
+            verdict=replay.verdict,
+            reason=replay.reason,
+            assumption="" if bad is None or bad.status is Status.OUTSIDE else bad.assuming,
+            spent=None if most is None else most.assumption,
+            spent_at=0.0 if most is None else most.t,
+            margin=None if worst is None else max(worst.margin, -1e300),
+            margin_at=0.0 if worst is None else worst.t,
+            start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",
+            bad_from="" if bad is None else iso(stamps[id(bad)]),
+            alarm="" if alarm is None else alarm.alarm,
+            judged=replay.judged_span,
+            span=replay.span,
+            digest=bag_origin(bag)["digest"],
+        )
+        return files.canonical(asdict(judged))
+
+
+def most_spent(readings: Sequence[Reading]) -> Reading | None:
+    """The reading that uses the most of what is assumed; None if none measures it."""
+    measured = [reading for reading in readings if math.isfinite(reading.assumption)]
+    return max(measured, key=lambda reading: reading.assumption, default=None)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Is the newest month what the calibration was? The rank test of Wilcoxon, Mann and Whitney of
+    what was spent, two-sided; a small p speaks against exchangeable ones, a large one for nothing.
+
+    larger: the part of pairs in which the month's bag spends more than the calibration trial.
+    """
+
+    month: str
+    bags: int
+    trials: int
+    p: float
+    larger: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.month}: {self.bags} bags, {self.trials} calibration trials: a bag spends more "
+            f"than a trial in {100 * self.larger:.0f} % of the pairs. Were they exchangeable, they "
+            f"would differ as much with p = {self.p:.2g} (rank test)"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FleetVerdict:
+    """Every bag's row, in order; calibration: what each trial that scaled the design spent."""
+
+    rows: tuple[Judged, ...]
+    calibration: tuple[float, ...]
+    made_of: frozenset[str]  # digests of the recordings that designed or scaled it
+
+    @property
+    def others(self) -> list[Judged]:
+        """The bags of which the assumption was measured and that the design was not made of."""
+        return [r for r in self.rows if r.spent is not None and r.digest not in self.made_of]
+
+    @property
+    def worst(self) -> list[Judged]:
+        """Ten bags that spent the most."""
+        measured = [row for row in self.rows if row.spent is not None]
+        return sorted(measured, key=lambda row: -(row.spent or 0.0))[:10]
+
+    @property
+    def histogram(self) -> list[int]:
+        """How many bags spent 0 to 10 %, ..., 90 to 100 % of what is assumed, and more."""
+        counts = [0] * (BINS + 1)
+        for row in self.rows:
+            if row.spent is not None:
+                counts[min(BINS, math.ceil(max(BINS * row.spent - 1.0, 0.0)))] += 1
+        return counts
+
+    def by(self, key: str) -> dict[str, Counter[str]]:
+        """Verdicts by `robot` or by `day`, those with nothing but inside last."""
+        found: dict[str, Counter[str]] = {}
+        for row in self.rows:
+            group = row.start[:10] if key == "day" else row.robot
+            found.setdefault(group, Counter())[row.verdict] += 1
+        good = Status.INSIDE.value
+        return dict(sorted(found.items(), key=lambda e: (e[1][good] - e[1].total(), e[0])))
+
+    @property
+    def ranks(self) -> list[str]:
+        """What m bags say of the next, if it is exchangeable with them: of two ranks that are fixed
+        before anything is looked at. Source: see `nlsid_core.data.calibration`.
+        """
+        spent = sorted((row.spent or 0.0 for row in self.others), reverse=True)
+        m = len(spent)
+        ranks = [1] if m else []
+        if (rare := math.floor(RARE * (m + 1))) > 1:
+            ranks.append(rare)
+        return [
+            f"the next bag spends more than {_percent(spent[rank - 1])} of what is assumed with "
+            f"probability {rank}/{m + 1} = {_above(rank / (m + 1))} at most, if it is exchangeable "
+            f"with these {m}"
+            for rank in ranks
+        ]
+
+    @property
+    def drift(self) -> Drift | None:
+        """Of the newest month; None if it or the calibration has fewer than LEAST."""
+        month = max((row.month for row in self.others), default="")
+        newest = [row.spent for row in self.others if row.month == month and row.spent is not None]
+        if not month or min(len(newest), len(self.calibration)) < LEAST:
+            return None
+        test = mannwhitneyu(newest, self.calibration, alternative="two-sided")
+        pairs = len(newest) * len(self.calibration)
+        return Drift(
+            month, len(newest), len(self.calibration), float(test.pvalue),
+            float(test.statistic) / pairs,
+        )  # fmt: skip
+
+
+def monitor_fleet(
+    bags: Mapping[str, Path],
+    funnel: Path,
+    proved: Proved[AnyDesign],
+    *,
+    centre: Centre,
+    definitions: Definitions,
+    workers: Workers,
+    manifest: Path | None = None,
+    progress: Progress = silent,
+) -> FleetVerdict:
+    """Each bag as `nlsid monitor` judges it; one that cannot be read or judged is `not read`.
+
+    funnel: the file, beside which the trials of the calibration are looked for.
+    """
+    task = JudgeBag(proved, centre, definitions)
+    with Manifest(manifest) as kept:
+        answers = ask(task, bags, workers, kept, progress=progress)
+    rows = [
+        Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
+        if answer.reason
+        else Judged(**_document(answer.content))
+        for answer in answers
+    ]
+    design: Any = proved.design
+    made_of: set[str] = set()
+    if isinstance(design.funnel, TubeFunnel):
+        for tube in design.funnel.tubes:
+            made_of |= {digest for _, digest in (*tube.designed_on, *tube.measured_on)}
+    return FleetVerdict(tuple(rows), calibration_spent(funnel, design), frozenset(made_of))
+
+
+def calibration_spent(funnel: Path, design: AnyDesign) -> tuple[float, ...]:
+    """What each trial that scaled the design spends of what it assumes; empty if none is there.
+
+    They are found by their digests in training.npz and held_back.npz beside the funnel.
+    """
+    parts: Any = design
+    if not isinstance(parts.funnel, TubeFunnel):
+        return ()
+    wanted = {digest for _, digest in parts.funnel.tubes[0].measured_on}
+    training = funnel.with_name(documents.TRAINING)
+    held_back = load_held_back(
+        funnel.with_name(documents.HELD_BACK), model=files.digest(parts.model.document())
+    )
+    trials: list[Trajectory] = [trial for data in held_back.values() for trial in data]
+    if training.exists():
+        trials += load_training(training, digest=parts.model.training)
+    monitor = Monitor(parts.model, parts.policy, parts.funnel, centre=Centre.COMMAND)
+    own = [trial for trial in trials if recording(trial) in wanted]
+    most = [most_spent(_readings(monitor, trial)) for trial in own]
+    return tuple(reading.assumption for reading in most if reading is not None)
+
+
+def _readings(monitor: Monitor, trial: Trajectory) -> list[Reading]:
+    """What the monitor says of a trial, sample by sample, in a run of its own."""
+    monitor.restart()
+    single = trial.y.shape[1] == trial.u.shape[1] == 1
+    samples = zip(trial.t.tolist(), trial.y, trial.u, strict=True)
+    said = [
+        monitor.update(t, float(y[0]), float(u[0])) if single else monitor.update(t, y, u)
+        for t, y, u in samples
+    ]
+    return [reading for reading in said if reading.status is not Status.UNKNOWN]
+
+
+def _document(content: bytes) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(content)
+    return found
+
+
+def _percent(part: float) -> str:
+    return f"{_above(100.0 * part)} %"
+
+
+def _above(value: float) -> str:
+    """Three digits, rounded up."""
+    if value <= 0.0:
+        return "0"
+    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return f"{math.ceil(value / unit * (1.0 - 1e-12)) * unit:.3g}"

@@ -1,0 +1,353 @@
+"""A fleet of bags behind an S3 server of this machine: how fast it is read, and what is fetched.
+
+python -m benchmarks.fleet [--bags 200] [--kills 4] [--json]
+
+The bags are made of the shipped F1TENTH trials with noise of their own on the speed, and with eight
+more topics, among them a camera: 1.9 MB each, chunks of 768 KiB without compression, as `ros2 bag
+record` writes them. Wanted are speed and command. The server is moto's, in a process of its own on
+the same cores. By hand is what one writes with s3fs, rosbags and Dask: fetch the file, decode the
+two topics, interpolate.
+"""
+
+import argparse
+import hashlib
+import json
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from io import BytesIO
+from itertools import cycle, islice
+from pathlib import Path
+from typing import Any
+
+import boto3
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from bags.chain.config import load_config
+from bags.fleet.bags import named_bags
+from bags.fleet.manifest import Manifest
+from bags.fleet.run import Answer, ask
+from bags.fleet.trials import ReadTrials
+from bags.fleet.workers import Workers
+from bags.recordings.bag import Bag
+from bags.recordings.definitions import standard_definition
+from bags.recordings.message_types import decode, standard_types
+from bags.recordings.remote import place
+from bags.samples import f1tenth
+from bags.signals.expressions import factors
+from bags.signals.reader import bag_origin, read_signals
+
+BUCKET = "fleet"
+CONFIG = Path(__file__).resolve().parents[1] / "config" / "f1tenth.yaml"
+IMAGES, IMAGE_BYTES = 15, 120_000  # of one bag
+OTHERS = 7  # small topics, of ten messages each
+CHUNK = 768 * 2**10
+NOISE = 1e-3  # m/s
+BLOB = "std_msgs/msg/ByteMultiArray"
+SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+
+
+def made_bag(trial: Path, seed: int, compression: CompressionType = CompressionType.NONE) -> bytes:
+    """The trial as one MCAP file, with noise on the speed and with the other topics."""
+    rng = np.random.default_rng(seed)
+    stream = BytesIO()
+    writer = Writer(stream, chunk_size=CHUNK, compression=compression)
+    writer.start(profile="ros2")
+    channels: dict[str, int] = {}
+
+    def add(topic: str, kind: str, at: int, data: bytes) -> None:
+        if topic not in channels:
+            text = standard_definition(kind).text.encode()
+            channels[topic] = writer.register_channel(
+                topic, "cdr", writer.register_schema(kind, "ros2msg", text)
+            )
+        writer.add_message(channels[topic], at, data, at)
+
+    with Bag(trial) as bag:
+        messages = list(bag.messages())
+        types = {topic: bag.types_on(topic) for topic in bag.topics}
+    every = max(1, len(messages) // IMAGES)
+    for k, message in enumerate(messages):
+        data = message.data
+        if message.topic == "/odom":
+            odometry: Any = decode(data, *types["/odom"])
+            linear = odometry.twist.twist.linear
+            linear = replace(linear, x=linear.x + NOISE * rng.standard_normal())
+            twist = replace(odometry.twist.twist, linear=linear)
+            odometry = replace(odometry, twist=replace(odometry.twist, twist=twist))
+            data = bytes(standard_types().serialize_cdr(odometry, message.msgtype))
+        add(message.topic, message.msgtype, message.log_time_ns, data)
+        if k % every == 0:
+            add("/camera", BLOB, message.log_time_ns, b"\0\1\0\0" + rng.bytes(IMAGE_BYTES))
+        if k % (2 * every) == 0:
+            for i in range(OTHERS):
+                add(f"/other_{i}", BLOB, message.log_time_ns, b"\0\1\0\0" + rng.bytes(200))
+    writer.finish()
+    return stream.getvalue()
+
+
+@contextmanager
+def s3_server(folder: Path) -> Iterator[Any]:
+    """moto's server in a process of its own; yields a client, and s3fs finds it too."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    os.environ |= {
+        "AWS_ACCESS_KEY_ID": "benchmark",
+        "AWS_SECRET_ACCESS_KEY": "benchmark",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
+    }
+    with (folder / "server.log").open("w") as log:
+        command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+        server = subprocess.Popen(command, stdout=log, stderr=log)
+    try:
+        for _ in range(600):
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        client = boto3.client("s3")
+        client.create_bucket(Bucket=BUCKET)
+        yield client
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def fill(client: Any, count: int, folder: str, compression: CompressionType) -> int:
+    """Put so many bags below a folder of the bucket; returns their bytes."""
+    size = 0
+    for k, trial in enumerate(islice(cycle(f1tenth()), count)):
+        content = made_bag(trial, k, compression)
+        key = f"{folder}/robot_{k % 10}/drive_{k:05d}.mcap"
+        client.put_object(Bucket=BUCKET, Key=key, Body=content)
+        size += len(content)
+    return size
+
+
+def read(
+    bags: Mapping[str, Path], workers: int, manifest: Path | None = None
+) -> tuple[list[Answer], float]:
+    """The answers, and bags a second between the first of them and the last."""
+    came: list[float] = []
+    with Manifest(manifest) as kept:
+        answers = ask(
+            ReadTrials(load_config(CONFIG)), bags, Workers(workers), kept,
+            progress=lambda *_: came.append(time.monotonic()),
+        )  # fmt: skip
+    refused = [answer for answer in answers if answer.reason]
+    if refused:
+        raise RuntimeError(f"{refused[0].name}: {refused[0].reason}")
+    return answers, (len(came) - 1) / (came[-1] - came[0]) if len(came) > 1 else float("nan")
+
+
+def digest(answers: Sequence[Answer]) -> str:
+    """Of everything that was sent home, in order."""
+    return hashlib.sha256(b"".join(answer.content for answer in answers)).hexdigest()
+
+
+def peak_mb(pattern: str, count: int) -> float:
+    """The most memory of a process that reads so many bags by itself and keeps what they say."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe()
+    reader = context.Process(target=_peak, args=(theirs, pattern, count))
+    reader.start()
+    found: float = mine.recv()
+    reader.join()
+    return found
+
+
+def _peak(pipe: Any, pattern: str, count: int) -> None:
+    bags = dict(islice(named_bags([Path(pattern)]).items(), count))
+    read(bags, 0)
+    pipe.send(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
+def cpu_share(bags: Mapping[str, Path]) -> float:
+    """The part of a task's processor time that is fetching, decompressing and decoding."""
+    config = load_config(CONFIG)
+    task = ReadTrials(config)
+    paths = [str(path) for path in bags.values()]
+    signals = [
+        part
+        for signal in (*config.signals.response, *config.signals.excitation)
+        for part in factors(signal.path)
+    ]
+
+    def reading(path: Path) -> None:
+        read_signals(path, signals)
+        bag_origin(path)
+
+    def spent(work: Callable[[], object]) -> float:
+        started = time.process_time()
+        work()
+        return time.process_time() - started
+
+    reading(place(paths[0]))
+    alone = whole = 0.0
+    for name, text in zip(bags, paths, strict=True):  # in turn, so that both see the same machine
+        alone += spent(lambda: reading(place(text)))  # noqa: B023 - called at once
+        whole += spent(lambda: task(place(text), name))  # noqa: B023 - called at once
+    return alone / whole
+
+
+def by_hand(bags: Mapping[str, Path], workers: int) -> float:
+    """Bags a second of the script that one would write."""
+    from distributed import Client, LocalCluster, as_completed
+
+    with (
+        LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        futures = client.map(_by_hand, [str(path) for path in bags.values()], pure=False)
+        came = []
+        for future in as_completed(futures):
+            assert len(future.result()) == 3
+            came.append(time.monotonic())
+    return (len(came) - 1) / (came[-1] - came[0])
+
+
+def _by_hand(url: str) -> tuple[Any, Any, Any]:
+    import s3fs
+    from rosbags.highlevel import AnyReader
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "drive.mcap"
+        s3fs.S3FileSystem().get(url, str(file))
+        found: dict[str, list[tuple[float, float]]] = {"/odom": [], "/cmd_vel": []}
+        with AnyReader([file]) as reader:
+            wanted = [c for c in reader.connections if c.topic in found]
+            for connection, stamp, data in reader.messages(wanted):
+                message: Any = reader.deserialize(data, connection.msgtype)
+                twist = message.twist.twist if connection.topic == "/odom" else message.twist
+                found[connection.topic].append((stamp / 1e9, twist.linear.x))
+    (t, y), (s, u) = (np.array(found[topic]).T for topic in ("/odom", "/cmd_vel"))
+    grid = np.arange(t[0], t[-1], 0.025)
+    return grid, np.interp(grid, t, y), np.interp(grid, s, u)
+
+
+def killed(pattern: str, wanted: str, rounds: int, folder: Path) -> int:
+    """In how many rounds a run that is killed, client or worker, ends as one that is not."""
+    good = 0
+    for number in range(rounds):
+        manifest = folder / f"killed_{number}.sqlite"
+        command = [sys.executable, "-m", "benchmarks.fleet", "--once", pattern, str(manifest)]
+        run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        limit = time.monotonic() + 60.0
+        while not _rows(manifest) and time.monotonic() < limit:
+            time.sleep(0.02)
+        time.sleep(random.uniform(0.0, 0.5))
+        victims = [run.pid] if number % 2 else _children(run.pid)
+        for victim in victims[-1:]:
+            os.kill(victim, signal.SIGKILL)
+        if number % 2:
+            run.wait()
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            good += done.stdout.strip().endswith(wanted)
+        else:
+            run.wait()
+            answers, _ = read(named_bags([Path(pattern)]), 0, manifest)
+            good += digest(answers) == wanted and all(answer.kept for answer in answers)
+    return good
+
+
+def _children(pid: int) -> list[int]:
+    """Processes that it started and that read bags; the resource tracker is not one."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            command = (entry / "cmdline").read_bytes()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and b"spawn_main" in command:
+            found.append(int(entry.name))
+    return sorted(found)
+
+
+def _rows(manifest: Path) -> int:
+    import sqlite3
+
+    if not manifest.exists():
+        return 0
+    try:
+        with sqlite3.connect(manifest) as rows:
+            return int(rows.execute("select count(*) from bags").fetchone()[0])
+    except sqlite3.OperationalError:
+        return 0
+
+
+def measured(count: int, kills: int) -> dict[str, Any]:
+    """Everything, by the keys of the JSON."""
+    with tempfile.TemporaryDirectory() as name, s3_server(Path(name)) as client:
+        folder = Path(name)
+        size = fill(client, count, "plain", CompressionType.NONE)
+        few = max(10, count // 10)
+        zipped = fill(client, few, "zstd", CompressionType.ZSTD)
+        pattern = f"s3://{BUCKET}/plain/*/drive_*.mcap"
+        bags = named_bags([Path(pattern)])
+        some = dict(islice(bags.items(), few))
+        here, _ = read(bags, 0)
+        rates, same = {}, True
+        for workers in (1, 2):
+            answers, rate = read(bags, workers)
+            rates[str(workers)] = round(rate, 2)
+            same = same and digest(answers) == digest(here)
+        compressed, _ = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0)
+        hand = by_hand(bags, 2)
+        part_of_all = f"s3://{BUCKET}/plain/robot_[0-3]/drive_*.mcap"
+        wanted = digest(read(named_bags([Path(part_of_all)]), 0)[0])
+        good = killed(part_of_all, wanted, kills, folder)
+        peaks = {str(n): round(peak_mb(pattern, n), 1) for n in (few, count)}
+        return {
+            "bags": count,
+            "megabytes": round(size / 1e6, 1),
+            "bags_per_s": rates,
+            "bytes_fetched_share": round(sum(a.fetched for a in here) / size, 4),
+            "bytes_fetched_share_zstd": round(sum(a.fetched for a in compressed) / zipped, 4),
+            "requests_per_bag": round(sum(a.requests for a in here) / count, 2),
+            "bytes_sent_home_per_bag": round(sum(len(a.content) for a in here) / count),
+            "peak_mb": peaks,
+            "bit_equal": same,
+            "resumed_after_kills": f"{good} of {kills}",
+            "cpu_share_in_reading": round(cpu_share(some), 3),
+            "by_hand_bags_per_s": round(hand, 2),
+            "ratio_to_by_hand": round(rates["2"] / hand, 2),
+        }
+
+
+def main() -> None:
+    """Make the fleet, read it, say how that went."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bags", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=4, help="runs that are killed half-way")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--once", nargs=2, metavar=("PATTERN", "MANIFEST"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.once:
+        pattern, manifest = options.once
+        print(digest(read(named_bags([Path(pattern)]), 2, Path(manifest))[0]))
+        return
+    found = measured(options.bags, options.kills)
+    if options.json:
+        print(json.dumps(found))
+        return
+    for key, value in found.items():
+        print(f"{key:28} {value}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from bags.chain.config import load_config
+from bags.chain.steps import design_funnel_files, identify_bags
+from bags.commands.cli import app
+from bags.designs import documents
+from bags.fleet.bags import named_bags
+from bags.fleet.check import check_fleet, write_parquet
+from bags.fleet.monitor import FleetVerdict, Judged, calibration_spent, monitor_fleet
+from bags.fleet.workers import Workers
+from bags.monitoring.replay import replay_bag
+from bags.samples import f1tenth
+from nlsid_core.progress import silent
+from nlsid_core.running.comparison import Centre
+from tests.bags.fleet.storage import drive
+
+CONFIG = Path("config/f1tenth.yaml")
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of F1TENTH's design."""
+    out = tmp_path_factory.mktemp("design")
+    config = load_config(CONFIG)
+    identify_bags(f1tenth(), config, out, progress=silent)
+    design_funnel_files(out / documents.MODEL, config, out)
+    return out / documents.FUNNEL
+
+
+def judged(spent: float, month: str = "2026-01", **other: str) -> Judged:
+    row = Judged(
+        f"bag_{spent}_{month}", "robot", "inside", spent=spent, start=f"{month}-03T00:00:00+00:00"
+    )
+    return replace(row, **other)  # type: ignore[arg-type]
+
+
+def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
+    proved = documents.load_proved(design)
+    bags = {path.name: path for path in f1tenth()[:6]}
+    found = monitor_fleet(
+        bags, design, proved, centre=Centre.COMMAND, definitions={}, workers=Workers()
+    )
+    for row, path in zip(found.rows, bags.values(), strict=True):
+        alone = replay_bag(proved, path, centre=Centre.COMMAND)
+        assert alone.worst is not None
+        assert (row.verdict, row.margin, row.span) == (
+            alone.verdict, alone.worst.margin, alone.span,
+        )  # fmt: skip
+        assert row.spent == max(r.assumption for r in alone.judged)
+        start = datetime.fromtimestamp(alone.stamps_ns[0] // 10**9, UTC)
+        assert row.start == start.isoformat()
+
+
+def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
+    """The level is the square of the factor times the most that a calibration trial spent."""
+    proved = documents.load_proved(design)
+    spent = calibration_spent(design, proved.design)
+    tube = proved.design.funnel.tubes[0]  # type: ignore[union-attr]
+    assert len(spent) == len(tube.measured_on) == 16
+    assert max(spent) == pytest.approx(1.0 / tube.safety_factor**2, rel=1e-3)
+
+
+def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) -> None:
+    proved = documents.load_proved(design)
+    bags = {path.name: path for path in f1tenth()}
+    found = monitor_fleet(
+        bags, design, proved, centre=Centre.COMMAND, definitions={}, workers=Workers()
+    )
+    tests = load_config(CONFIG).split.test
+    assert {row.bag for row in found.others} == set(tests)
+    assert "probability 1/9 = 0.112 at most" in found.ranks[0]
+    assert found.drift is not None
+    assert (found.drift.bags, found.drift.trials, found.drift.month) == (8, 16, "2022-01")
+
+
+def test_ranks_of_a_thousand_bags_say_two_things() -> None:
+    rows = tuple(judged(k / 1000) for k in range(1000))
+    first, second = FleetVerdict(rows, (), frozenset()).ranks
+    assert "more than 99.9 % of what is assumed with probability 1/1001 = 0.001 at most" in first
+    assert "more than 99 % of what is assumed with probability 10/1001 = 0.01 at most" in second
+
+
+def test_drift_is_the_rank_test_of_all_orders() -> None:
+    """p by the definition: how many ways of dealing the ranks are as uneven."""
+    newest, older = [0.9, 0.8, 0.7], (0.1, 0.2, 0.3, 0.4)
+    rows = (*(judged(s, "2026-02") for s in newest), judged(0.99, "2026-01"))
+    drift = FleetVerdict(rows, older, frozenset()).drift
+    every = [*newest, *older]
+    sums = [sum(sorted(every).index(s) for s in dealt) for dealt in permutations(every, 3)]
+    mean, own = sum(sums) / len(sums), sum(sorted(every).index(s) for s in newest)
+    as_uneven = sum(abs(s - mean) >= abs(own - mean) for s in sums) / len(sums)
+    assert drift is not None
+    assert drift.p == pytest.approx(as_uneven)
+    assert drift.larger == 1.0
+    assert "100 % of the pairs" in str(drift)
+    assert FleetVerdict(rows[:2], older, frozenset()).drift is None
+
+
+def test_the_histogram_counts_every_bag_once() -> None:
+    rows = tuple(judged(s) for s in (0.0, 0.05, 0.1, 0.11, 0.95, 1.0, 1.01, 30.0))
+    counts = FleetVerdict(rows, (), frozenset()).histogram
+    assert counts == [3, 1, 0, 0, 0, 0, 0, 0, 0, 2, 2]
+
+
+def test_groups_with_trouble_come_first() -> None:
+    rows = (
+        judged(0.1, robot="a"), judged(0.2, robot="b", verdict="outside"), judged(0.3, robot="b"),
+    )  # fmt: skip
+    assert list(FleetVerdict(rows, (), frozenset()).by("robot")) == ["b", "a"]
+    assert list(FleetVerdict(rows, (), frozenset()).by("day")) == ["2026-01-03"]
+
+
+def test_the_command_says_who_was_outside_and_that_one_was_not_read(
+    design: Path, tmp_path: Path
+) -> None:
+    drive(tmp_path / "fleet" / "robot_1" / "other.mcap", samples=117)
+    (tmp_path / "fleet" / "robot_2").mkdir()
+    (tmp_path / "fleet" / "robot_2" / "cut.mcap").write_bytes(b"no bag")
+    pattern = str(tmp_path / "fleet" / "*" / "*.mcap")
+    table, kept = tmp_path / "rows.parquet", tmp_path / "rows.sqlite"
+    given = ["--funnel", str(design), "--out", str(table), "--manifest", str(kept)]
+    done = CliRunner().invoke(app, ["fleet", "monitor", pattern, *given])
+    assert done.exit_code == 1, done.output
+    assert "robot_2/cut: " in done.output
+    assert "is not an MCAP file" in done.output
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
+    assert set(rows) == {"robot_1/other", "robot_2/cut"}
+    assert rows["robot_1/other"]["verdict"] in ("outside", "assumption violated")
+    assert rows["robot_2/cut"]["verdict"] == "not read"
+    assert kept.exists()
+
+
+def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
+    bags = {path.name: path for path in f1tenth()[:3]}
+    (tmp_path / "cut.mcap").write_bytes(b"no bag")
+    bags |= named_bags([tmp_path / "cut.mcap"])
+    rows = check_fleet(bags, load_config(CONFIG), workers=Workers())
+    assert [row.bag for row in rows] == list(bags)
+    assert rows[-1].verdict == "bad"
+    assert "is not an MCAP file" in rows[-1].trouble
+    assert all(row.findings and row.start.startswith("2022-01-01T00:") for row in rows[:3])
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_parquet(rows, tmp_path / "t.parquet")
+    assert parquet.read_table(tmp_path / "t.parquet").num_rows == 4
+
+
+def test_the_command_check_says_what_is_bad(tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(b"no bag")
+    given = ["fleet", "check", str(tmp_path), "--config", str(CONFIG)]
+    done = CliRunner().invoke(app, given)
+    assert done.exit_code == 1
+    assert "1 bad" in done.output
