@@ -80,6 +80,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "rwse_scaling": Benchmark("rwse_scaling"),
         "satellite": Benchmark("satellite"),
         "tubes": Benchmark("tubes"),
+        "verified": Benchmark("verified"),
         "wiener_hammerstein": Benchmark("wiener_hammerstein", data="wh2009"),
         "wiener_hammerstein_cascade": Benchmark("wiener_hammerstein_cascade", data="wh2009"),
     }

@@ -87,3 +87,20 @@ Definition forgets (m : model) (P : matrix) (rate : num) : Prop :=
   (forall k, step m (d k) (r k) (x k) (w k) (v k) (x (S k)) (y k)) ->
   (forall k, step m (d k) (r k) (z k) (w k) (u k) (z (S k)) (q k)) ->
   forall k, V P (minus (z k) (x k)) <= (val rate ^ 2) ^ k * V P (minus (z O) (x O)).
+
+(* A plan is the simulation under its inputs u_k. Where the policy acts, the observed motion has the
+   input u_k - kappa K (z - x), with its own kappa in [0, 1] at each sample: 0 is the plan's input
+   played, 1 the policy engaged. *)
+Definition stays_near_plan (a b : list num) (b0 c : num) (feedback : list num) (t : tube) : Prop :=
+  forall (u kappa : nat -> R) (x y z e measured : nat -> list R),
+  (forall k, 0 <= kappa k <= 1) ->
+  (forall k, step (Linear a) [val b0 * u k + val c] (map (fun v => val v * u k) b)
+    (x k) [] [] (x (S k)) (y k)) ->
+  (forall k, let applied := u k - kappa k * dot (map val feedback) (minus (z k) (x k)) in
+    exists z' yz, step (Linear a) [val b0 * applied + val c] (map (fun v => val v * applied) b)
+      (z k) [] [] z' yz /\
+    z (S k) = plus z' (image (map (map val) (gain t)) (e k)) /\
+    measured k = plus yz (e k) /\ length (e k) = length yz) ->
+  V (storage t) (minus (z O) (x O)) <= val (inlet t) ->
+  forall k, energy t e (S k) <= val (top t) ->
+  Rabs (hd 0 (measured k) - hd 0 (y k)) <= val (hd (0%Z, xH) (widths t)).

@@ -115,6 +115,7 @@ class Increments:
 
     def __init__(self, claim: Any, proof: Any, folder: Path) -> None:
         self.tubes: list[Any] | None = None
+        self.policy: Any = None
         if claim["kind"] == "stability":
             _only(claim, "kind about rate")
             (self.model,), _ = _bound(claim["about"], folder, "model")
@@ -123,11 +124,17 @@ class Increments:
             self.trees = [proof.get("multipliers")]
         else:
             _only(claim, "kind about")
-            if "policy" in claim["about"]:
-                raise NotCovered("a tube around a policy's plan is not covered")
-            (self.model, funnel), digests = _bound(claim["about"], folder, "model funnel")
-            if funnel["model"] != digests["model"]:
-                raise NotCovered("the funnel names another model")
+            planned = "policy" in claim["about"]
+            roles = "model policy funnel" if planned else "model funnel"
+            (self.model, *plan, funnel), digests = _bound(claim["about"], folder, roles)
+            if any(entry["model"] != digests["model"] for entry in (*plan, funnel)):
+                raise NotCovered("a file names another model")
+            if planned:
+                self.policy = plan[0]
+                if funnel["policy"] != digests["policy"]:
+                    raise NotCovered("the funnel names another policy")
+                if any(tube["L"] != self.policy["L"] for tube in funnel["tubes"]):
+                    raise NotCovered("the observer of a tube is not the policy's")
             _only(proof, "", "multipliers")
             self.tubes = funnel["tubes"]
             self.trees = proof.get("multipliers", [None] * len(self.tubes))
@@ -401,6 +408,16 @@ class Writer:
         Ns = tree["N"] if forms > 1 else [tree["N"]]
         return to.chosen("Leaf", 0, to.listed(self.matrix(zip(*N, strict=True)) for N in Ns))
 
+    def plan(self, problem: "Increments") -> list[str]:
+        """a, b_1 ..., b_0, c of a difference equation, and the policy's feedback."""
+        model = problem.model
+        if model["kind"] != "difference_equation":
+            raise NotCovered(f"a plan of a model of kind {model['kind']} is not covered")
+        direct, *b = model["b"]
+        (feedback,) = problem.policy["K"]
+        rows = self.nums(model["a"]), self.nums(b)
+        return [*rows, self.num(direct), self.num(model["c"]), self.nums(feedback)]
+
     def tube(self, tube: dict[str, Any]) -> str:
         """The numbers of one tube."""
         return self.to.made(
@@ -544,6 +561,13 @@ Theorem near : Forall (stays_near data) tubes.
 Proof. exact (tubes_proved data tubes proofs accepted). Qed.
 Print Assumptions near.
 """
+PLANNED = """\
+Theorem planned : forallb (plan_ok a b b0 feedback) tubes = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem near_plan : Forall (stays_near_plan a b b0 c feedback) tubes.
+Proof. exact (plans_proved a b b0 c feedback tubes planned). Qed.
+Print Assumptions near_plan.
+"""
 STABLE = """\
 Theorem accepted : stability_ok data storage rate proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
@@ -572,7 +596,7 @@ def coq(problem: Funnel | Increments) -> str:
         data, proof = writer.problem(problem), writer.witness(problem)
         to.lines += [f"Definition data : problem := {data}.", f"Definition proof := {proof}."]
         return "\n".join(to.lines) + "\n" + THEOREM
-    to = Coq("Integers Forms Claim Data Tubes Boxes Near")
+    to = Coq("Integers Forms Claim Data Tubes Boxes Near Driven")
     writer = Writer(to)
     to.named("data", writer.model(problem.model))
     if problem.tubes is None:
@@ -582,7 +606,12 @@ def coq(problem: Funnel | Increments) -> str:
         return "\n".join(to.lines) + "\n" + STABLE
     to.named("tubes", to.listed(map(writer.tube, problem.tubes)))
     to.named("proofs", to.listed(trees(writer, problem)))
-    return "\n".join(to.lines) + "\n" + NEAR
+    if problem.policy is None:
+        return "\n".join(to.lines) + "\n" + NEAR
+    names = ("a : list num", "b : list num", "b0 : num", "c : num", "feedback : list num")
+    for name, term in zip(names, writer.plan(problem), strict=True):
+        to.named(name, term)
+    return "\n".join(to.lines) + "\n" + NEAR + PLANNED
 
 
 def trees(writer: Writer, problem: Increments) -> list[str]:
@@ -600,10 +629,13 @@ def words(problem: Funnel | Increments) -> str:
         return f"funnel {writer.problem(problem)}\n{writer.witness(problem)}\n"
     model = writer.model(problem.model)
     if problem.tubes is None:
-        terms = writer.symmetric(problem.P, "P"), writer.num(problem.rate)
-        return "\n".join(["stability", model, *terms, writer.tree(problem.trees[0], 1)])
+        stated = writer.symmetric(problem.P, "P"), writer.num(problem.rate)
+        return "\n".join(["stability", model, *stated, writer.tree(problem.trees[0], 1)])
     tubes = to.listed(map(writer.tube, problem.tubes))
-    return "\n".join(["tube", model, tubes, to.listed(trees(writer, problem))])
+    terms = [model, tubes, to.listed(trees(writer, problem))]
+    if problem.policy is None:
+        return "\n".join(["tube", *terms])
+    return "\n".join(["plan", *terms, *writer.plan(problem)])
 
 
 def asked(checker: Path, problem: Funnel | Increments) -> int:

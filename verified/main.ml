@@ -70,6 +70,11 @@ let () =
   let accepted = match word () with
     | "funnel" -> let d = problem () in decide_funnel d (witness ())
     | "tube" -> let m = model () in let ts = listed tube in decide_tubes m ts (listed tree)
+    | "plan" ->
+      let m = model () in let ts = listed tube in let proofs = listed tree in
+      let a = nums () in let b = nums () in let b0 = num () in let _c = num () in
+      let feedback = nums () in
+      decide_tubes m ts proofs && decide_plans a b b0 feedback ts
     | "stability" ->
       let m = model () in let storage = matrix () in let rate = num () in
       decide_stability m storage rate (tree ())

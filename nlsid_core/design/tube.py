@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 
 import cvxpy
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, solve_discrete_lyapunov
+from scipy.linalg import LinAlgError, block_diag, null_space, solve_discrete_lyapunov
 from scipy.signal import lfilter
 
 from nlsid_core import files
@@ -673,7 +673,9 @@ def _program(
     """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
 
     modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
-    of a linear model only.
+    of a linear model only. Where E is one matrix, M + sym(N [E 0]) ≻ 0 has a solution N just where
+    M ≻ 0 on the null space of [E 0], and N = λ/2 [E 0]' is one (Finsler's lemma): these N are no
+    unknowns of the program.
     """
     n, p = len(modes[0][0]), len(modes[0][1])
     size = m + n + p
@@ -689,8 +691,12 @@ def _program(
         constraints += [R >> ROOM * np.eye(p), *(cp.trace(R @ S) <= 1.0 for S in windows)]
     if not m:
         constraints += [M >> room for M in forms]
+    only = np.hstack([leaves[0][0], np.zeros((m, p))]) if _is_constant(leaves, ray) else None
+    if only is not None:
+        Z = null_space(only)
+        constraints += [Z.T @ M @ Z >> ROOM * np.eye(Z.shape[1]) for M in forms]
     unknown: list[list[Any]] = []
-    for vertices in leaves if m else []:
+    for vertices in leaves if m and only is None else []:
         Ns: list[Any] = []
         for M in forms:
             N: Any
@@ -723,7 +729,26 @@ def _program(
             return None
     R_found = np.eye(1) if p == 1 else np.asarray(R.value)
     found = [[np.asarray(N.value) for N in Ns] for Ns in unknown]
+    if only is not None:
+        found = [[_finsler(np.asarray(M.value), only) for M in forms]]
     return np.asarray(P.value), R_found, np.asarray(tau.value), found
+
+
+def _is_constant(leaves: list[FloatArray], ray: bool) -> bool:
+    """Whether E is one matrix."""
+    return not ray and len(leaves) == 1 and len(leaves[0]) == 1
+
+
+def _finsler(M: FloatArray, E: FloatArray) -> FloatArray:
+    """N = λ/2 E' with M + λE'E ≻ 0, λ the first power of 2 that leaves half of M's room on E's null
+    space.
+    """
+    Z = null_space(E)
+    enough = 0.5 * float(np.linalg.eigvalsh(Z.T @ M @ Z)[0])
+    weight = 1.0
+    while float(np.linalg.eigvalsh(M + weight * E.T @ E)[0]) < enough and weight < LARGEST:
+        weight *= 2.0
+    return 0.5 * weight * E.T
 
 
 def _placed(M: Any, start: int, size: int) -> Any:

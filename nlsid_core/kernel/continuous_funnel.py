@@ -8,15 +8,13 @@ for every x̄: then V = W/ρ falls by margin or more, in 1/s, where V = 1 (thesi
 f is affine in each entry of w, so a vertex of its box each is enough; or, where w only pushes, with
 ẋ = ... + Gw, h |2x̄'Pg| r <= h r (κ(x̄'Pg)² + 1/κ) is added for each w instead, r half its range.
 Where u = clip(ũ), ũ = u₀ - Kx̄, each clipped input is free, low or high; τ_l >= 0 multiplies
-q_l >= 0 of that mode: (high - ũ)(ũ - low), low - ũ, or ũ - high.
-Where the input is held, it is clip(ũ) + δ with |δ_i| <= W_i: every corner of that box is a case as
-every vertex of w is, and every piece of rates has to show, for both signs,
-    h R_i ∓ dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l > 0, so |dũ_i/dt| < R_i in the funnel; W is at least
-the hold times R, and the largest |K_i e| over measurement errors e.
+q_l >= 0 of that mode. Where the input is held, it is clip(ũ) + δ with |δ_i| <= W_i: every corner of
+that box is a case as every vertex of w is, and pieces of rates show that |dũ_i/dt| < R_i.
+Why that is enough: docs/certificate_continuous_funnel.md.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -238,7 +236,7 @@ def _read_hold(
     ):
         raise Rejected("the dynamics are not affine in each input: corners do not bound its hold")
     shaken = [
-        [max(_weighed(gain[i], error) for gain in points) for i in range(field.m)]
+        [max(_product(map(abs, gain[i]), error) for gain in points) for i in range(field.m)]
         for points in policy.K
     ]
     widths: list[list[Fraction]] = []
@@ -255,11 +253,6 @@ def _read_hold(
             ]
         )
     return Hold(period, error, rates, widths)
-
-
-def _weighed(row: Sequence[Fraction], weights: Sequence[Fraction]) -> Fraction:
-    """Σ |row_i| weights_i."""
-    return sum((abs(a) * b for a, b in zip(row, weights, strict=True)), Fraction(0))
 
 
 def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
@@ -284,12 +277,12 @@ def inside(
     """Raise Rejected unless {|x-a|²_A <= rho} lies in {|x-b|²_B <= 1}, by the S-lemma."""
     at_most(0, multiplier, what)
     d = [p - q for p, q in zip(a, b, strict=True)]
-    Bd = [sum((p * q for p, q in zip(row, d, strict=True)), Fraction(0)) for row in B]
+    Bd = [_product(row, d) for row in B]
     rows = [
         [*(multiplier * p / rho - q for p, q in zip(left, right, strict=True)), -e]
         for left, right, e in zip(A, B, Bd, strict=True)
     ]
-    corner = 1 - multiplier - sum(p * q for p, q in zip(d, Bd, strict=True))
+    corner = 1 - multiplier - _product(d, Bd)
     semidefinite([*rows, [*(-e for e in Bd), corner]], what)
 
 
@@ -502,7 +495,7 @@ def _pushed(equation: Terms, j: int, field: Field) -> Fraction:
     return sum((c for e, c in equation if e[1 + field.n + field.m + j]), Fraction(0))
 
 
-def _product(a: Sequence[Fraction], b: Sequence[Fraction]) -> Fraction:
+def _product(a: Iterable[Fraction], b: Iterable[Fraction]) -> Fraction:
     return sum((p * q for p, q in zip(a, b, strict=True)), Fraction(0))
 
 

@@ -2,20 +2,10 @@
 
 With x̄ = xhat - x_k and d_k the observer's correction, x̄⁺ = f̄_k(x̄) + d_k exactly. Sizes are |S_k x̄|.
 For both chains of radii, the tube and the inlet, and at each step: `positive` proves that
-|ξ| <= radius implies |f̄_k(ξ)| <= reach. With the disturbance's form and bound η, then
-    peak      |d| <= η:                reach + η <= next radius, and |x̄| <= radius;
-    response  |r| <= η, r⁺ = A r + d:  ξ = x̄ - r, reach + |f̄(ξ + r) - f̄(ξ) - A r| <= next radius;
-    energy, fading  E <= η², E⁺ = rate E + gain |d|²:  ξ⁺ = f̄(ξ), reach <= next radius, and
-              |f̄(ξ + w) - f̄(ξ)| <= μ|w| with gain μ² <= (gain - 1) rate, so that |x̄ - ξ|² <= E.
-A trapezoidal model's f̄ is any root of its equation h(z, w) = 0 within the stated bound. For the
-form response, ξ has a root at most spread·|r| from that of ξ + r, by Brouwer's theorem: with
-M h = c + B z + C w + N(z, w) and N's stretch μ, the map w -> w - M h(ξ, w) takes that ball into
-itself.
-Coordinates are stated: x̄ = T z, and for an implicit model v̄⁺ = T⁺w. Sizes are |S x̄| before the
-step and |S⁺x̄⁺| after it. A part p_m = Σ c_e z^e of degree m obeys |p_m(z)| <= γ|z|^m, and so does
-the symmetric m-linear map that it comes from, if γ²I - Σ c_e c_e' Π e_i!/m! ⪰ 0. Hence
-    |p(z + w) - p(z)| <= Σ_m γ_m ((|z| + |w|)^m - |z|^m) <= μ|w|.                  (`stretch`)
-Source: docs/certificate_sampled_funnel.md.
+|ξ| <= radius implies |f̄_k(ξ)| <= reach; and the reach, with what the disturbance adds to it in the
+assumption's form, is within the next radius. A trapezoidal model's f̄ is any root of its equation
+h(z, w) = 0 within the stated bound. Coordinates are stated: x̄ = T z, and v̄⁺ = T⁺w.
+Why that is enough: docs/certificate_sampled_funnel.md.
 """
 
 from collections.abc import Sequence

@@ -7,16 +7,11 @@ or it follows a centre e₀ that is a bijection,
     2(E₀y)'(∂h/∂v y) - |E₀y|² >= 0,   E₀ = ∂e₀/∂v                              (Proposition 2.7)
 e₀ being linear with |E₀y|² - m²|y|² >= 0, or strongly monotone itself; each for every v and y.
 
-For two solutions x, x̂ = x - x~ with the same input, in each set a storage falls by δ|x~|² or more a
-sample, so that Σ|x~|² is finite. For every v, x, w, v~, x~ and y (v~ = v - v̂, Δ = y):
-    2.10  2v~'(h - ĥ) + V(x, x~) - V(x⁺, x~⁺) - δ|x~|² >= 0, V(x, x~) >= 0, V(x, 0) = 0
-    2.11  2ν'(∂h/∂v ν + ∂h/∂x Δ) + |Δ|²_M(x) - δ|Δ|² - |[ν; ∂ã/∂x Δ]|²_M(x⁺) >= 0, |y|²_M(x) >= 0
-    2.12  (2x~'(e - ê) - |x~|²_P - δ|x~|²) y₀² + 2y₀ y'(f - f̂) + |y|²_P >= 0, P ≻ 0
-    2.13  2Δ'(∂e/∂x Δ) - |Δ|²_P - δ|Δ|² + 2y'(∂f/∂x Δ) + |y|²_P >= 0, P ≻ 0
-    2.19  Δ'EΔ - δ|Δ|² + 2y'(FΔ) + y'Ey >= 0 for a linear model E x⁺ = F x + …, E = E'
-each on the box of states and inputs, if there is one: then the claim is about solutions that stay
-in it, the unknown v included, which is a next state. In 2.11 a box needs a constant M: then
-straight lines join two states, and stay inside. Source: thesis (2.4)-(2.19).
+For two solutions x, x̂ = x - x~ with the same input, a storage falls by δ|x~|² or more a sample, so
+that Σ|x~|² is finite: one inequality for each set, thesis (2.10)-(2.19), on the box of states and
+inputs, if there is one. Then the claim is about solutions that stay in it, the unknown v included,
+which is a next state; and in 2.11 M has to be constant: then straight lines join two states, and
+stay inside. The inequalities: docs/certificate_stable_set.md.
 """
 
 from fractions import Fraction

@@ -11,6 +11,7 @@ from .files import Node, Rejected
 
 LONGEST = 10**12  # samples of a recording
 MAX_TRIALS = 10**5  # that one assumption was measured on, or one tube designed on
+MEASURED = "measured safety_factor designed_on measured_on"
 DIGEST = re.compile(r"sha256:[0-9a-f]{64}")  # one spelling, so that a recording has one name
 WINDOW = re.compile(r"([0-9]{1,12}):([0-9]{1,12})\]")
 
@@ -22,6 +23,28 @@ class Recorded:
     recording: str
     first: int = 0
     end: int = LONGEST
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The largest value that was measured on trials, and its safety factor."""
+
+    value: Fraction
+    factor: Fraction
+    trials: list[Recorded]
+
+
+def read_measured(parts: dict[str, Node], what: str) -> Measured:
+    """The members of MEASURED; Rejected if what was measured has samples that chose its bound."""
+    measured, factor = parts["measured"].number(), parts["safety_factor"].number()
+    trials = read_trials(parts["measured_on"])
+    if measured < 0 or factor < 1:
+        raise Rejected("measured should be 0 or more, the safety factor 1 or more")
+    if not trials:
+        raise Rejected(f"the {what} was measured on no trial")
+    if shared(trials, read_trials(parts["designed_on"])):
+        raise Rejected(f"a trial that the {what} was designed on cannot measure it")
+    return Measured(measured, factor, trials)
 
 
 def read_trials(trials: Node) -> list[Recorded]:
@@ -74,37 +97,27 @@ def distinct(trials: list[Recorded]) -> int:
     return count
 
 
-def calibration(
-    measured: Fraction, factor: Fraction, trials: list[Recorded], fitted_to: list[Recorded] | None
-) -> str:
-    """On what a level was measured, and what is known of a next trial.
-
-    fitted_to: what made the model; None if it does not say.
-    """
-    count = distinct(trials)
-    kind = "window" if any(trial.end < LONGEST for trial in trials) else "trial"
-    those = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
-    return (
-        f"largest of {those} taken whole, "
-        f"{text.above(measured)}, safety factor {text.below(factor)} in amplitude; "
-        f"{_rank_bound(trials, fitted_to, count)}"
-    )
-
-
-def _rank_bound(trials: list[Recorded], fitted_to: list[Recorded] | None, count: int) -> str:
-    """How often a next trial exceeds the largest of those measured, if that can be said.
+def calibration(measured: Measured, fitted_to: list[Recorded] | None) -> str:
+    """On what a bound was measured, and how often a next trial exceeds it, if that can be said.
 
     The largest of m + 1 exchangeable numbers is the last with probability at most 1/(m + 1). The
     numbers are exchangeable only if the model and the tube were fixed before they were seen.
+    fitted_to: what made the model; None if it does not say.
     """
-    none = "no probability is stated of a next trial, as"
-    if any(trial.end < LONGEST for trial in trials):
-        return f"{none} windows of one recording are hardly exchangeable"
-    if fitted_to is None:
-        return f"{none} the model does not name what it was fitted to"
-    if seen := shared(trials, fitted_to):
-        return f"{none} the model was fitted to {seen} of them"
+    count, cut = distinct(measured.trials), any(t.end < LONGEST for t in measured.trials)
+    kind = "window" if cut else "trial"
+    those = f"{count} distinct {kind}s, each" if count > 1 else f"1 distinct {kind},"
+    worth = "no probability is stated of a next trial, as "
+    if cut:
+        worth += "windows of one recording are hardly exchangeable"
+    elif fitted_to is None:
+        worth += "the model does not name what it was fitted to"
+    elif seen := shared(measured.trials, fitted_to):
+        worth += f"the model was fitted to {seen} of them"
+    else:
+        worth = "a next trial that is exchangeable with them exceeds their largest with probability"
+        worth += f" at most 1/{count + 1}"
     return (
-        "a next trial that is exchangeable with them exceeds their largest with probability at "
-        f"most 1/{count + 1}"
+        f"largest of {those} taken whole, {text.above(measured.value)}, safety factor "
+        f"{text.below(measured.factor)} in amplitude; {worth}"
     )

@@ -1,19 +1,12 @@
 """Claim `tube`: outputs stay near the model's own simulation, or near a policy's plan.
 
 The model runs twice under the same inputs: the simulation x, and the observer x̂ with L e injected
-after each step, e the innovation. With x̄ = x̂ - x and the increment form of the model,
-    E ζ = 0,    x̄⁺ = F ζ + L e,    o = y - y° = H ζ + e,    ζ = (ν, x̄).
-At every vertex E, with multipliers N:
+after each step, e the innovation. x̄ = x̂ - x, x̄⁺ = F ζ + L e, o = y - y° = H ζ + e, ζ = (ν, x̄), and
+at every vertex E of the increment form, with multipliers N:
     diag(0, ρP, R) - [F L]'P[F L] + sym(N [E 0]) ≻ 0,
     diag(0, ρP, R) - τ_j [H_j 1_j]'[H_j 1_j] + sym(N_j [E 0]) ≻ 0.
-With E_{k+1} = ρE_k + e_k'Re_k, E_0 = 0: V(x̄_k) <= ρ^k V(x̄_0) + E_k and τ_j o_j² <= ρV + e'Re, at
-most ρ inlet + level while E <= level. ρ = 1 is a bound on the energy of so many samples. A funnel
-may hold several such tubes, each with its assumption.
-
-A policy's plan is the simulation from its start under its inputs u_k. Where the policy acts, the
-input is û = u_k - κKx̄, 0 <= κ <= 1: one more ν, û - u_k, whose row [1, κK] gives it, so F becomes
-F - κBK and H becomes H - κDK. Both inequalities are concave in κ: κ = 0 and 1 decide all between.
-Source: docs/certificate_tube.md.
+Where a policy acts, F is F - κBK and H is H - κDK, κ in [0, 1], and its ends decide all between.
+Why that is enough: docs/certificate_tube.md.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +18,7 @@ from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
 from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
 from .levels import CommandLevel, formula, read_level
-from .trials import Recorded, calibration, read_trials, shared
+from .trials import MEASURED, Measured, Recorded, calibration, read_measured, read_trials
 
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
@@ -41,9 +34,7 @@ class Assumption:
 
     level: Fraction
     samples: int | None
-    measured: Fraction
-    safety_factor: Fraction
-    measured_on: list[Recorded]
+    measured: Measured
     follows: CommandLevel | None
 
 
@@ -180,8 +171,7 @@ def _read(node: Node, model: Model) -> Tube:
 
 def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assumption:
     """level, assumption and follows of a tube's members."""
-    names = "kind measured safety_factor designed_on measured_on"
-    given = parts["assumption"].members(names, "samples")
+    given = parts["assumption"].members(f"kind {MEASURED}", "samples")
     kind = given["kind"].text()
     if kind not in ("fading", "energy"):
         raise Rejected(f"assumption {kind!r} is unknown; known: fading, energy")
@@ -192,18 +182,10 @@ def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assu
     assumed = Assumption(
         level=parts["level"].number(),
         samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
-        measured=given["measured"].number(),
-        safety_factor=given["safety_factor"].number(),
-        measured_on=read_trials(given["measured_on"]),
+        measured=read_measured(given, "tube"),
         follows=read_level(parts["follows"], inputs, 1) if "follows" in parts else None,
     )
-    if assumed.measured < 0 or assumed.safety_factor < 1:
-        raise Rejected("measured should be 0 or more, the safety factor 1 or more")
-    if not assumed.measured_on:
-        raise Rejected("the assumption was measured on no trial")
-    if shared(assumed.measured_on, read_trials(given["designed_on"])):
-        raise Rejected("a trial that the tube was designed on cannot measure its assumption")
-    least = assumed.safety_factor**2 * assumed.measured
+    least = assumed.measured.factor**2 * assumed.measured.value
     at_most(least, assumed.level, "the level is below safety_factor^2 x measured")
     return assumed
 
@@ -230,18 +212,13 @@ def _response(model: Model, node: Node, fitted_to: list[Recorded] | None) -> lis
     p = len(model.y)
     parts = node.members("half_widths assumption", "follows")
     widths = parts["half_widths"].array(p)
-    given = parts["assumption"].members("measured safety_factor designed_on measured_on")
+    measured = read_measured(parts["assumption"].members(MEASURED), "response")
     follows = read_level(parts["follows"], len(model.u), p) if "follows" in parts else None
-    measured, factor = given["measured"].number(), given["safety_factor"].number()
-    measured_on = read_trials(given["measured_on"])
-    if min(widths) <= 0 or measured < 0 or factor < 1:
-        raise Rejected("a response's half-widths should be positive, its safety factor 1 or more")
-    if not measured_on:
-        raise Rejected("the response was measured on no trial")
-    if shared(measured_on, read_trials(given["designed_on"])):
-        raise Rejected("a trial that the response's level was chosen on cannot measure it")
-    at_most(factor * measured, 1, "the response is below safety_factor x measured")
-    worth = calibration(measured, factor, measured_on, fitted_to)
+    if min(widths) <= 0:
+        raise Rejected("a response's half-widths should be positive")
+    needed = measured.factor * measured.value
+    at_most(needed, 1, "the response is below safety_factor x measured")
+    worth = calibration(measured, fitted_to)
     said = []
     for j, (signal, width) in enumerate(zip(model.y, widths, strict=True)):
         bound = signal.quantity(text.below(width))
@@ -314,11 +291,10 @@ def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int
     if _several(tubes):
         whose = "one state with the observers, one for each tube"
     start = f"after {settling} samples ({span} s) the simulation starts at {whose}"
-    inlets = " and ".join(text.below(tube.inlet) for tube in tubes)
     if any(tube.inlet for tube in tubes):
-        near = f"where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
-        return f"{start}, or {near}" + (", as the plan does" if policy else "")
-    return start + (", as the plan does" if policy else "")
+        inlets = " and ".join(text.below(tube.inlet) for tube in tubes)
+        start += f", or where V = xbar'P xbar <= {inlets}, xbar the observer's state minus its own"
+    return start + ", as the plan does" * bool(policy)
 
 
 def _inside(model: Model, box: Node) -> str:
@@ -346,6 +322,6 @@ def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, o
         bound = f"E <= {level} g after every sample, {growth}, g = {g}"
     if assumed.samples is not None:
         bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
-    worth = calibration(assumed.measured, assumed.safety_factor, assumed.measured_on, fitted_to)
+    worth = calibration(assumed.measured, fitted_to)
     whose = " of its own observer" if own else ""
     return f"innovation energy{whose}: {bound} ({worth})"

@@ -3,15 +3,17 @@
 The kernel's `positive` takes monomials v, a power of two for each (V = diag 2^columns), and factors
 R_j of whole numbers, and asks that what is left of the polynomial,
     r = c - Σ_j B_j(s) |R_j V v|² / 4^unit,
-is diagonally dominant in V v. So the Gram matrix is scaled to a diagonal near 1, half of its least
-eigenvalue is left to r, and the Cholesky factor of the rest is rounded: log2(order/δ) + 4 bits keep
-the rounding below δ. Where v_i² = v_a v_b, the rounding of the pair counts on the diagonal of v_i:
-there a column is raised to the mean of the pair's. Nothing here is trusted.
+is diagonally dominant in V v. So the Gram matrix is scaled to a diagonal near 1, most of its least
+eigenvalue is left to r, and the Cholesky factor of the rest is rounded to the fewest bits that
+change no row of the Gram matrix by more than a part of that. Where v_i² = v_a v_b, the rounding of
+the pair counts on the diagonal of v_i: there a column is raised to the mean of the pair's. Nothing
+here is trusted.
 Source: docs/certificate.md.
 """
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from itertools import combinations
 from math import ceil, lcm, log2
 
 import numpy as np
@@ -22,8 +24,9 @@ from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial.documents import write_whole
 
-ROOM = 0.5  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
-SPARE_BITS = 4  # beyond log2(order/δ): the rounding of a row's products then stays below δ
+ROOM = 0.7  # of the least eigenvalue of the scaled Gram matrix: what is left to the remainder
+ROUNDING = 0.3  # of that room: what rounding may take of a diagonal entry
+SPARE_BITS = 8  # beyond what is enough where no product of v is a square of another
 MULTIPLIER_BITS = 48  # of a multiplier's factor: any rounding of it is a sum of squares
 SMALLEST = 2.0**-200  # of a diagonal entry, relative to the largest: below it a column is not used
 Residual = Mapping[tuple[int, ...], ArrayLike]
@@ -54,15 +57,20 @@ def witness(
     room = ROOM * least
     columns = _raised(monomials, _columns(Q))
     small = diagonal * np.exp2(-columns.astype(np.float64))
-    unit = max(0, ceil(log2(len(monomials) / (room.min() * small.min() ** 2))) + SPARE_BITS)
     try:
-        roots = [
+        roots = np.array([
             cholesky(part - delta * np.eye(len(part))) * small
             for part, delta in zip(S, room, strict=True)
-        ]
+        ])  # fmt: skip
     except LinAlgError as error:
         raise Infeasible("a Gram matrix is positive definite to rounding only") from error
-    return _written(monomials, columns, unit, roots)
+    allowed = ROUNDING * room[:, None] * small**2
+    enough = ceil(log2(len(monomials) ** 1.5 / allowed.min()))  # |E|₁ ≤ k^1.5 2^-unit
+    enough = max(0, enough + SPARE_BITS)
+    places = _charged(monomials, columns)
+    kept = (u for u in range(enough) if (_lost(roots, u, places) <= allowed).all())
+    unit = next(kept, enough)
+    return _written(monomials, columns, unit, list(roots))
 
 
 def multiplier(
@@ -167,6 +175,30 @@ def _absorbed(monomials: IntArray, Q: FloatArray, residual: Residual) -> FloatAr
         for i, j in places[tuple(key)]:
             Q[:, i, j] += control / len(places[tuple(key)])
     return Q
+
+
+def _lost(roots: FloatArray, unit: int, places: tuple[IntArray, IntArray]) -> FloatArray:
+    """(J+1, k) what each diagonal entry of r loses where factors are whole numbers over 2^unit."""
+    whole = np.ldexp(np.round(np.ldexp(roots, unit)), -unit)
+    change = np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole
+    at = np.zeros_like(change)
+    for total, part in zip(at, change, strict=True):
+        np.add.at(total, places, part)
+    return np.asarray(np.abs(at).sum(axis=1) + np.abs(at).sum(axis=2)) / 2
+
+
+def _charged(monomials: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
+    """(k, k) each: where the kernel counts v_a v_b, at a square's own place or that of one pair."""
+    k, shifts = len(monomials), columns.tolist()
+    keys = [[tuple(key) for key in row] for row in (monomials[:, None] + monomials[None]).tolist()]
+    home: dict[tuple[int, ...], tuple[int, int]] = {}
+    for i, j in combinations(range(k), 2):
+        a, b = home.setdefault(keys[i][j], (i, j))
+        if shifts[i] + shifts[j] > shifts[a] + shifts[b]:
+            home[keys[i][j]] = (i, j)
+    home |= {keys[i][i]: (i, i) for i in range(k)}
+    places = np.array([[home[key] for key in row] for row in keys])
+    return places[..., 0], places[..., 1]
 
 
 def _columns(Q: FloatArray) -> IntArray:

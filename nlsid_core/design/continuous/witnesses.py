@@ -22,8 +22,8 @@ from nlsid_core.polynomial.maps import monomials
 from nlsid_core.sos.witness import multiplier, witness
 
 SHARE = 0.5  # of what the constant can lose that becomes the margin
-FIT = 0.2  # of the least eigenvalue of the scaled Gram matrices: how well factors have to fit
-MU_BITS, TAU_BITS = 32, 24  # of multipliers, relative to the largest coefficient on the funnel
+FIT = 0.4  # of the least eigenvalue of the scaled Gram matrices: how well factors have to fit
+MU_BITS, TAU_BITS = 24, 16  # of multipliers, relative to the largest coefficient on the funnel
 MARGIN_BITS = 10  # of the margin that is stated
 MAX_DEGREE = 23  # of the factors in s: what the kernel takes
 

@@ -216,6 +216,8 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
 
 def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: Path) -> None:
     """Busy for ever, vanished after it was listed, busy for a while, of another type: each once."""
+    pytest.importorskip("fsspec")
+    pytest.importorskip("aiohttp")
     for k in range(4):
         drive(tmp_path / "web" / f"drive_{k}.mcap", seed=k, samples=120)
     with (tmp_path / "web" / "drive_4.mcap").open("wb") as stream:

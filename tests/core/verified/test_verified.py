@@ -12,9 +12,15 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from bags.chain.config import load_config
+from bags.chain.shipped import config_file
+from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
+from bags.designs import documents
+from bags.samples import f1tenth
 from nlsid_core import proofs, second
 from nlsid_core.errors import CertificateRejected
+from nlsid_core.progress import silent
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
 
 Json = dict[str, Any]
@@ -120,7 +126,7 @@ def test_both_kernels_refuse_a_forgery(
 @pytest.mark.coq
 @pytest.mark.parametrize(
     "name",
-    ["tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
+    ["tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
      "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
      "stability/moving_lags", "stability/split", "stability/two_outputs"],
 )  # fmt: skip
@@ -171,6 +177,12 @@ def multipliers_gone(files: Files) -> None:
     N[:] = [[[0.0 for _ in row] for row in matrix] for matrix in N]
 
 
+def feedback_stronger(files: Files) -> None:
+    """Ten times: the tube was made for less."""
+    K = files["policy.json"]["K"]
+    K[:] = [[10 * gain for gain in row] for row in K]
+
+
 @pytest.fixture(scope="module")
 def program(build: Path) -> Path:
     """The extracted checker."""
@@ -187,16 +199,18 @@ def program(build: Path) -> Path:
 @pytest.mark.parametrize(
     "forge",
     [fades_faster, narrower, tau_larger, storage_of_another_size, indefinite,
-     outputs_counted_twice, multipliers_gone],
+     outputs_counted_twice, multipliers_gone, feedback_stronger],
 )  # fmt: skip
 def test_both_kernels_refuse_a_forged_tube(
     forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
 ) -> None:
-    folder = CORPUS / "tube" / "lasting_two_outputs"
+    folder = CORPUS / "tube" / ("engaged" if forge is feedback_stronger else "lasting_two_outputs")
     files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
     forge(files)
     digests: dict[str, str] = {}
-    for name in ("model.json", "funnel.json", "claim.proof.json"):
+    for name in ("model.json", "policy.json", "funnel.json", "claim.proof.json"):
+        if name not in files:
+            continue
         content = json.dumps(rebound(files[name], digests))
         digests[name] = "sha256:" + hashlib.sha256(content.encode()).hexdigest()
         (tmp_path / name).write_text(content)
@@ -211,11 +225,24 @@ def test_both_kernels_refuse_a_forged_tube(
 
 def rebound(document: Json, digests: dict[str, str]) -> Json:
     """With the digests of the files that it names."""
-    if "model" in document and document["format"] == "nlsid/funnel":
-        document["model"] = digests["model.json"]
+    for role in ("model", "policy"):
+        if role in document:
+            document[role] = digests[f"{role}.json"]
     for entry in document.get("claim", {}).get("about", {}).values():
         entry["digest"] = digests[entry["file"]]
     return document
+
+
+@needs_coq
+@pytest.mark.coq
+def test_coq_proves_the_car_that_ships(build: Path, tmp_path: Path) -> None:
+    config = load_config(config_file("f1tenth.yaml"))
+    identify_bags(f1tenth(), config, tmp_path, progress=silent)
+    design_funnel_files(tmp_path / documents.MODEL, config, tmp_path)
+    for name in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
+        done = accepted(tmp_path / name, build)
+        assert done.returncode == 0, done.stderr
+    assert "Theorem near_plan" in (build / "theorem.v").read_text()
 
 
 @needs_coq

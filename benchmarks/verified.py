@@ -1,0 +1,119 @@
+"""The second kernel (verified/): proofs of the examples in Coq and extracted; mutants of both.
+
+    python -m benchmarks.verified [--json] [--mutations N] [--no-designs]
+
+Needs Debian's coq, libcoq-bignums, ocaml-findlib and libzarith-ocaml-dev. Seconds are processor
+seconds: of make with one theorem, the theory being built, and of the extracted checker with the
+generator. A mutant is that of tests/core/kernel; only those count of which both kernels have a
+verdict. A disagreement is listed by what the first kernel said of it.
+"""
+
+import argparse
+import json
+import re
+import resource
+import subprocess
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.kernel import shipped
+from benchmarks.machine import describe
+from nlsid_core import files, kernel, second
+from tests.core.kernel import mutations
+
+ROOT = Path(__file__).resolve().parents[1]
+VERIFIED = ROOT / "verified"
+MUTATIONS = 10_000
+SEED = 4
+KINDS = ("continuous_funnel", "tube", "stability")
+
+
+def main() -> None:
+    """Print the figures; the last line is one JSON object with --json."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--mutations", type=int, default=MUTATIONS)
+    parser.add_argument("--no-designs", action="store_true", help="mutations only")
+    arguments = parser.parse_args()
+    theory = [path.read_text().splitlines() for path in VERIFIED.glob("*.v")]
+    result: dict[str, Any] = {"lines": sum(bool(line.strip()) for text in theory for line in text)}
+    with tempfile.TemporaryDirectory() as folder:
+        build = Path(folder) / "build"
+        make = ["make", "-s", "-C", str(VERIFIED), f"BUILD={build}"]
+        for targets in ([], ["second"]):
+            subprocess.run([*make, *targets], check=True, stdout=subprocess.DEVNULL)
+        program = build / "nlsid-second"
+        if not arguments.no_designs:
+            result |= decided(Path(folder), make, program)
+        result |= mutated(arguments.mutations, Path(folder) / "mutant", program)
+    print(describe())
+    for key, value in result.items():
+        print(f"{key:24}{value!s}")
+    if arguments.json:
+        print(json.dumps(result))
+
+
+def decided(folder: Path, make: list[str], program: Path) -> dict[str, Any]:
+    """`accepted`, or why not, and the seconds in Coq and extracted, for every shipped proof."""
+    accepted: dict[str, str] = {}
+    coq: dict[str, float] = {}
+    extracted: dict[str, float] = {}
+    for name, paths in shipped(folder):
+        for path in paths:
+            label = f"{name}/{path.name}"
+            before = _children()
+            opinion = second.opinion(path, program)
+            accepted[label] = opinion.reason or opinion.verdict
+            if opinion.verdict != "accepted":
+                continue
+            extracted[label] = _children() - before
+            before = _children()
+            done = subprocess.run([*make, f"FILE={path}"], check=False, capture_output=True)
+            accepted[label] = "accepted" if done.returncode == 0 else "refused by Coq"
+            coq[label] = _children() - before
+    return {"accepted": accepted, "coq_s": coq, "extracted_s": extracted}
+
+
+def mutated(count: int, folder: Path, program: Path) -> dict[str, Any]:
+    """How often the kernels have both a verdict of a mutant, and where they differ."""
+    folder.mkdir()
+    rng = np.random.default_rng(SEED)
+    cases = [case for case in mutations.corpus() if case.kind in KINDS]
+    both: Counter[str] = Counter()
+    differ: Counter[str] = Counter()
+    for k in range(count):
+        forged = mutations.mutant(cases[k % len(cases)], rng)
+        try:
+            for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
+                (folder / name).write_bytes(files.encode(document))
+        except (ValueError, TypeError):  # it cannot even be written
+            continue
+        said = "proved"
+        try:
+            kernel.check(folder / mutations.PROOF)
+        except kernel.Rejected as refusal:
+            said = str(refusal)
+        verdict = second.opinion(folder / mutations.PROOF, program).verdict
+        if verdict in ("accepted", "refused"):
+            both[verdict] += 1
+            if (verdict == "accepted") != (said == "proved"):
+                differ[f"{verdict}, but {re.sub(r'[0-9.e+-]*[0-9]', '#', said)[:90]}"] += 1
+    return {
+        "mutations": count,
+        "both": dict(both),
+        "disagreements": sum(differ.values()),
+        "differ": dict(differ.most_common()),
+    }
+
+
+def _children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+if __name__ == "__main__":
+    main()
