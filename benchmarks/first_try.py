@@ -176,7 +176,7 @@ def quadrotor_16() -> Written:
 
     start, end, hover = np.zeros(16), np.zeros(16), 9.81 / 4
     end[:3], start[12:], end[12:] = [1, 1, 0.5], hover, hover
-    motion = plan_motion(rate, start=start, end=end, seconds=3, u=[hover] * 4, knots=25)
+    motion = plan_motion(rate, start=start, end=end, seconds=3, u=[hover] * 4)
     goal = [0.2] * 3 + [0.4] * 3 + [0.2] * 3 + [1.0] * 3 + [1.0] * 4
     return rate, design(ContinuousTracking(rate, motion, goal=goal))
 

@@ -673,9 +673,9 @@ def _program(
     """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
 
     modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
-    of a linear model only. Where E is one matrix, M + sym(N [E 0]) ≻ 0 has a solution N just where
-    M ≻ 0 on the null space of [E 0], and N = λ/2 [E 0]' is one (Finsler's lemma): these N are no
-    unknowns of the program.
+    of a linear model only. Of several outputs, where E is one matrix, M + sym(N [E 0]) ≻ 0 has a
+    solution N just where M ≻ 0 on the null space of [E 0], and N = λ/2 [E 0]' is one (Finsler's
+    lemma): these N are no unknowns of the program.
     """
     n, p = len(modes[0][0]), len(modes[0][1])
     size = m + n + p
@@ -691,7 +691,8 @@ def _program(
         constraints += [R >> ROOM * np.eye(p), *(cp.trace(R @ S) <= 1.0 for S in windows)]
     if not m:
         constraints += [M >> room for M in forms]
-    only = np.hstack([leaves[0][0], np.zeros((m, p))]) if _is_constant(leaves, ray) else None
+    constant = p > 1 and not ray and len(leaves) == 1 and len(leaves[0]) == 1
+    only = np.hstack([leaves[0][0], np.zeros((m, p))]) if constant else None
     if only is not None:
         Z = null_space(only)
         constraints += [Z.T @ M @ Z >> ROOM * np.eye(Z.shape[1]) for M in forms]
@@ -732,11 +733,6 @@ def _program(
     if only is not None:
         found = [[_finsler(np.asarray(M.value), only) for M in forms]]
     return np.asarray(P.value), R_found, np.asarray(tau.value), found
-
-
-def _is_constant(leaves: list[FloatArray], ray: bool) -> bool:
-    """Whether E is one matrix."""
-    return not ray and len(leaves) == 1 and len(leaves[0]) == 1
 
 
 def _finsler(M: FloatArray, E: FloatArray) -> FloatArray:

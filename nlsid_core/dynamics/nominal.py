@@ -38,11 +38,19 @@ class Nominal:
 
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
         """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""
+        when, gaps = self._sampled(field)
+        j, i = np.unravel_index(int(gaps.argmax()), gaps.shape)
+        return float(gaps[j, i]), float(when[j]), int(i)
+
+    def gaps(self, field: VectorField | Rates) -> FloatArray:
+        """(K-1,) the largest of those within each interval."""
+        gaps = self._sampled(field)[1][:-1]
+        return np.asarray(gaps.reshape(len(self.t) - 1, -1).max(axis=1))
+
+    def _sampled(self, field: VectorField | Rates) -> tuple[FloatArray, FloatArray]:
+        """(S,) times and (S, n) |f(t, x₀, u₀) - ẋ₀| there."""
+        share = np.arange(SAMPLES) / SAMPLES
+        when = np.append((self.t[:-1, None] + np.diff(self.t)[:, None] * share).ravel(), self.t[-1])
         rate = self.x.derivative()
-        worst = (0.0, float(self.t[0]), 0)
-        for k, (start, end) in enumerate(zip(self.t[:-1], self.t[1:], strict=True)):
-            for t in np.linspace(start, end, SAMPLES, endpoint=k == len(self.t) - 2):
-                gap = np.abs(field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t))
-                if gap.max() > worst[0]:
-                    worst = (float(gap.max()), float(t), int(gap.argmax()))
-        return worst
+        gaps = [field(t, self.x(t)[None], self.u(t)[None])[0] - rate(t) for t in when.tolist()]
+        return when, np.abs(gaps)

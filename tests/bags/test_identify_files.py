@@ -23,6 +23,7 @@ from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.identification import METHODS
 from nlsid_core.models import (
     BlockCascade,
+    CellNetwork,
     DifferenceEquation,
     ImplicitModel,
     MonotoneEquation,
@@ -53,10 +54,11 @@ CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
     "monotone": ({"model": "monotone", "lags": 2, "delays": [0, 1]}, MonotoneEquation),
     "implicit": ({"model": "implicit", "lags": 2, "delays": [0, 1]}, ImplicitModel),
     "linear_states": ({"model": "linear_states"}, ImplicitModel),
+    "cells": ({"model": "cells", "cells": 2, "intervals": 4}, CellNetwork),
 }  # fmt: skip
 COEFFICIENTS = {
     "linear": "a", "state_affine": "coefficients", "block_cascade": "a1", "monotone": "a",
-    "implicit": "coefficients", "linear_states": "coefficients",
+    "implicit": "coefficients", "linear_states": "coefficients", "cells": "next",
 }  # fmt: skip
 STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
 REASONS = {"rate": "the decrease of V", "delta": "inequality stable: not positive"}

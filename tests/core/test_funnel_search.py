@@ -81,7 +81,7 @@ def test_what_holds_at_samples_is_left_in_between_and_cannot_be_made_proved(
 
 
 def test_more_samples_see_more_and_agree_with_the_proof_where_it_is_smooth() -> None:
-    with pytest.raises(Infeasible, match=r"no rho at t = 1\.5 s"):
+    with pytest.raises(Infeasible, match=r"no funnel at t = 1\.5 s"):
         sample_funnel(*pulsed(), goal=np.eye(1), Q=np.zeros((1, 1)), samples=3)
     sampled = sample_funnel(*hanging(), goal=GOAL)
     proved = design_funnel(*hanging(), goal=GOAL)

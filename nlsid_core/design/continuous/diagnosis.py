@@ -13,12 +13,14 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.errors import SolverError
 
+NOISE = 1e-6  # of the linear part: less is rounding
 CLOSE = 1e-4  # of the boundary's size: there differences of rates are linear
-TERMS = ("remainder", "disturbance", "saturation", "curvature", "motion")
+TERMS = ("remainder", "disturbance", "saturation", "hold", "curvature", "motion")
 NAMES = {
     "remainder": "what the Taylor cubics leave out",
     "disturbance": "the disturbance w",
     "saturation": "the inputs' limits",
+    "hold": "an input that is held, and computed from a measurement,",
     "curvature": "the curvature of the dynamics",
     "motion": "the motion's own error, f(t, x0, u0) - dx0/dt,",
 }
@@ -28,6 +30,7 @@ ADVICE = {
     "disturbance": "take a larger goal, feedback that acts faster (a smaller R), or narrower "
     "bounds of w: a smaller goal makes it worse",
     "saturation": "take a motion that leaves the inputs more room, wider limits, or a smaller goal",
+    "hold": "take a shorter hold, smaller measurement errors, or a larger goal",
     "curvature": "take a smaller goal, a slower motion, or other Q and R",
     "motion": "give a motion with more knots, or one that obeys the dynamics more exactly",
     "linear": "the linear closed loop itself lets V grow there: take other Q and R, a policy that "
@@ -50,15 +53,15 @@ class Diagnosis:
     @property
     def dominant(self) -> str:
         """The term to act on."""
-        if self.linear <= 0:
-            return "linear"
-        return max(TERMS, key=lambda name: self.taken[name])
+        largest = max(TERMS, key=lambda name: self.taken[name])
+        return "linear" if self.taken[largest] <= -self.linear else largest
 
     def __str__(self) -> str:
         total = sum(part for part in self.taken.values() if part > 0) or 1.0
         shares = sorted(((p, name) for name, p in self.taken.items() if p > 0), reverse=True)
+        least = max(0.01 * total, NOISE * abs(self.linear))
         taking = "; ".join(f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
-                           for p, n in shares if p >= 0.01 * total)  # fmt: skip
+                           for p, n in shares if p >= least)  # fmt: skip
         sizes = ", ".join(f"{width:.3g}" for width in self.widths)
         cause = "that" if self.dominant == "linear" else NAMES[self.dominant].rstrip(",")
         return (
@@ -68,10 +71,10 @@ class Diagnosis:
         )
 
 
-def diagnosed(steps: LSteps, sections: Sequence[Section], rhos: Sequence[float]) -> Diagnosis:
-    """The terms at the one of these instants, with these ρ, where least is left. ρ is linear."""
-    h = abs(sections[-1].t - sections[0].t) or 1.0
-    growth = (rhos[-1] - rhos[0]) / h
+def diagnosed(
+    steps: LSteps, sections: Sequence[Section], rhos: Sequence[float], growth: float
+) -> Diagnosis:
+    """The terms at the one of these instants, with these ρ and ρ̇ = growth, where least is left."""
     worst: tuple[float, Section, float, int, FloatArray] | None = None
     for section, rho in zip(sections, rhos, strict=True):
         try:
@@ -87,7 +90,7 @@ def diagnosed(steps: LSteps, sections: Sequence[Section], rhos: Sequence[float])
         worst = (0.0, sections[0], rhos[0], 0, y)
     _, section, rho, case, y = worst
     linear, parts = _terms(steps, section, rho, case)
-    taken = {name: -float(part @ y) for name, part in parts.items()}
+    taken = dict.fromkeys(TERMS, 0.0) | {name: -float(p @ y) for name, p in parts.items()}
     widths = np.sqrt(rho * np.diag(np.linalg.inv(section.P)))
     return Diagnosis(
         section.t, float(linear @ y) + growth / rho, taken, tuple(float(w) for w in widths)
@@ -133,5 +136,6 @@ def _terms(
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning
     rest = steps.values(section, rho, case) - linear - sum(parts.values())
-    parts["saturation"] = np.asarray(rest) if len(steps.limits) else np.zeros(len(x_bar))
+    cause = "saturation" if len(steps.limits) else "hold" if steps.widths is not None else "motion"
+    parts[cause] = parts.get(cause, 0.0) + np.asarray(rest)
     return linear, parts

@@ -25,6 +25,10 @@ STEP = 1.3  # of ρ, while the largest is bracketed
 FALL = 0.98  # of ρ, squared at each further try
 MAX_TRIES = 10  # of exact L-steps a knot
 BACK, MAX_BACK = 0.8, 40  # of ρ, where the interval before cannot take it; how often
+BETWEEN = np.linspace(
+    0.125, 0.875, 7
+)  # of an interval, where bounds are looked at, no program solved
+STEEP = 0.01  # of (Δρ/ρ)² over the interval's length: left where 1/ρ is far from linear in time
 LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
 
 
@@ -147,7 +151,8 @@ class _Interval:
         """What both ends leave of the margin, in 1/s, for φ there."""
         h = self.pair[1].t - self.pair[0].t
         growth = (self.after - rho) / h
-        return min(at_start + growth / rho, at_end + growth / self.after) - self.margin
+        steep = STEEP * h * (growth / min(rho, self.after)) ** 2
+        return min(at_start + growth / rho, at_end + growth / self.after) - self.margin - steep
 
     def predicted(self, rho: float, known: Ends) -> float:
         """An upper bound of the slack at ρ; no program solved. -inf if nothing can be expanded."""
@@ -168,6 +173,17 @@ class _Interval:
         left = self.slack(rho, min(s.m for s in at_start), min(s.m for s in at_end))
         return left, Ends(at_start, at_end)
 
+    def between(self, rho: float, known: Ends) -> float:
+        """An upper bound of what is left within the interval, from the duals at its ends."""
+        h, least = self.pair[1].t - self.pair[0].t, np.inf
+        for s in BETWEEN.tolist():
+            section = section_at(self.steps, self.policy, self.P, self.k, s)
+            here = (1 - s) * rho + s * self.after
+            duals = known.start if s < 0.5 else known.end
+            phi = self.steps.predicted(section, here, duals, saturated=False)
+            least = min(least, phi + (self.after - rho) / h / here)
+        return least
+
     def largest(self, ratio: float, known: Ends | None, cap: float) -> tuple[float, Ends]:
         """The largest ρ ≤ cap at the start, nearly, and its L-steps.
 
@@ -183,7 +199,7 @@ class _Interval:
                 rho, most = rho / 2, rho / 2
                 continue
             left, known = self.solved(rho, known)
-            if left >= -ACCEPT * self.margin:
+            if left >= -ACCEPT * self.margin and self.between(rho, known) > ACCEPT * self.margin:
                 return rho, known
             most, fall = rho * fall, fall * fall
             rho = most
@@ -218,4 +234,5 @@ class _Interval:
         values = [-np.inf if known is None else self.predicted(r, known) for r in levels.tolist()]
         rho = float(levels[int(np.argmax(values))])
         self.expand(rho)
-        return diagnosed(self.steps, self.pair, (rho, self.after))
+        growth = (self.after - rho) / (self.pair[1].t - self.pair[0].t)
+        return diagnosed(self.steps, self.pair, (rho, self.after), growth)

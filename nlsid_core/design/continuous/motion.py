@@ -6,8 +6,8 @@ Source: Hargraves and Paris, "Direct trajectory optimization using nonlinear pro
 collocation", 1987; Mao, Szmuk and Açıkmeşe, "Successive convexification", 2016.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,14 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from nlsid_core import conic
-from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.setting import DEFECT, limits_of
 from nlsid_core.dynamics import Nominal, Rates, VectorField, cubic_through, linear_through
 from nlsid_core.errors import DataError, Infeasible, SolverError
 
 FIRST_KNOTS = 25
-MORE_KNOTS = 2.0  # at a time, where cubics between the knots miss the dynamics
+MORE_KNOTS = 3  # for one interval, at a time, where its cubic misses the dynamics
 MAX_KNOTS = 200
 KEPT = 0.9  # of the limits: the rest is there to correct with
 GOOD = 0.5  # of the defect that a funnel accepts
@@ -31,6 +31,10 @@ TRUST, SMALLEST = 1.0, 1e-7  # of the sizes of states and inputs
 PRICE = 1e2  # of a defect, over what the inputs may cost
 LOST = 1e6  # a defect of that size, relative to the states': the steps diverge
 SETTLED = 1e-10  # largest defect, relative to the states' sizes
+SMOOTH = 0.05  # of the time: what the inputs change in that long costs as much as they do
+AT_REST = 1e-9  # of the way, in the whole time
+ROUNDS = 8  # of convex programs, each with the states' sizes that the last one left
+OTHER_STARTS, BENT = 4, 0.3  # guesses beside the first, bent by that of the states' sizes
 STALLED = 1e-5  # of the cost: less is not worth another program
 STEP = 1e-6  # of the sizes, for central differences: errors of 1e-10
 
@@ -75,30 +79,54 @@ def plan_motion(
         middle, half = (low + high) / 2, KEPT * (high - low) / 2
         box[int(i)] = middle - half, middle + half
     path = np.stack(ends) if through is None else np.asarray(through, dtype=np.float64)
-    size = FIRST_KNOTS if knots is None else knots
-    share = np.linspace(0, 1, len(path))
-    x = np.stack([np.interp(np.linspace(0, 1, size), share, column) for column in path.T], axis=1)
+    t = np.linspace(0.0, seconds, FIRST_KNOTS if knots is None else knots)
+    share = np.linspace(0, seconds, len(path))
+    x = np.stack([np.interp(t, share, column) for column in path.T], axis=1)
     x[0], x[-1] = ends
-    z = np.hstack([x, np.tile(rest, (size, 1))])
+    straight = np.hstack([x, np.tile(rest, (len(t), 1))])
+    mesh = _Mesh(rates, t, n, rest, box, _held(rates, ends, rest, seconds, box))
+    straight[mesh.held, n:] = rest
+    z = mesh.started(straight)
     while True:
-        mesh = _Mesh(rates, np.linspace(0.0, seconds, size), n, rest, box)
-        z = mesh.planned(z)
-        z = mesh.settled(z)
         found = mesh.nominal(z)
-        gap, when, _ = found.defect(rates)
-        scale = float(np.abs(found.x.derivative().control).max())
-        if gap <= GOOD * DEFECT * scale or (knots is not None and gap <= DEFECT * scale):
+        gaps = found.gaps(rates)
+        wanted = DEFECT * float(np.abs(found.x.derivative().control).max())
+        if (gaps <= GOOD * wanted).all() or (knots is not None and (gaps <= wanted).all()):
             return found
-        if knots is not None or size > MAX_KNOTS:
+        worst = int(gaps.argmax())
+        more = np.ceil(np.clip((gaps / (GOOD * wanted)) ** (1 / 3), 1, MORE_KNOTS)).astype(int)
+        if knots is not None or len(mesh.t) + (more - 1).sum() > MAX_KNOTS:
             raise Infeasible(
-                f"the motion misses its dynamics by {gap:.3g} at {when:.4g} s between {size} "
-                "knots: take more knots, or more seconds"
+                f"the motion misses its dynamics by {gaps[worst]:.3g}, more than {wanted:.3g}, at "
+                f"{mesh.t[worst]:.4g} s between {len(mesh.t)} knots: "
+                + ("leave out `knots`, or take more" if knots is not None else "take more seconds")
             )
-        wanted = size * (gap / (GOOD * DEFECT * scale)) ** (1 / 3)
-        size = int(np.clip(wanted, size + 4, MORE_KNOTS * size))
-        fine = np.linspace(0.0, seconds, size)
-        z = np.hstack([found.x(fine), found.u(fine)])
+        t = np.concatenate([np.linspace(a, b, count + 1)[:-1] for a, b, count in
+                            zip(mesh.t[:-1], mesh.t[1:], more.tolist(), strict=True)]
+                           + [mesh.t[-1:]])  # fmt: skip
+        z = np.hstack([found.x(t), found.u(t)])
         z[-1, :n] = ends[1]
+        mesh = replace(mesh, t=t)
+        try:
+            z = mesh.settled(z)
+        except Infeasible:
+            z = mesh.planned(z)
+
+
+def _held(
+    rates: VectorField | Rates,
+    ends: Sequence[FloatArray],
+    rest: FloatArray,
+    seconds: float,
+    box: FloatArray,
+) -> list[int]:
+    """The knots, first or last, at which the input is `rest`: where that keeps the state."""
+    if not ((box[:, 0] <= rest) & (rest <= box[:, 1])).all():
+        return []
+    moving = [np.abs(rates(s, x[None], rest[None])).max() * seconds for s, x in
+              zip((0.0, seconds), ends, strict=True)]  # fmt: skip
+    size = max(float(np.abs(ends[1] - ends[0]).max()), SMALLEST)
+    return [k for k, rate in zip((0, -1), moving, strict=True) if rate <= AT_REST * size]
 
 
 @dataclass(eq=False)
@@ -110,6 +138,23 @@ class _Mesh:
     n: int
     rest: FloatArray
     box: FloatArray
+    held: list[int]
+
+    def started(self, straight: FloatArray) -> FloatArray:
+        """A motion from the straight guess, or from others that are bent; Infeasible if none."""
+        rng = np.random.default_rng(0)
+        share, n = (self.t / self.t[-1])[:, None], self.n
+        for attempt in range(1 + OTHER_STARTS):
+            z = straight.copy()
+            if attempt:
+                bends = rng.normal(size=(2, n)) * BENT * self.sizes(straight)[:n]
+                z[:, :n] += np.sin(np.pi * share) * bends[0] + np.sin(2 * np.pi * share) * bends[1]
+                z[[0, -1], :n] = straight[[0, -1], :n]
+            try:
+                return self.planned(z)
+            except Infeasible as refusal:
+                said = refusal
+        raise said
 
     def nominal(self, z: FloatArray) -> Nominal:
         """Cubics through the states with the rates there; inputs linear."""
@@ -127,6 +172,13 @@ class _Mesh:
     def alone(self) -> bool:
         """True if the rates depend on t."""
         return self.rates.depends_on_time
+
+    def free(self, z: FloatArray) -> BoolArray:
+        """What may change: not the states at both ends, nor the input where it is held."""
+        free = np.ones(z.shape, dtype=bool)
+        free[[0, -1], : self.n] = False
+        free[self.held, self.n :] = False
+        return free
 
     def sizes(self, z: FloatArray) -> FloatArray:
         """(n + m,) what is a large change of each entry."""
@@ -176,14 +228,35 @@ class _Mesh:
         return np.stack(columns, axis=2)
 
     def planned(self, z: FloatArray) -> FloatArray:
-        """Convex programs within a trust region: inputs small, defects at a price."""
-        sizes = self.sizes(z)
-        states, trust = sizes[: self.n], TRUST
+        """A motion by convex programs and Newton's steps from a guess; Infeasible if none."""
         z = z.copy()
         z[:, self.n :] = np.clip(z[:, self.n :], *self.box.T)
+        for _ in range(ROUNDS):
+            z = self._descended(z, self.sizes(z))
+            try:
+                return self.settled(z)
+            except Infeasible as refusal:
+                said = refusal
+        raise said
+
+    def _costs(self, sizes: FloatArray) -> sp.csc_matrix:
+        """The cost of v = (u - rest)/sizes as a matrix: the mean of v² + (τ dv/dt)²."""
+        K, width, h = len(self.t), len(sizes), np.diff(self.t)
+        span = self.t[-1] - self.t[0]
+        mean = (np.append(h, 0) + np.insert(h, 0, 0)) / 2 / span
+        change = sp.diags([-np.ones(K), np.ones(K - 1)], [0, 1], (K - 1, K))
+        over_time = sp.diags(mean) + change.T @ sp.diags(SMOOTH**2 * span / h) @ change
+        inputs = np.arange(width) >= self.n
+        return sp.csc_matrix(sp.kron(over_time, sp.diags(inputs / max(inputs.sum(), 1))))
+
+    def _descended(self, z: FloatArray, sizes: FloatArray) -> FloatArray:
+        """Convex programs within a trust region: inputs small, defects at a price."""
+        states, trust, M = sizes[: self.n], TRUST, self._costs(sizes)
+        origin = np.concatenate([np.zeros(self.n), self.rest])
 
         def merit(z: FloatArray) -> tuple[float, float]:
-            cost = np.mean(((z[:, self.n :] - self.rest) / sizes[self.n :]) ** 2)
+            v = ((z - origin) / sizes).ravel()
+            cost = v @ M @ v
             with np.errstate(all="ignore"):
                 missed = np.abs(self.defects(z) / states).sum()
             return float(cost + PRICE * missed), float(cost)
@@ -191,7 +264,7 @@ class _Mesh:
         now, _ = merit(z)
         for _ in range(MAX_STEPS):
             try:
-                step, promised = self._step(z, sizes, trust)
+                step, promised = self._step(z, sizes, trust, M)
             except SolverError:
                 trust /= 4
                 if trust < SMALLEST:
@@ -212,42 +285,41 @@ class _Mesh:
                     break
         return z
 
-    def _step(self, z: FloatArray, sizes: FloatArray, trust: float) -> tuple[FloatArray, float]:
+    def _step(
+        self, z: FloatArray, sizes: FloatArray, trust: float, M: sp.csc_matrix
+    ) -> tuple[FloatArray, float]:
         """The step (K, n + m) of one convex program, and the merit it promises."""
         n, width, K = self.n, z.shape[1], len(z)
-        m, count = width - n, (K - 1) * n
+        count = (K - 1) * n
         scale = np.tile(1 / sizes[:n], K - 1)
-        J = sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, K))
+        J = sp.csc_matrix(sp.diags(scale) @ self.slopes(z, sizes) @ sp.diags(np.tile(sizes, K)))
         d = self.defects(z).ravel() * scale
         high, low = np.full((K, width), trust), np.full((K, width), -trust)
         inputs = z[:, n:]
         high[:, n:] = np.minimum(high[:, n:], (self.box[:, 1] - inputs) / sizes[n:])
         low[:, n:] = np.maximum(low[:, n:], (self.box[:, 0] - inputs) / sizes[n:])
-        high[[0, -1], :n] = low[[0, -1], :n] = 0.0
-        weight = np.zeros((K, width))
-        weight[:, n:] = 2 / (K * m) if m else 0.0
-        gradient = np.zeros((K, width))
-        gradient[:, n:] = weight[:, n:] * (inputs - self.rest) / sizes[n:]
-        size, eye = K * width, sp.eye(K * width)
+        free = np.flatnonzero(self.free(z).ravel())
+        v = ((z - np.concatenate([np.zeros(n), self.rest])) / sizes).ravel()
+        size, eye, kept = len(free), sp.eye(len(free)), J[:, free]
         gap, none = sp.eye(count), sp.csr_matrix((size, count))
         program = ConeProgram(
-            P=sp.block_diag([sp.diags(weight.ravel()), sp.csc_matrix((count, count))], "csc"),
-            q=np.concatenate([gradient.ravel(), np.full(count, PRICE)]),
-            A=sp.bmat([[J, -gap], [-J, -gap], [eye, none], [-eye, none]], "csc"),
-            b=np.concatenate([-d, d, high.ravel() + 1e-9, -low.ravel() + 1e-9]),
+            P=sp.block_diag([2 * M[free][:, free], sp.csc_matrix((count, count))], "csc"),
+            q=np.concatenate([2 * (M @ v)[free], np.full(count, PRICE)]),
+            A=sp.bmat([[kept, -gap], [-kept, -gap], [eye, none], [-eye, none]], "csc"),
+            b=np.concatenate([-d, d, high.ravel()[free] + 1e-9, -low.ravel()[free] + 1e-9]),
             cones=(Cone("nonnegative", 2 * count + 2 * size),),
         )
-        x = conic.solve(program).x
-        y = np.clip(x[:size].reshape(K, width), low, high)
-        cost = np.mean(((inputs - self.rest) / sizes[n:] + y[:, n:]) ** 2) if m else 0.0
-        missed = np.abs(J @ y.ravel() + d).sum()
+        y = np.zeros(K * width)
+        y[free] = np.clip(conic.solve(program).x[:size], low.ravel()[free], high.ravel()[free])
+        cost = (v + y) @ M @ (v + y)
+        missed = np.abs(J @ y + d).sum()
+        y = y.reshape(K, width)
         return y * sizes, float(cost + PRICE * missed)
 
     def settled(self, z: FloatArray) -> FloatArray:
         """The nearest z that obeys the collocation, by least-norm Newton steps; else Infeasible."""
         sizes, n = self.sizes(z), self.n
-        free = np.ones(z.shape, dtype=bool)
-        free[[0, -1], :n] = False
+        free = self.free(z)
         scale = np.tile(1 / sizes[:n], len(z) - 1)
         for _ in range(NEWTON_STEPS):
             with np.errstate(all="ignore"):

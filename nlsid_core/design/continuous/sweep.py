@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.diagnosis import diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section
 from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress, silent
@@ -112,10 +113,9 @@ def _largest(
             infeasible = min(infeasible, rho)
         duals = found
     if best is None:
-        raise Infeasible(
-            f"no rho at t = {section.t:.6g} s keeps solutions inside: the linearisation may not be "
-            "stabilised there. Try more knots, another P (Q and R of the LQR), or a smaller goal."
-        )
+        levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
+        rho = max(levels, key=lambda r: slack(r, steps.predicted(section, here(r), duals)))
+        raise Infeasible(str(diagnosed(steps, [section], [here(rho)], (after - rho) / h)))
     return feasible, best
 
 

@@ -211,7 +211,14 @@ def _backward(
 
     explodes.terminal = True  # type: ignore[attr-defined]
     solved: Any = solve_ivp(
-        flat, (t[-1], t[0]), final.ravel(), t_eval=t[::-1], rtol=RTOL, atol=ATOL, events=explodes
+        flat,
+        (t[-1], t[0]),
+        final.ravel(),
+        t_eval=t[::-1],
+        method="DOP853",
+        rtol=RTOL,
+        atol=ATOL,
+        events=explodes,
     )
     if not solved.success or solved.y.shape[1] != len(t):
         raise Infeasible(f"no bounded solution of {what} ({solved.message})")

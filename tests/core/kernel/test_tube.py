@@ -146,7 +146,10 @@ FALSE: dict[str, Change] = {
     "tau": lambda c: scaled(tubes(c.funnel), "tau", 1.003),
     "rho": lambda c: tubes(c.funnel).update(rho=0.9 * tubes(c.funnel)["rho"]),
     "R": lambda c: scaled(tubes(c.funnel), "R", 0.97),
-    "P": lambda c: scaled(tubes(c.funnel), "P", 0.5),
+    # Where hardly anything is injected, P has room for a factor of fifty.
+    "P": lambda c: scaled(
+        tubes(c.funnel), "P", 0.5 if np.abs(tubes(c.funnel)["L"]).max() > 1e-2 else 1e-3
+    ),
     "L": lambda c: scaled(tubes(c.funnel), "L", 1.3),
     "half-width": lambda c: scaled(tubes(c.funnel), "half_widths", 0.98),
     "level": lambda c: scaled(tubes(c.funnel), "level", 1.03),
