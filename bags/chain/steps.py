@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -22,14 +21,12 @@ from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design
 from nlsid_core.design.tube import least_window
-from nlsid_core.errors import DataError, percent
+from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
 from nlsid_core.progress import Progress, part, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
-
-USELESS: Final = 100.0  # % of the response's deviation: the error of a model that says its mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,28 +85,10 @@ def identify_trials(trials: Trials, config: Config, out: Path, *, progress: Prog
     return write_identified(fit, trials, config, out, progress=progress)
 
 
-def _refuse_useless(fit: Fit[Model]) -> None:
-    """DataError if the model is no better than the mean on the trials that chose or scored it."""
-    for name in fit.errors.keys() & {"validation", "test"}:
-        error = fit.errors[name][fit.chosen.method.name]
-        if not error <= USELESS:
-            raise DataError(
-                f"the model is off by {percent(error)} on {name} trials, more than the response's "
-                "mean is (100 %): those trials do what the training trials never did, or the "
-                "response follows something else; add such trials to the training, or other "
-                "excitations (`nlsid init` lists what the response follows)"
-            )
-
-
 def write_identified(
     fit: Fit[Model], trials: Trials, config: Config, out: Path, *, progress: Progress
 ) -> Identified:
-    """The files of one fit; a proof file of an earlier model does not stay beside an unproved.
-
-    Raises DataError for a model that is farther off than none (`USELESS`), before anything is
-    written.
-    """
-    _refuse_useless(fit)
+    """The files of one fit; a proof file of an earlier model does not stay beside an unproved."""
     out.mkdir(parents=True, exist_ok=True)
     training, path, proof = (
         out / name for name in (documents.TRAINING, documents.MODEL, documents.MODEL_PROOF)

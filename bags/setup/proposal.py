@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import welch
 
 from bags.chain.config import Config
-from bags.chain.steps import USELESS, Trials, read_trials
+from bags.chain.steps import Trials, read_trials
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
@@ -531,10 +531,9 @@ def _terms(tried: StateAffineClass) -> int:
 
 
 def _poor(best: float, where: str) -> str:
-    refused = f"; identification refuses a model above {USELESS:g} %" if best > USELESS else ""
     return (
         f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
-        f"will be wide{refused}; another pair of signals, or more of them, may say more"
+        "will be wide; another pair of signals, or more of them, may say more"
     )
 
 
