@@ -47,7 +47,7 @@ class Shown:
 
 
 DEMOS: Final = {
-    "f1tenth": lambda: Shown("f1tenth.yaml", samples.f1tenth(), "trial_05", {}),
+    "f1tenth": lambda: Shown("f1tenth_driven.yaml", samples.f1tenth(), "trial_05", {}),
     "dart": lambda: Shown(
         "dart.yaml",
         samples.dart("rubbery"),
