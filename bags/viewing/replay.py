@@ -32,6 +32,7 @@ class Recording:
         summary = replay_bag(proved, bag, centre=centre)
         self._verdict = " ".join(filter(None, [f"verdict: {summary.verdict}.", summary.reason]))
         self._widths, self._names = HalfWidths(design), signal_names(design)
+        self._said: tuple[State | None, str] = None, ""
 
     def play(self, scene: Scene, rate: float, closing: threading.Event) -> None:
         """Feed `scene` until the end, or until `closing` is set; rate 1: as recorded."""
@@ -46,6 +47,7 @@ class Recording:
 
     def _show(self, scene: Scene, entry: Stamped) -> None:
         stamp_ns, reading, state = entry
-        text = state.value + (f": {reading.reason}" if reading.reason else "")
-        scene.say(stamp_ns, MONITOR, LEVELS[state], text, names=self._names)
+        if state is not self._said[0]:  # as the node does: an event is a change
+            self._said = state, state.value + (f": {reading.reason}" if reading.reason else "")
+        scene.say(stamp_ns, MONITOR, LEVELS[state], self._said[1], names=self._names)
         scene.sample(stamp_ns, {**reading.numbers, **self._widths.of(reading)})
