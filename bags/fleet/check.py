@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from bags.fleet.manifest import Manifest
 from bags.fleet.run import ask
 from bags.fleet.workers import Workers
 from bags.recordings.bag import Bag
-from bags.recordings.definitions import read_definitions
+from bags.recordings.definitions import read_definitions, texts_of
 from bags.tools.fitness import Level, check_fitness
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.files import canonical
@@ -50,11 +51,12 @@ class CheckBag:
 
     config: Config
 
-    @property
+    @cached_property
     def asked(self) -> str:
-        """The signals and their clock."""
-        keys = {"signals", "clock", "definitions"}
-        return f"check {version('nlsid')} {self.config.model_dump_json(include=keys)}"
+        """The signals, their clock and the types' definitions."""
+        types = texts_of(read_definitions(self.config.definitions))
+        said = self.config.model_dump_json(include={"signals", "clock"})
+        return f"check {version('nlsid')} {said} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """A Checked, as JSON."""

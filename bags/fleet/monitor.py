@@ -24,6 +24,7 @@ from bags.fleet.manifest import Manifest
 from bags.fleet.run import ask
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import Definitions, replay_bag
+from bags.recordings.definitions import texts_of
 from bags.signals.reader import bag_origin
 from nlsid_core import files
 from nlsid_core.data.calibration import recording
@@ -84,7 +85,7 @@ class JudgeBag:
     @cached_property
     def asked(self) -> str:
         """The design and what it is around."""
-        types = sorted((name, found.text) for name, found in self.definitions.items())
+        types = texts_of(self.definitions)
         wiring = hashlib.sha256(pickle.dumps(self.proved.design.wiring)).hexdigest()
         digest = self.proved.design.digest
         return f"monitor {version('nlsid')} {digest} {self.centre} {wiring} {types}"

@@ -7,6 +7,7 @@ does, on the same numbers in the same order, so its result is the same to the la
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from bags.chain.training import decoded, encoded
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
 from bags.fleet.workers import Workers
+from bags.recordings.definitions import read_definitions, texts_of
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.progress import Progress, part, silent
@@ -29,11 +31,12 @@ class ReadTrials:
 
     config: Config
 
-    @property
+    @cached_property
     def asked(self) -> str:
-        """Signals, grid and clock; another version may read otherwise."""
-        keys = {"signals", "grid", "clock", "definitions"}
-        return f"trials {version('nlsid')} {self.config.model_dump_json(include=keys)}"
+        """Signals, grid, clock and the types' definitions; another version may read otherwise."""
+        types = texts_of(read_definitions(self.config.definitions))
+        said = self.config.model_dump_json(include={"signals", "grid", "clock"})
+        return f"trials {version('nlsid')} {said} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """The trials, as `training.encoded` writes them."""

@@ -74,6 +74,11 @@ def types_from(msgtype: str, texts: Mapping[str, str]) -> Typestore:
     return types_in_bag(msgtype, MessageDefinition(MessageDefinitionFormat.MSG, text))
 
 
+def texts_of(definitions: Mapping[str, Definition]) -> list[tuple[str, str]]:
+    """(type, text), sorted: what a manifest's key has of them, not where they were read."""
+    return sorted((name, found.text) for name, found in definitions.items())
+
+
 def read_definitions(paths: Iterable[Path]) -> dict[str, Definition]:
     """Definitions from .msg files, packages' folders (with `msg` in it) and folders of packages.
 

@@ -14,9 +14,10 @@ from bags.chain.config import load_config
 from bags.chain.steps import identify_bags
 from bags.designs import documents
 from bags.fleet.bags import named_bags, robot_of
+from bags.fleet.check import CheckBag
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
-from bags.fleet.trials import MANIFEST, identify_fleet
+from bags.fleet.trials import MANIFEST, ReadTrials, identify_fleet
 from bags.fleet.workers import Workers
 from bags.recordings.definitions import standard_definition
 from bags.samples import f1tenth
@@ -147,6 +148,18 @@ def test_a_second_run_reads_only_what_is_new(tmp_path: Path, config: Path) -> No
     assert {a.name for a in again.answers if not a.kept} == {"robot_9/drive_9", "robot_0/drive_2"}
     run(pattern, config, tmp_path / "fresh")
     assert contents(tmp_path / "out") == contents(tmp_path / "fresh")
+
+
+def test_an_edited_definition_is_asked_again(tmp_path: Path, config: Path) -> None:
+    given = tmp_path / "robot_msgs" / "msg" / "Speed.msg"
+    given.parent.mkdir(parents=True)
+    settings = load_config(config).model_copy(update={"definitions": (given,)})
+    asked = []
+    for text in ("float64 x", "float64 x", "float64 y"):
+        given.write_text(f"std_msgs/Header header\n{text}\n")
+        asked.append((ReadTrials(settings).asked, CheckBag(settings).asked))
+    assert asked[0] == asked[1]
+    assert all(old != new for old, new in zip(asked[0], asked[2], strict=True))
 
 
 def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
