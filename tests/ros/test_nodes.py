@@ -155,7 +155,11 @@ def test_every_node_ends_cleanly_when_asked_to(
     ("name", "parameters", "message"),
     [
         ("tracking_controller", {"highest": 0.4, "settling": -1.0}, "parameter settling"),
-        ("tracking_controller", {"highest": "much"}, "parameter highest (greatest input; must be"),
+        (
+            "tracking_controller",
+            {"highest": "much"},
+            "parameter highest (greatest input, or a list; must be",
+        ),
         ("tracking_controller", {"highest": 2 * 10**9}, "is not in [-1000000000.0, 1000000000.0]"),
         ("tracking_controller", {}, "no room between lowest and highest"),
         ("tracking_controller", {"lowest": 0.2, "highest": 0.4}, "limits: 0.0 should be in"),
