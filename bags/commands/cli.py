@@ -42,6 +42,7 @@ app.add_typer(bag_app)
 app.add_typer(config_app)
 app.add_typer(fleet_app)
 out = Console()
+UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 err = Console(stderr=True)
 
 BagsArgument = Annotated[
@@ -451,9 +452,12 @@ def monitor(
         if (alarm := entry.first_alarm) is not None:
             said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
             out.print(said, soft_wrap=True)
-        for reading in entry.unjudged:
+        for reading in entry.unjudged[:UNJUDGED_SAID]:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
+        if more := entry.unjudged[UNJUDGED_SAID:]:
+            said = f"not judged later either: {len(more)} more, the last from {more[-1].t:.3f} s on"
+            out.print(f"{entry.name}: {said}", soft_wrap=True)
         if not entry.judged:
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if drawn:

@@ -49,4 +49,5 @@ def check(
         typer.echo(line)
     if wrong:
         raise typer.Exit(1)
-    typer.echo(f"{file}: nothing is wrong" + (f", {len(folders)} bags fit" if folders else ""))
+    fit = f", {len(folders)} bags have its signals; their messages were not read" if folders else ""
+    typer.echo(f"{file}: nothing is wrong{fit}")

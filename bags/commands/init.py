@@ -41,7 +41,7 @@ def run_init(
         raise DataError(f"{target} exists already; give another name, or remove it")
     folders = expand_bags(bags)
     types = read_definitions(definitions)
-    console.print(f"looking into {len(folders)} bags", soft_wrap=True)
+    console.print(f"looking into {len(folders)} bag{'s' * (len(folders) != 1)}", soft_wrap=True)
     found = look(folders, definitions=types)
     asked = not yes and not (responses and excitations)
     if asked and not sys.stdin.isatty():

@@ -36,6 +36,7 @@ COMPARISON_CAPTION = """\
 free run: simulated; +k: predicted k samples ahead. residual: coloured (not
 white), follows the input u, or both, at 99 %. rate: proved, a sample; forgets:
 its time constant. time: of the processor."""
+MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
 STABILITY = "proved rate a sample (time constant)"
 
 
@@ -54,10 +55,10 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
     table.collapse_padding = True
-    table.add_column("method", no_wrap=True)
-    table.add_column("test error", justify="right")
-    table.add_column("time", justify="right")
-    table.add_column(STABILITY)
+    table.add_column("method")
+    table.add_column("test error", justify="right", min_width=7)
+    table.add_column("time", justify="right", no_wrap=True)
+    table.add_column(STABILITY, min_width=17)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,
@@ -258,7 +259,9 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         "assumed",
         title_justify="left",
         caption_justify="left",
-        collapse_padding=True,
+        box=SIMPLE_HEAD,
+        show_edge=False,
+        padding=0,
     )
     for column, justify in (
         ("bag", "left"),
@@ -270,12 +273,12 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         ("bad from", "right"),
         ("judged", "right"),
     ):
-        long = column in ("bag", "axis")  # folded where the terminal is narrow, never cut
-        width = {"bag": 8, "axis": 10}.get(column)
+        folded = column in ("bag", "verdict", "axis", "judged")  # on narrow terminals, never cut
+        width = {"bag": 8, "verdict": 10, "axis": 10}.get(column)
         table.add_column(
             column,
             justify=justify,  # type: ignore[arg-type]
-            no_wrap=not long and column != "judged",
+            no_wrap=not folded,
             overflow="fold",
             min_width=width,
         )
@@ -297,7 +300,9 @@ def replay_table(replays: Sequence[Replay]) -> Table:
 
 def _percent(part: float) -> str:
     """The part of the assumption that is used; a continuous funnel's is not measured."""
-    return "not measured" if math.isnan(part) else f"{100 * part:.0f} %"
+    if math.isnan(part):
+        return "not measured"
+    return f"{100 * part:.0f} %" if part < MOST_SAID else f"> {100 * MOST_SAID:.0f} %"
 
 
 def caught_table(replays: Sequence[Replay]) -> Table:

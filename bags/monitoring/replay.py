@@ -1,5 +1,6 @@
 """Offline monitoring: a bag's messages through the same sampling and monitor as the live node."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,8 +94,9 @@ class Replay:
 
     @property
     def assumption(self) -> float:
-        """The part of what is assumed that is used at the last judged sample; 1 is all of it."""
-        return self.judged[-1].assumption if self.judged else float("nan")
+        """The most of what is assumed that a judged sample used; 1 is all of it, NaN unmeasured."""
+        used = [r.assumption for r in self.judged if not math.isnan(r.assumption)]
+        return max(used, default=math.nan)
 
     @property
     def verdict(self) -> str:

@@ -236,7 +236,7 @@ def _forms(
         return
     stamps = columns.log_ns if columns.stamp_ns is None else columns.stamp_ns
     usable = np.isfinite(numbers) & (np.diff(stamps, prepend=stamps[:1] - 1) > 0)
-    window = float(f"{WINDOW / _rate(stamps[usable]):.2g}") if usable.sum() > WINDOW else 0.0
+    window = slope_window(_rate(stamps[usable])) if usable.sum() > WINDOW else 0.0
     if not 0.0 < window < 1e3:
         return
     slopes = np.full(len(numbers), np.nan)
@@ -244,6 +244,11 @@ def _forms(
         slopes[usable] = derivative(numbers[usable], stamps[usable], window)
         written = f"{text}|unwrap" if angle else text
         yield f"{written}|derivative({window:g} s)", slopes, per_second(unit)
+
+
+def slope_window(rate: float) -> float:
+    """Seconds of a slope over WINDOW messages at `rate` [Hz], two digits."""
+    return float(f"{WINDOW / rate:.2g}")
 
 
 def _field(text: str) -> str:

@@ -21,7 +21,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
-from bags.setup.candidates import Found
+from bags.setup.candidates import Found, slope_window
 from bags.signals.columns import read_columns
 from bags.signals.expressions import factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
@@ -209,7 +209,7 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
             if best.response.is_position and not best.command.is_position:
                 proposal.walls.append(
                     f"{y.path} is a position: one that adds up its command for ever is in no model "
-                    "class; take |derivative(0.2 s) of it"
+                    f"class; take |derivative({slope_window(best.response.rate):g} s) of it"
                 )
 
 
@@ -453,9 +453,10 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
     section = proposal.content["identification"]
     if not known:
         proposal.why["lags"] = "a first guess"
+        window = slope_window(1.0 / proposal.content["grid"]["period"])
         proposal.walls.append(
             "no number of lags gave a model that is proved stable: identification will refuse; a "
-            "response that adds up its command for ever needs |derivative(0.2 s)"
+            f"response that adds up its command for ever needs |derivative({window:g} s)"
         )
         return
     best = min(known.values())

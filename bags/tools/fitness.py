@@ -38,6 +38,7 @@ BAND_LOOK: Final = 0.4  # of the sampling rate: power above is close to being al
 LINES_FEW: Final = 3  # frequency lines with power: no more than one or two sinusoids
 RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
 LONGEST_DELAY: Final = 5.0  # s
+LEAST_OVERLAP: Final = 10  # steps of the response: less says nothing of a delay
 LONGEST_HELD: Final = 1e5  # s: to see what there is, whatever limit a configuration sets
 
 
@@ -295,8 +296,13 @@ def _delays(excitations: Sequence[Samples], responses: Sequence[Samples]) -> lis
         for u in excitations:
             period_ns = int(np.median(np.diff(y.stamp_ns))) if len(y) > 1 else 0
             start, end = max(u.stamp_ns[0], y.stamp_ns[0]), min(u.stamp_ns[-1], y.stamp_ns[-1])
-            if period_ns <= 0 or end - start < 10 * period_ns:
+            if period_ns <= 0 or end - start < LEAST_OVERLAP * period_ns:
                 what = f"{u.path} and {y.path} do not overlap in time by their stamps"
+                if period_ns > 0 and end > start:
+                    what = (
+                        f"{u.path} and {y.path} overlap for {(end - start) / 1e9:.3g} s, less than "
+                        f"{LEAST_OVERLAP} steps of the response"
+                    )
                 findings.append(Finding(Level.BAD, "delay", what))
                 continue
             at = np.arange(start, end, period_ns)

@@ -37,7 +37,7 @@ def edited(path: Path, **changes: Any) -> Path:
 
 
 def test_nothing_is_wrong_with_the_shipped_configurations() -> None:
-    assert "nothing is wrong, 41 bags fit" in check(CONFIG, *f1tenth())
+    assert "nothing is wrong, 41 bags have its signals" in check(CONFIG, *f1tenth())
     for name in ("arm.yaml", "pendulum.yaml"):
         assert "nothing is wrong" in check("--track", config_file(name))
 

@@ -26,7 +26,17 @@ from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
 from bags.setup.proposal import choose
 from nlsid_core.errors import BagError, DataError
-from tests.bag_messages import COMMAND, SPEED, START_NS, header, speed_bag, twist
+from tests.bag_messages import (
+    CMD_TYPE,
+    COMMAND,
+    SPEED,
+    START_NS,
+    command,
+    header,
+    joints,
+    speed_bag,
+    twist,
+)
 from tests.conftest import SHARED
 
 CMD = "/cmd_vel:twist.linear.x"
@@ -361,3 +371,19 @@ def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seco
     nlsid("init", parts, "--yes", "--out", config)
     assert load_config(config).clock == "header"
     whole_way(parts, config, tmp_path / "out")
+
+
+def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: Path) -> None:
+    bag, level = tmp_path / "tank", 0.0
+    pumped = np.repeat(np.random.default_rng(2).uniform(0.0, 1.0, 30), 10)
+    with BagWriter(bag) as writer:
+        for k, value in enumerate(pumped.tolist()):
+            stamp = START_NS + k * 500_000_000
+            level += 0.1 * (value - level)
+            times = {"log_time_ns": stamp, "publish_time_ns": stamp}
+            writer.write("/pump", CMD_TYPE, command(stamp, value), **times)
+            writer.write("/level", "sensor_msgs/msg/JointState", joints(stamp, [level]), **times)
+    said = nlsid("init", bag, "--out", tmp_path / "robot.yaml", "-u", "/pump:twist.linear.x",
+                 "-y", "/level:position[0]")  # fmt: skip
+    assert "looking into 1 bag\n" in said
+    assert "take |derivative(2.5 s) of it" in " ".join(said.split())

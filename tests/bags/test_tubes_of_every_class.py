@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from bags.chain.config import load_config
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.commands.cli import app
+from bags.commands.cli import UNJUDGED_SAID, app
 from bags.designs import documents
 from bags.designs.design import AnyDesign
 from bags.designs.documents import Proved
@@ -84,6 +84,12 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     done = CliRunner().invoke(app, held)
     assert done.exit_code == 2, done.output
     assert "not judged from 1.000 s on: 3 samples are missing" in done.output
+    kept = np.setdiff1d(np.arange(300), [50, 100, 150, 200, 250])
+    gaps = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gaps")
+    done = CliRunner().invoke(app, [*held[:-1], str(write_joint_bag(tmp_path, gaps))])
+    assert done.output.count("not judged from") == UNJUDGED_SAID == 3
+    last = f"the last from {PERIOD * 250:.3f} s on"
+    assert f"gaps: not judged later either: 2 more, {last}" in done.output
     replayed = replay_bag(documents.load_proved(out / documents.FUNNEL), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
     starts = [r for r in replayed.readings[100:] if r.reason.startswith("waiting for")]
