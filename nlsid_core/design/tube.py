@@ -674,8 +674,8 @@ def _program(
 
     modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
     of a linear model only. Of several outputs, where E is one matrix, M + sym(N [E 0]) ≻ 0 has a
-    solution N just where M ≻ 0 on the null space of [E 0], and N = λ/2 [E 0]' is one (Finsler's
-    lemma): these N are no unknowns of the program.
+    solution N just where M ≻ 0 on the null space of [E 0] (Finsler's lemma): these N are no
+    unknowns of the program.
     """
     n, p = len(modes[0][0]), len(modes[0][1])
     size = m + n + p
@@ -731,20 +731,16 @@ def _program(
     R_found = np.eye(1) if p == 1 else np.asarray(R.value)
     found = [[np.asarray(N.value) for N in Ns] for Ns in unknown]
     if only is not None:
-        found = [[_finsler(np.asarray(M.value), only) for M in forms]]
+        found = [[finsler(np.asarray(M.value), only) for M in forms]]
     return np.asarray(P.value), R_found, np.asarray(tau.value), found
 
 
-def _finsler(M: FloatArray, E: FloatArray) -> FloatArray:
-    """N = λ/2 E' with M + λE'E ≻ 0, λ the first power of 2 that leaves half of M's room on E's null
-    space.
-    """
+def finsler(M: FloatArray, E: FloatArray) -> FloatArray:
+    """N with M + sym(N E) = Z'MZ on the null space of E, 1 on its complement and 0 between them."""
     Z = null_space(E)
-    enough = 0.5 * float(np.linalg.eigvalsh(Z.T @ M @ Z)[0])
-    weight = 1.0
-    while float(np.linalg.eigvalsh(M + weight * E.T @ E)[0]) < enough and weight < LARGEST:
-        weight *= 2.0
-    return 0.5 * weight * E.T
+    Y = null_space(Z.T)
+    N = (0.5 * np.eye(len(M)) - (Z @ Z.T + 0.5 * Y @ Y.T) @ M) @ Y
+    return np.asarray(N @ np.linalg.inv(E @ Y))
 
 
 def _placed(M: Any, start: int, size: int) -> Any:

@@ -10,7 +10,7 @@ import pytest
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.design.tube import energy, innovations
+from nlsid_core.design.tube import energy, finsler, innovations
 from nlsid_core.errors import CertificateMismatch, DataError, OptionError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification.prediction import history, simulate_trial
@@ -277,3 +277,21 @@ def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None
     model = MODELS["linear"]()
     with pytest.raises(OptionError):
         OutputTube(model, Dataset(dataset(model, 0, 2).trajectories), **options)
+
+
+@pytest.mark.parametrize("room", [1.0, 1e-3, 1e-6])
+def test_the_multiplier_of_one_increment_matrix_keeps_the_room_on_its_null_space(
+    room: float,
+) -> None:
+    # A multiple of E' would have to be near 1/room to keep half of it.
+    rng = np.random.default_rng(4)
+    E = rng.standard_normal((3, 9))
+    Z = np.linalg.svd(E)[2][3:].T
+    M = rng.standard_normal((9, 9))
+    M = M + M.T
+    M = M + Z @ (room * np.eye(6) - Z.T @ M @ Z) @ Z.T
+    N = finsler(M, E)
+    whole = M + N @ E + (N @ E).T
+    assert np.linalg.eigvalsh(M)[0] < -0.1
+    assert np.linalg.eigvalsh(whole)[0] == pytest.approx(min(room, 1.0), abs=1e-12)
+    assert np.abs(N).max() < 100.0
