@@ -55,10 +55,11 @@ def methods_table(fit: Fit[Model], test: Dataset) -> Table:
     """Every method's error on the test trials, time, and whether its model is proved stable."""
     table = Table(title=f"{fit.model}; {len(test)} test trials", title_justify="left")
     table.collapse_padding = True
-    table.add_column("method")
+    longest = max(len(candidate.method.title) for candidate in fit.candidates)
+    table.add_column("method", no_wrap=longest <= 38)  # as long as the rate beside it stays whole
     table.add_column("test error", justify="right", min_width=7)
     table.add_column("time", justify="right", no_wrap=True)
-    table.add_column(STABILITY, min_width=17)
+    table.add_column(STABILITY, min_width=15)
     for candidate in fit.candidates:
         table.add_row(
             candidate.method.title,

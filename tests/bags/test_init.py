@@ -384,6 +384,6 @@ def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: P
             writer.write("/pump", CMD_TYPE, command(stamp, value), **times)
             writer.write("/level", "sensor_msgs/msg/JointState", joints(stamp, [level]), **times)
     said = nlsid("init", bag, "--out", tmp_path / "robot.yaml", "-u", "/pump:twist.linear.x",
-                 "-y", "/level:position[0]")  # fmt: skip
+                 "-y", "/level:position[name=joint_0]")  # fmt: skip
     assert "looking into 1 bag\n" in said
     assert "take |derivative(2.5 s) of it" in " ".join(said.split())

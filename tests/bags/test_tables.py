@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from bags.commands.cli import app
 from bags.monitoring.replay import Replay
 from bags.tools.fitness import LEAST_OVERLAP
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.identification import CertifiedSem, MonotoneClass, identify
+from nlsid_core.identification import CertifiedSem, LinearClass, MonotoneClass, Rse, identify
 from nlsid_core.running.reading import Reading, Status
 from tests.bag_messages import COMMAND, SPEED, speed_bag
 
@@ -52,7 +53,10 @@ def test_what_is_used_is_the_most_that_a_sample_used(last: float) -> None:
     assert np.isnan(replay().assumption)
 
 
-def test_the_rate_of_a_method_with_a_long_name_is_not_cut() -> None:
+@pytest.mark.parametrize(
+    ("kind", "method"), [(MonotoneClass(1, delays=(1,)), CertifiedSem()), (LinearClass(2), Rse())]
+)
+def test_the_rate_of_a_method_with_a_long_name_is_not_cut(kind: Any, method: Any) -> None:
     rng, trials = np.random.default_rng(1), []
     for name in ("a", "b"):
         u = np.repeat(rng.uniform(-1, 1, 20), 10)[:, None]
@@ -61,13 +65,14 @@ def test_the_rate_of_a_method_with_a_long_name_is_not_cut() -> None:
             y[k + 1] = 0.9 * y[k] + 0.1 * u[k]
         trials.append(Trajectory(t=0.1 * np.arange(200), y=y, u=u, name=name))
     data = Dataset(tuple(trials))
-    fit = identify(data, MonotoneClass(1, delays=(1,)), method=CertifiedSem(), test=data)
+    fit = identify(data, kind, method=method, test=data)
     text = printed(show.methods_table(fit, data))
     assert "…" not in text
+    assert all(len(line) == 80 for line in text.splitlines() if line.startswith("│"))
     proved = [c.proof for c in fit.candidates if c.proof is not None]
     assert len(proved) == len(fit.candidates) > 1
     for candidate in fit.candidates:
-        assert show.stability(candidate).removeprefix("[green]").split()[0] in text
+        assert show.stability(candidate).removeprefix("[green]") in text
 
 
 def test_a_recording_too_short_for_a_delay_is_said_to_be_short(tmp_path: Path) -> None:
