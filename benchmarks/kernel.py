@@ -1,11 +1,12 @@
 """The kernel: its size, its imports, its processor seconds for examples/, and attacks on it.
 
-    python -m benchmarks.kernel [--json] [--mutations N] [--no-designs]
+    python -m benchmarks.kernel [--json] [--mutations N] [--processes N] [--no-designs]
 
 A time is the least of three `kernel.check` of a saved proof, in processor seconds of one process.
 Lines are those that are not blank. A mutant is a structured change of a proof of version 2 or of a
 file it is about; each that is proved is decided a second time by an oracle (tests/core/kernel),
-in fractions: `judged` counts them by kind.
+in fractions: `judged` counts them by kind. They are made in blocks, each from a seed of its own, so
+that the counts are the same for any number of processes.
 """
 
 import argparse
@@ -14,30 +15,22 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
-from bags.designs import documents
-from bags.samples import f1tenth
 from benchmarks.machine import describe
-from examples import cart_pole, planar_quadrotor, quadrotor, satellite_funnel
 from nlsid_core import kernel
-from nlsid_core.design import design_funnel
 from nlsid_core.kernel.checking import KINDS
-from nlsid_core.progress import silent
 
 FOLDER = Path(kernel.__file__).parent
 REPEATS = 3
 MUTATIONS = 2000
 SEED = 3
-QUADROTOR_LEVEL = 0.1  # of the goal, in LQR cost, as in benchmarks.quadrotor
-QUADROTOR_KNOTS = 31
+BLOCK = 5000  # mutants
 REACHED = {  # what was aimed at
     "kernel_lines": 1500,
     "largest_claim_lines": 900,
@@ -56,13 +49,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--mutations", type=int, default=MUTATIONS)
+    parser.add_argument("--processes", type=int, default=1, help="for the mutations")
     parser.add_argument("--no-designs", action="store_true", help="lines and mutations only")
     arguments = parser.parse_args()
     result: dict[str, Any] = size()
     if not arguments.no_designs:
         with tempfile.TemporaryDirectory() as folder:
             result |= times(Path(folder))
-    result |= mutated(arguments.mutations)
+    result |= mutated(arguments.mutations, arguments.processes)
     print(describe())
     for key, value in result.items():
         print(f"{key:24}{value!s:>24}   {REACHED.get(key, '')}")
@@ -90,6 +84,8 @@ def times(folder: Path) -> dict[str, Any]:
     result: dict[str, Any] = {}
     sizes: dict[str, float] = {}
     margins: dict[str, float] = {}
+    from benchmarks.shipped import shipped  # designs need solvers, attacks only the kernel
+
     for name, paths in shipped(folder):
         found = [_checked(path) for path in paths]
         result[f"{name}_s"] = sum(seconds for seconds, _ in found)
@@ -98,47 +94,26 @@ def times(folder: Path) -> dict[str, Any]:
     return result | {"files_mb": sizes, "margins": margins}
 
 
-def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
-    """The proofs of the examples that ship, made again: names and proof files."""
-    designs: Mapping[str, Callable[[], Any]] = {
-        "satellite": _satellite,
-        "quadrotor": _quadrotor,
-        "cart_pole": cart_pole.designed,
-        "planar_quadrotor": planar_quadrotor.designed,
-    }
-    for name, design in designs.items():
-        yield name, [design().save(folder / name)[-1]]
-    out = folder / "f1tenth"
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    yield "f1tenth", [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
-
-
-def mutated(count: int) -> dict[str, Any]:
+def mutated(count: int, processes: int = 1) -> dict[str, Any]:
     """How many mutants were decided, judged by an oracle, and proved wrongly."""
+    blocks = [(k, min(BLOCK, count - k * BLOCK)) for k in range(-(-count // BLOCK))]
+    totals, judged, seconds = Counter[str](), Counter[str](), 0.0
+    with ProcessPoolExecutor(processes) as pool:
+        for done, found in enumerate(pool.map(_mutated_block, *zip(*blocks, strict=True)), 1):
+            seconds += found.pop("seconds")
+            judged.update(found.pop("judged"))
+            totals.update(found)
+            if processes > 1:
+                print(f"{done} of {len(blocks)}: {dict(totals)}", file=sys.stderr, flush=True)
+    return {"mutations": count, "mutations_s": seconds, **totals, "judged": dict(judged)}
+
+
+def _mutated_block(block: int, count: int) -> dict[str, Any]:
     from tests.core.kernel import mutations
 
     started = time.process_time()
-    outcomes = mutations.run(count, np.random.default_rng(SEED))
-    seconds = time.process_time() - started
-    return {"mutations": count, "mutations_s": seconds, **outcomes}
-
-
-def _satellite() -> Any:
-    field, nominal, weights = satellite_funnel.problem()
-    return design_funnel(field, nominal, goal=satellite_funnel.goal_matrix(), **weights)
-
-
-def _quadrotor() -> Any:
-    dynamics, nominal, S = quadrotor.problem(QUADROTOR_KNOTS)
-    return design_funnel(
-        dynamics,
-        nominal,
-        goal=S / QUADROTOR_LEVEL,
-        Q=quadrotor.Q / QUADROTOR_LEVEL,
-        R=quadrotor.R / QUADROTOR_LEVEL,
-    )
+    outcomes = mutations.run(count, np.random.default_rng([SEED, block]))
+    return outcomes | {"seconds": time.process_time() - started}
 
 
 def _checked(proof: Path) -> tuple[float, kernel.Verdict]:

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.kernel import shipped
 from benchmarks.machine import describe
+from benchmarks.shipped import shipped
 from nlsid_core import files, kernel, second
 from tests.core.kernel import mutations
 
