@@ -10,6 +10,7 @@ or lacks its data is named at the end, with status 1, and leaves no file.
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -96,17 +97,24 @@ def measured(benchmark: Benchmark, data: Path | None, limit: float) -> dict[str,
     command = benchmark.command(data)
     started, date = time.monotonic(), datetime.now(UTC)
     environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
-    done = subprocess.run(
-        command, cwd=ROOT, env=environment, timeout=limit, check=True, stdout=subprocess.PIPE,
-        text=True,
-    )  # fmt: skip
+    with subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        try:
+            written, _ = process.communicate(timeout=limit)
+        except BaseException:
+            os.killpg(process.pid, signal.SIGKILL)  # and what it started: nodes, workers
+            raise
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
     return {
         "command": ["python", *(_without(data, word) for word in command[1:])],
         "date": date.isoformat(timespec="seconds"),
         "machine": describe(),
         "commit": commit(),
         "seconds": round(time.monotonic() - started, 1),
-        "result": json.loads(done.stdout.strip().rpartition("\n")[2]),
+        "result": json.loads(written.strip().rpartition("\n")[2]),
     }
 
 

@@ -51,6 +51,32 @@ def test_a_benchmark_without_its_recordings_is_named_and_leaves_no_file(tmp_path
     assert not list(tmp_path.iterdir())
 
 
+def test_a_benchmark_that_takes_too_long_is_ended_with_what_it_started(tmp_path: Path) -> None:
+    """--limit: named, status 1, no file, and no process of it left."""
+    command = [sys.executable, "-m", "benchmarks", "first_order_bias", "--limit", "0.2",
+               "--out", str(tmp_path)]  # fmt: skip
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "no result: first_order_bias: " in done.stdout
+    assert "timed out after 0.2 seconds" in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_processes_of_a_benchmark_end_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A child that a benchmark waits for, and that would hold its output open for a minute."""
+    started = tmp_path / "started"
+    child = f"import os, pathlib; pathlib.Path({str(started)!r}).write_text(str(os.getpid()))"
+    script = ["-c", f"import subprocess, sys; subprocess.run([sys.executable, '-c', "
+              f"{child + '; import time; time.sleep(60)'!r}])"]  # fmt: skip
+    monkeypatch.setattr(Benchmark, "command", lambda *_: [sys.executable, *script])
+    with pytest.raises(subprocess.TimeoutExpired):
+        measured(Benchmark("any"), None, 2.0)
+    state = Path(f"/proc/{started.read_text()}/stat")
+    assert not state.exists() or state.read_text().split()[2] == "Z"
+
+
 def test_n4sid_finds_a_known_linear_system_of_two_outputs() -> None:
     A, B = np.array([[0.9, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.5]])
     C = np.array([[1.0, 0.0], [20.0, 5.0]])
