@@ -4,8 +4,9 @@ python -m benchmarks.nonlinear --data DIR [--json] [NAME ...]
 
 DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. One ladder of classes
 and methods serves every set, those for one input and output where a set has one of each. What is
-best is chosen by the simulation error on validation data among the models with a proof, fitted
-again to training and validation data together, and then simulated once over the test data.
+best is chosen by the simulation error on validation data, which no search has seen, among the
+models with a proof, fitted again to training and validation data together, then simulated once over
+the test data.
 Trials are as the owners divide them; where they name no validation data it is the end, or every
 third, of the training data. Comparators are chosen in the same way. On sets of more than
 `SAMPLES` training samples the choice is made on that many, and fitted to all.
@@ -250,7 +251,7 @@ def best_of(
     found: list[tuple[float, Any, Method, Fit[Any]]] = []
     for model_class, method in candidates:
         started = time.process_time()
-        fit = fitted(few, validation, model_class, method, proved=proved)
+        fit = fitted(few, None, model_class, method, proved=proved)
         if fit is None:
             continue
         error = simulated(case, fit, validation)
@@ -261,14 +262,15 @@ def best_of(
         return None
     error, model_class, method, fit = min(found, key=lambda entry: entry[0])
     both = Dataset((*train.trajectories, *validation.trajectories))
-    needs = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
-    again = fitted(train if needs else both, validation, model_class, method, proved=proved)
+    knots = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
+    chosen_on = (train, validation) if knots else (both, None)
+    again = fitted(*chosen_on, model_class, method, proved=proved)
     kept = fit if again is None else again
     return Best(f"{model_class}, {method.name}", error, simulated(case, kept, test))
 
 
 def fitted(
-    train: Dataset, validation: Dataset, model_class: Any, method: Method, *, proved: bool
+    train: Dataset, validation: Dataset | None, model_class: Any, method: Method, *, proved: bool
 ) -> Fit[Any] | None:
     """A fit; None if there is none, or none with a proof where one is asked for."""
     try:
@@ -294,7 +296,7 @@ def shortened(data: Dataset) -> Dataset:
     for trial in data:
         N = min(left, len(trial))
         if N > 0:
-            kept.append(Trajectory(t=trial.t[:N], y=trial.y[:N], u=trial.u[:N], name=trial.name))
+            kept.append(trial.rows(slice(N)))
         left -= N
     return Dataset(tuple(kept))
 
