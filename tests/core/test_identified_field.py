@@ -1,8 +1,10 @@
 """From recorded signals to a differential equation, and to a proved funnel of it."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +12,6 @@ from scipy.integrate import solve_ivp
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
-from nlsid_core.design import ContinuousTracking, design, plan_motion
 from nlsid_core.dynamics import VectorField, identified_field
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.identification import CertifiedSem, Fit, ImplicitClass, LinearStateClass, identify
@@ -20,6 +21,7 @@ from nlsid_core.models.signal import Signal
 from nlsid_core.proofs import check
 
 PERIOD = 0.02
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "howto-funnels.md"
 Rates = Callable[[FloatArray, FloatArray], FloatArray]
 
 
@@ -106,13 +108,17 @@ def test_every_linear_model_of_measured_states_has_a_field() -> None:
     np.testing.assert_allclose(B, [[1.0], [0.0]], atol=0.06)
 
 
-def test_a_recording_becomes_a_proved_funnel(slowed: Fit[ImplicitModel], tmp_path: Path) -> None:
-    field = identified_field(slowed.model, box=[(-2, 2), (-2, 2)], disturbance=[0.01])
-    assert field.uncertain.tolist() == [[-0.01, 0.01]]
-    motion = plan_motion(field, start=[0.0], end=[0.5], seconds=1.0, m=1)
-    found = design(ContinuousTracking(field, motion, goal=[0.2]))
-    assert found.funnel.widths(0.0)[0] > 0.1
-    found.save(tmp_path)
+def test_the_page_goes_from_a_recording_to_a_proved_funnel(tmp_path: Path) -> None:
+    (block,) = [
+        part
+        for part in re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+        if "identified_field" in part
+    ]
+    made: dict[str, Any] = {}
+    exec(block, made)
+    assert made["field"].uncertain.tolist() == [[-0.01, 0.01]]
+    assert made["funnel"].funnel.widths(0.0)[0] > 0.1
+    made["funnel"].save(tmp_path)
     assert check(tmp_path / "funnel.proof.json")
 
 
