@@ -435,7 +435,9 @@ class Writer:
                 if any(a >= b for a, b in pairwise(exponents)) or len(exponents) > MONOMIALS:
                     raise NotCovered("monomials should be distinct, in increasing order")
                 if any(len(row) != size or sum(row) > 7 for row in exponents):
-                    raise NotCovered(f"a monomial should have {size} exponents, of degree 7 at most")
+                    raise NotCovered(
+                        f"a monomial should have {size} exponents, of degree 7 at most"
+                    )
                 rows = zip(exponents, map(rational, equation["coefficients"]), strict=True)
                 terms = [to.pair(self.counts(row), self.fraction(c)) for row, c in rows]
                 equations.append(to.listed(terms))
@@ -467,7 +469,8 @@ class Writer:
         to, policy, funnel = self.to, problem.policy, problem.funnel
         to.named("field", self.field(problem.field))
         limits = (
-            to.pair(to.count(_whole(i)), self.ends([low, high])) for i, low, high in policy["limits"]
+            to.pair(to.count(_whole(i)), self.ends([low, high]))
+            for i, low, high in policy["limits"]
         )
         if len(policy["limits"]) > 3:
             raise NotCovered("more than three limits")

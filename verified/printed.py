@@ -37,7 +37,10 @@ def read(text: str) -> dict[str, Any]:
     for line in text.splitlines():
         if line.startswith("Definition "):
             name, _, term = line.removeprefix("Definition ").rstrip(".").partition(" := ")
-            found[name.partition(" ")[0]] = _term(TOKEN.findall(term), found)
+            tokens = TOKEN.findall(term)
+            if "".join(tokens) != term.replace(" ", ""):
+                raise Differs(f"{name}: not a term of numbers")
+            found[name.partition(" ")[0]] = _term(tokens, found)
     return found
 
 
@@ -94,7 +97,10 @@ def words(term: Any) -> str:
 def number(term: Any) -> Any:
     """Fractions for pairs of whole numbers, lists for lists and for other pairs."""
     if type(term) is tuple and all(type(e) is int for e in term):
-        return Fraction(*term)
+        value = Fraction(*term)
+        if (value.numerator, value.denominator) != term:
+            raise Differs(f"{term} is not in lowest terms")
+        return value
     return [number(e) for e in term] if type(term) in (list, tuple) else term
 
 
@@ -113,7 +119,8 @@ def as_written(value: Any, like: Any, where: str) -> Any:
         }
     if type(value) is list and type(like) is list and len(value) == len(like):
         return [
-            as_written(a, b, f"{where}[{i}]") for i, (a, b) in enumerate(zip(value, like, strict=True))
+            as_written(a, b, f"{where}[{i}]")
+            for i, (a, b) in enumerate(zip(value, like, strict=True))
         ]
     if isinstance(value, int | Fraction) and type(like) in (int, float, str):
         return _number(Fraction(value), like)
@@ -129,11 +136,13 @@ def _number(value: Fraction, like: Any) -> Any:
         return str(value)
     if type(like) is int and value.denominator == 1:
         return int(value)
+    if Fraction(float(value)) != value:
+        raise Differs(f"{value} is no float64")
     return copysign(0.0, like) if value == 0 else float(value)
 
 
 def differences(documents: dict[str, Any], files: dict[str, tuple[str, Any]]) -> None:
-    """Raise Differs unless the files, text and content by role, print as the theorem's documents."""
+    """Raise Differs unless the files (text and content, by role) print as these documents."""
     for role, document in documents.items():
         text, content = files[role]
         try:
@@ -157,7 +166,10 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
     around = {"t": knots, "x": nominals}
     rows = [[j, *number(ends), *_maybe(span)] for (j, ends), span in valid]
     pieces = [
-        [{"exponents": [e for e, _ in row], "coefficients": [number(c) for _, c in row]} for row in f]
+        [
+            {"exponents": [e for e, _ in row], "coefficients": [number(c) for _, c in row]}
+            for row in f
+        ]
         for f in spans
     ]
     claim: dict[str, Any] = {"goal": None}
@@ -211,12 +223,16 @@ def _witness(term: Made, limited: int, states: int, order: list[Any]) -> dict[st
 
 
 def _place(piece: dict[str, Any]) -> str:
-    return repr([piece[key] for key in ("interval", "vertex", "level", "index")] + (piece.get("mode") or []))
+    return repr(
+        [piece[key] for key in ("interval", "vertex", "level", "index")] + (piece.get("mode") or [])
+    )
 
 
 def _piece(interval: int, piece: Made, limited: int) -> dict[str, Any]:
     depth, index, vertex, mode, _kappa, mu, columns, squares, tau = piece.terms
     (rows,) = mu.terms
+    if mode >= 3**limited:
+        raise Differs(f"a mode {mode} of {limited} clipped inputs")
     digits = [mode // 3**i % 3 - 1 for i in reversed(range(limited))]
     return {
         "interval": interval, "vertex": vertex, "level": depth, "index": index,
@@ -255,6 +271,8 @@ def near(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, 
     ]
     documents["proof"] = {"proof": {"multipliers": trees if any(trees) else None}}
     if "feedback" in terms:
+        if number(terms["a"]) != documents["model"]["a"]:
+            raise Differs("the plan's model is another one than the tube's")
         documents["model"]["b"] = number([terms["b0"], *terms["b"]])
         documents["model"]["c"] = number(terms["c"])
         documents["policy"] = {"K": [number(terms["feedback"])], "L": tubes[0]["L"]}
@@ -279,31 +297,45 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
     if term.name == "Monotone":
         *e, a, shift = terms
         if like["kind"] == "monotone_equation":
+            if shift != _moved(len(a), 1):
+                raise Differs("the model does more than shift its states")
             return {"e": e, "a": [-entry for entry in a]}
         table = {(i,) + (0,) * len(a): [c] for i, c in enumerate(e, 1)}
         table |= {_unit(1 + i, 1 + len(a)): [c] for i, c in enumerate(a)}
-        moved = [[row[i] for row in shift] for i in range(len(a))]
-        states = {_unit(i, len(a)): row for i, row in enumerate(moved)}
-        return {"h": _table(table, like["h"], 1 + len(a))} | (
-            {"shift": _table(states, like["shift"], len(a))} if shift else {}
-        )
+        return {"h": _table(table, like["h"], 1 + len(a)), **_shift(shift, len(a), like)}
     p, n, scale, ends, rows = terms
     if like["kind"] == "implicit":
         ((_, E),) = rows
         columns = {_unit(j, p + n): [row[j] for row in E] for j in range(p + n)}
-        return {"h": _table(columns, like["h"], p + n)}
+        return {"h": _table(columns, like["h"], p + n), **_shift(_moved(n, p), n, like)}
+    if len(like["G"]) * p != n + p:
+        raise Differs("the model has another number of states")
     found = {tuple(e): C for e, C in rows}
     G = []
     for k, entry in enumerate(like["G"]):
         blocks = {e: [row[k * p : (k + 1) * p] for row in C] for e, C in found.items()}
         G.append(_table(blocks, entry, len(like["window"])))
-    at = [i for i, _ in like["window"]]
-    ranges = {
-        i: [Fraction(like["u_offset"][i]) + Fraction(like["u_scale"][i]) * end for end in pair]
-        for i, pair in zip(at, ends, strict=True)
-    }
+    ranges: dict[int, list[Fraction]] = {}
+    for (i, _), pair in zip(like["window"], ends, strict=True):
+        offset, size = Fraction(like["u_offset"][i]), Fraction(like["u_scale"][i])
+        found_ends = [offset + size * end for end in pair]
+        if ranges.setdefault(i, found_ends) != found_ends:
+            raise Differs(f"two ranges of input {i}")
     kept = [ranges.get(i, list(map(Fraction, row))) for i, row in enumerate(like["u_range"])]
     return {"y_scale": scale, "G": G, "u_range": kept}
+
+
+def _moved(n: int, p: int) -> list[list[Fraction]]:
+    """The first n - p of n states."""
+    return [[Fraction(i == j) for j in range(n)] for i in range(n - p)]
+
+
+def _shift(shift: list[Any], n: int, like: dict[str, Any]) -> dict[str, Any]:
+    """What becomes of the states, of an implicit model."""
+    if len(like["states"]) != n:
+        raise Differs("the model has another number of states")
+    columns = {_unit(j, n): [row[j] for row in shift] for j in range(n)}
+    return {"shift": _table(columns, like["shift"], n)} if shift else {}
 
 
 def _unit(i: int, n: int) -> tuple[int, ...]:
@@ -317,7 +349,11 @@ def _table(known: dict[tuple[int, ...], Any], like: dict[str, Any], size: int) -
     for e, coefficients in zip(like["exponents"], like["coefficients"], strict=True):
         first = tuple(e[:size])
         inputs_only = size < len(e) and not any(first)
-        given = [Fraction(c) for c in coefficients] if inputs_only else [Fraction(0)] * len(coefficients)
+        given = (
+            [Fraction(c) for c in coefficients]
+            if inputs_only
+            else [Fraction(0)] * len(coefficients)
+        )
         rows.append(left.pop(first, given))
     if any(_flat(coefficients) != [0] * len(_flat(coefficients)) for coefficients in left.values()):
         raise Differs("monomials that the file does not have")
