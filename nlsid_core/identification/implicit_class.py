@@ -18,8 +18,9 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.implicit_sets import Names
 from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.regressors import refuse_poor, signal_scale
-from nlsid_core.models import ImplicitModel, Signal
+from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
@@ -41,7 +42,9 @@ class ImplicitClass:
     5. coupled: whether w is multiplied with x to total degree right_degree instead of added. box:
     (low, high) of every output, then every input, in their units, for stability on it (None:
     everywhere).
-    storage_degree: of the storage's metric in "2.10", 0 to 4.
+    storage_degree: of the storage's metric in "2.10", 0 to 4. continuous: of measured states, only
+    models that E dx/dt = g(x) + r(u) makes by the trapezoidal rule, e = Ex - hg/2 and f = Ex + hg/2
+    + hr: `dynamics.identified_field` is then the equation itself.
     Raises OptionError, or DataError for a combination that no model can satisfy.
     """
 
@@ -54,6 +57,7 @@ class ImplicitClass:
     coupled: bool = False
     box: Box | None = None
     storage_degree: int = 0
+    continuous: bool = False
     kind: ClassVar[type[ImplicitModel]] = ImplicitModel
 
     def __post_init__(self) -> None:
@@ -71,6 +75,13 @@ class ImplicitClass:
             raise DataError(f"storage_degree is for set 2.10, not {self.set}")
         if self.set == "2.19" and (self.left_degree, self.right_degree, self.box) != (1, 1, None):
             raise DataError("set 2.19 is linear: left_degree 1, right_degree 1, no box")
+        if self.continuous and (self.lags, self.delays, self.coupled) != (1, (1,), False):
+            raise DataError("continuous models have measured states: lags 1, delays [1], uncoupled")
+        if self.continuous and self.left_degree != self.right_degree:
+            raise DataError(
+                f"continuous models have left_degree and right_degree the same, not "
+                f"{self.left_degree} and {self.right_degree}"
+            )
         if self.box is None:
             self._refuse_growth()
 
@@ -247,15 +258,8 @@ def with_signals(
 ) -> ImplicitModel:
     """The model with the signals and recordings it was made from."""
     first = dataset.trajectories[0]
-    y, u = (
-        tuple(Signal(*labels) for labels in zip(names, units, paths, strict=True))
-        for names, units, paths in (
-            (first.y_names, first.y_units, first.y_paths),
-            (first.u_names, first.u_units, first.u_paths),
-        )
-    )
-    bags = tuple((trial.name, trial.digest) for trial in dataset)
-    return replace(model, y=y, u=u, window=window, bags=bags)
+    y, u = signals_of(first, "y"), signals_of(first, "u")
+    return replace(model, y=y, u=u, window=window, bags=dataset.bags)
 
 
 def _refuse_data_outside(rows: ImplicitRows) -> None:

@@ -39,18 +39,16 @@ def derivative(p: Terms, j: int) -> Terms:
 
 
 def along(
-    ps: Sequence[Terms], at: Sequence[Polynomial], direction: Sequence[Polynomial], ring: Ring,
-    first: int = 0,
-) -> list[Polynomial]:  # fmt: skip
-    """Σ_j ∂p/∂(variable first + j) direction[j] of each p, with `at` in the variables' place."""
+    ps: Sequence[Terms], at: Sequence[Polynomial], direction: Sequence[Polynomial], ring: Ring
+) -> list[Polynomial]:
+    """Σ_j ∂p/∂(variable j) direction[j] of each p, with `at` in the variables' place."""
     size = len(direction)
-    slopes = [derivative(p, first + j) for p in ps for j in range(size)]
-    found = ring.substituted(slopes, at)
+    found = ring.substituted([derivative(p, j) for p in ps for j in range(size)], at)
     return [ring.dot(found[i : i + size], direction) for i in range(0, size * len(ps), size)]
 
 
-def shown(p: Terms, names: Sequence[str]) -> str:
-    """p with its exact coefficients, highest degree first; its size alone if that is too long."""
+def shown(p: Terms, names: Sequence[str], what: str) -> str:
+    """p with its exact coefficients, highest degree first; if too long, its place and size."""
     result = ""
     for exponents, coefficient in reversed(p):
         if not coefficient:
@@ -69,5 +67,5 @@ def shown(p: Terms, names: Sequence[str]) -> str:
         result += " ".join(parts)
         if len(result) > MAX_SHOWN:
             degree = max(sum(e) for e, _ in p)
-            return f"the claim's polynomial of degree {degree} with {len(p)} terms"
+            return f"the claim's {what} of degree {degree} with {len(p)} terms"
     return result or "0"
