@@ -148,6 +148,20 @@ def test_an_input_that_is_clipped_may_be_held_too() -> None:
     assert "every 0.02 s or more often" in found.verdict.assumptions[0]
 
 
+def test_a_clipped_input_of_several_states_may_be_held_too() -> None:
+    """The angle enters nonlinearly and the rate does not: the proof takes the rate first."""
+    found = design(tracking(limits=[[-4.5, 3.0]], hold=HOLD))
+    assert "u0 clipped to [-4.5, 3]" in found.verdict.assumptions[0]
+    assert largest(found, hold=HOLD) < 1
+
+
+def test_without_an_input_there_is_nothing_to_hold() -> None:
+    field = VectorField.from_function(lambda x: -x, 1, 0)
+    nominal = integrate_nominal(field, lambda _: np.zeros(0), t=np.linspace(0, 1, 5), start=[0.0])
+    with pytest.raises(DataError, match="there is no input to hold"):
+        design(ContinuousTracking(field, nominal, goal=[[1.0]], hold=0.01))
+
+
 def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
     with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
         design(tracking(hold=1.0))
