@@ -1,7 +1,8 @@
 """The same for Foxglove: its websocket protocol, by foxglove-sdk (extra `view`).
 
 Topics: /nlsid/margin, /nlsid/signals, /nlsid/status (JSON) and /nlsid/events (foxglove.Log), logged
-at the judged samples' stamps. config/foxglove_layout.json shows them.
+at the judged samples' stamps. config/foxglove_layout.json shows them. The first viewer that comes
+is sent the events of before, which bear their stamps; it draws samples when they arrive.
 """
 
 import importlib.util
@@ -47,10 +48,29 @@ def serve_foxglove(scene: Scene, *, host: str, port: int) -> Iterator[str]:
         raise DataError("foxglove-sdk is not installed: pip install 'nlsid[view]', or use --page")
     import foxglove
 
-    context = foxglove.Context()
-    server = foxglove.start_server(name="nlsid view", host=host, port=port, context=context)
+    class Viewers(foxglove.websocket.ServerListener):
+        """Who hears of events; the first of them sets `first`."""
+
+        def __init__(self) -> None:
+            self.first = threading.Event()
+            self._ids = set[int]()
+
+        def on_subscribe(self, client: Any, channel: Any) -> None:
+            if channel.topic == EVENTS:
+                if not self._ids:
+                    self.first.set()
+                self._ids.add(client.id)
+
+        def on_unsubscribe(self, client: Any, channel: Any) -> None:
+            if channel.topic == EVENTS:
+                self._ids.discard(client.id)
+
+    context, viewers = foxglove.Context(), Viewers()
+    server = foxglove.start_server(
+        name="nlsid view", host=host, port=port, context=context, server_listener=viewers
+    )
     closing = threading.Event()
-    thread = threading.Thread(target=_send, args=(scene, context, closing))
+    thread = threading.Thread(target=_send, args=(scene, context, viewers.first, closing))
     thread.start()
     try:
         yield f"ws://{host}:{server.port}"
@@ -60,7 +80,7 @@ def serve_foxglove(scene: Scene, *, host: str, port: int) -> Iterator[str]:
         server.stop()
 
 
-def _send(scene: Scene, context: Any, closing: threading.Event) -> None:
+def _send(scene: Scene, context: Any, first: threading.Event, closing: threading.Event) -> None:
     import foxglove
     from foxglove.channels import LogChannel
 
@@ -74,6 +94,9 @@ def _send(scene: Scene, context: Any, closing: threading.Event) -> None:
     sampled = told = tick = 0
     newest_ns, before = 0, None
     while not closing.wait(TICK):
+        if first.is_set():
+            first.clear()
+            told = 0
         sampled, samples = scene.samples_after(sampled, 10**9)
         told, events = scene.events_after(told)
         for sample in samples:

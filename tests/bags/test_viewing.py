@@ -393,6 +393,31 @@ def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None
     assert heard[foxglove.STATUS][0][1]["word"] == "inside"
 
 
+def test_who_opens_foxglove_late_is_told_what_happened_before() -> None:
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk (extra `view`)")
+    over = Scene("a recording", "replay")
+    with serve_foxglove(over, host=LOCAL, port=0) as address:
+        port = urlsplit(address).port
+        assert port is not None
+        over.say(10**9, "monitor", ERROR, "outside: speed")
+        time.sleep(4 * foxglove.TICK)  # told to nobody
+        for _viewer in range(2):  # the second one comes after the first has gone
+            with WebSocket(port, protocol="foxglove.sdk.v1") as client:
+                channels: dict[str, int] = {}
+                while len(channels) < 4:
+                    for each in json.loads(client.receive()).get("channels", ()):
+                        channels[each["topic"]] = each["id"]
+                wanted = [{"id": i, "channelId": i} for i in channels.values()]
+                client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+                heard = dict[int, bytes]()
+                while channels[foxglove.EVENTS] not in heard:
+                    data = client.receive()
+                    if data[:1] == b"\x01":
+                        heard[struct.unpack("<I", data[1:5])[0]] = data[13:]
+            assert b"outside: speed" in heard[channels[foxglove.EVENTS]]
+            time.sleep(4 * foxglove.TICK)
+
+
 def test_without_foxglove_it_says_what_to_install(
     watched: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

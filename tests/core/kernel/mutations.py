@@ -11,7 +11,7 @@ import math
 import pickle
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +73,21 @@ def corpus() -> tuple[Case, ...]:
     return tuple(cases)
 
 
+@lru_cache(maxsize=512)
+def _encoded(pickled: bytes) -> bytes:
+    return files.encode(pickle.loads(pickled))
+
+
+def encoded(document: Json) -> bytes:
+    """As it is saved: most files of a mutant are those of its case, and are not written again."""
+    return _encoded(pickle.dumps(document))
+
+
 def decide(case: Case) -> str:
     """`proved`, `rejected`, or `not decided` for a refusal that no reason was meant for."""
     try:
-        contents = {name: files.encode(about) for name, about in case.about.items()}
-        kernel.decide(files.encode(case.document), lambda name: contents[name])
+        contents = {name: encoded(about) for name, about in case.about.items()}
+        kernel.decide(encoded(case.document), lambda name: contents[name])
     except Rejected as refusal:
         return "not decided" if str(refusal).startswith("not decided") else "rejected"
     except (ValueError, TypeError):  # a document that cannot even be written
@@ -105,13 +115,13 @@ def bind_again(forged: Case) -> None:
         for name, role in (("policy", of), ("funnel", of), ("funnel", "policy")):
             with contextlib.suppress(ValueError, TypeError, KeyError):
                 document = forged.about[f"{prefix}{name}.json"]
-                document[role] = files.digest(forged.about[f"{prefix}{role}.json"])
+                document[role] = files.digest(encoded(forged.about[f"{prefix}{role}.json"]))
     for document in (*forged.about.values(), forged.document):
         claim = document.get("claim")
         bindings = claim.get("about") if isinstance(claim, dict) else None
         for binding in bindings.values() if isinstance(bindings, dict) else ():
             with contextlib.suppress(ValueError, TypeError, KeyError):
-                binding["digest"] = files.digest(forged.about[binding["file"]])
+                binding["digest"] = files.digest(encoded(forged.about[binding["file"]]))
 
 
 def run(count: int, rng: np.random.Generator) -> dict[str, Any]:
