@@ -203,7 +203,7 @@ class TrackingController(ManagedNode):
         if self._watched and not self.count_publishers(self._margin.topic_name):
             self._controller = None
             return f"require_monitor is set and nobody publishes {self._margin.topic_name}"
-        self._first_ns = None
+        self._first_ns, self._stage = None, 1
         self._tell("waiting for the response")
         return ""
 
@@ -235,9 +235,17 @@ class TrackingController(ManagedNode):
                 self._judged, self._announced_ns = self._heard, stamp_ns
                 announced = Run(stamp_ns, self._digest).document()
                 self._announce.publish(String(data=files.encode(announced).decode()))
-                self._tell("tracking")
+                self._tell(self._tracking(controller))
+            elif controller.stage != self._stage:
+                self._tell(self._tracking(controller))
         self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
         self._on_due()
+
+    def _tracking(self, controller: Controller) -> str:
+        """What is being done, and of a composition in which stage."""
+        self._stage = controller.stage
+        many = controller.stages > 1
+        return f"tracking, stage {self._stage} of {controller.stages}" if many else "tracking"
 
     def _distrust(self, stamp_ns: int, message: Any) -> str:
         """Why a response is not to be acted on though its number could be; empty if it is."""

@@ -1,9 +1,13 @@
 """A continuous funnel made by hand: the monitor's and the controller's, not the checker's."""
 
+from pathlib import Path
+
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.dynamics import VectorField, constant_on, linear_through
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, Goal, compose_funnels, design
+from nlsid_core.dynamics import Nominal, VectorField, constant_on, linear_through
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 
@@ -28,3 +32,16 @@ def stage(t0: float = 0.0, radius: float = RADIUS, *, limit: float | None = None
     rho = (np.linspace(radius, radius / 2, 5)) ** 2
     funnel = ContinuousFunnel(x, np.ones((5, 1, 1)), rho, digest, files.digest(policy.document()))
     return field, policy, funnel
+
+
+def composed(folder: Path) -> Path:
+    """Two such stages, proved and composed in `folder`, which is returned."""
+    goal: Goal | FloatArray = np.array([[25.0]])
+    proofs = []
+    for t0 in (1.0, 0.0):
+        field, policy, _ = stage(t0)
+        nominal = Nominal(policy.x, policy.u)
+        found = design(ContinuousTracking(field, nominal, goal=goal, policy=policy))
+        proofs.insert(0, found.save(folder / f"from {t0:g}")[-1])
+        goal = Goal.start_of(found.funnel)
+    return compose_funnels(proofs, folder / "whole").parent

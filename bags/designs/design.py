@@ -62,7 +62,8 @@ class WiredDesign(Generic[M, P, F]):
     """The parts of a design of any kind, and where their signals are.
 
     wiring: of a continuous funnel, None until somebody says it. held: how the proof of a continuous
-    funnel lets its policy be applied.
+    funnel lets its policy be applied. later: of a composition, the stages that follow this one;
+    composition: the digest of its proof.
     """
 
     model: M
@@ -70,6 +71,13 @@ class WiredDesign(Generic[M, P, F]):
     funnel: F
     wiring: Wiring | None = None
     held: Held = CONTINUOUSLY
+    later: "tuple[WiredDesign[M, P, F], ...]" = ()
+    composition: str = ""
+
+    @property
+    def stages(self) -> "tuple[WiredDesign[M, P, F], ...]":
+        """This one, and those of a composition that follow."""
+        return self, *self.later
 
     @property
     def name(self) -> str:
@@ -126,11 +134,15 @@ class WiredDesign(Generic[M, P, F]):
 
     @property
     def digest(self) -> str:
-        """Of the funnel's document: how an announcement names it."""
-        return files.digest(self.funnel.document())
+        """Of the funnel's document, or of the composition's proof: how an announcement names it."""
+        return self.composition or files.digest(self.funnel.document())
 
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
+        if self.later:
+            parts: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+            held = [stage.held for stage in self.stages]
+            return Monitor.of_stages(parts, period=self.period, held=held)
         period = self.period if isinstance(self.model, VectorField) else None
         return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period,
                        held=self.held)  # fmt: skip
@@ -140,6 +152,11 @@ class WiredDesign(Generic[M, P, F]):
         period = self.period if isinstance(self.model, VectorField) else None
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
+        if self.later:
+            parts: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+            return Controller.of_stages(
+                parts, limits=limits, settling=settling, period=self.period, held=self.held
+            )
         return Controller(
             self.model,
             self.policy,

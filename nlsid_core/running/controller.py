@@ -120,13 +120,15 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
+        held: Held | None = None,
     ) -> "Controller":
-        """The policies of a composition, one stage after another.
+        """The policies of a composition, one stage after another; `stage` is which.
 
-        None has a hold: what is held into the next stage is covered by no proof.
+        held: of the first stage, its errors. None has a hold: what is held into the next stage is
+        covered by no proof.
         """
         controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period, None)
+        controller._follow(list(stages), limits, settling, period, held)
         return controller
 
     def _follow(
@@ -162,6 +164,7 @@ class Controller:
             limits.refuse(np.size(planned.planned[0]))
             self._refuse_cut(planned.planned)
         self.ended = ""
+        self.stage = 1  # of a composition, counted from 1
         self.k = -1
         self.u: Any = limits.clip(policy.planned[0])  # the input in force at the next sample
         if self._observer.ahead:
@@ -194,6 +197,11 @@ class Controller:
         self._answer(self._when(t), x)
         return self.u
 
+    @property
+    def stages(self) -> int:
+        """How many stages there are: 1 but for a composition."""
+        return len(self._stages)
+
     def _when(self, t: float) -> float:
         """The moment of the next input, as the funnels count."""
         if self._continuous:
@@ -202,7 +210,8 @@ class Controller:
 
     def _stage(self, when: float) -> tuple[Any, Any, Any]:
         """The stage that is on: of a composition the first that has not ended."""
-        return next((s for s in self._stages[:-1] if when < s[2].last), self._stages[-1])
+        self.stage = 1 + sum(when >= stage[2].last for stage in self._stages[:-1])
+        return self._stages[self.stage - 1]
 
     def _settle(self, t: float, y: Any) -> None:
         """Wait for a state from which the funnel may start."""

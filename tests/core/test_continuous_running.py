@@ -167,20 +167,25 @@ def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     """At 0.8 s of the first stage 0.15 m is outside, at the second's start it is inside."""
     first, second = stage(), stage(1.0, 0.3)
     monitor = Monitor.of_stages([first, second], period=0.2)
-    said = []
+    said, stages = [], []
     for k in range(11):
         t = 0.2 * k
         x = np.array([t + (0.15 if 3 < k < 6 else 0.0)])
         policy = first[1] if t < 1.0 - 1e-9 else second[1]
-        said.append(monitor.update(t, x, policy(t, x)).status)
+        reading = monitor.update(t, x, policy(t, x))
+        said.append(reading.status)
+        stages.append(reading.assuming.split(":")[0])
     radius = 0.2 - 0.1 * 0.8
     assert radius < 0.15 < 0.3
     outside = [k for k, status in enumerate(said) if status is Status.OUTSIDE]
     assert outside == [4]
+    assert stages == ["stage 1 of 2"] * 5 + ["stage 2 of 2"] * 6
     assert set(said) == {Status.INSIDE, Status.OUTSIDE}
     controller = Controller.of_stages([first, second], limits=LIMITS, settling=1.0, period=HELD)
+    assert (controller.stage, controller.stages) == (1, 2)
     states, said = driven(controller, Monitor.of_stages([first, second], period=HELD), 0.1)
     assert controller.ended == "the proof is over"
+    assert controller.stage == 2
     assert len(states) == round(2.0 / HELD) + 1
     assert set(said) == {Status.INSIDE}
     with pytest.raises(CertificateMismatch, match="do not follow"):
