@@ -19,9 +19,6 @@ MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "n
            "Q", "R", "limits", "hold", "error")  # fmt: skip
 
 
-WORDS = ("shape", "gain", "objective")
-
-
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
     """`ContinuousTracking` with a vector field, in its words.
@@ -96,7 +93,9 @@ class FunnelProblem:
             _array(document, "Q", (field.n, field.n), source),
             _array(document, "R", (field.m, field.m), source),
             _goal(document, field.n, source),
-            *(files.member(words, key, str, source=source) for key in WORDS),
+            files.member(words, "shape", str, source=source),
+            files.member(words, "gain", str, source=source),
+            files.member(words, "objective", str, source=source),
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),

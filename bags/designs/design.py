@@ -1,6 +1,6 @@
 """What a robot runs and is held against: a model, a policy and a funnel that belong together."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, TypeAlias, TypeGuard, TypeVar
@@ -55,6 +55,13 @@ class Wiring:
     def parse(cls, response: Iterable[str], command: Iterable[str], period: float) -> "Wiring":
         """Read each `topic:field.path[index]`; BagError if a vector is not on one topic."""
         return cls(SignalVector.parse(response), SignalVector.parse(command), period)
+
+    @classmethod
+    def parse_if_any(
+        cls, response: Sequence[str], command: Sequence[str], period: float
+    ) -> "Wiring | None":
+        """`parse`, None if neither was said."""
+        return cls.parse(response, command, period) if response or command else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,13 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.chain.joint_bags import JOINTS, _make
 from bags.designs.design import WiredDesign, Wiring
-from bags.monitoring.announcement import Run
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
-from bags.recordings.message_types import standard_types
-from bags.recordings.writer import BagWriter
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
@@ -22,7 +18,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
-from tests.continuous_stage import stage
+from tests.continuous_stage import stage, write_run
 
 HELD = 0.02  # s
 LIMITS = Limits(lowest=-20.0, highest=20.0, stop_rate=1.0)
@@ -261,22 +257,8 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
         u = controller.update(len(samples) * HELD, x)
         samples.append((x, u))
         x = x + HELD * u
-    start_ns, period_ns, empty = 10**12, round(HELD * 1e9), np.zeros(0)
-    with BagWriter(tmp_path / "bag") as writer:
-
-        def write(topic: str, kind: str, stamp_ns: int, content: object) -> None:
-            data = bytes(standard_types().serialize_cdr(content, kind, little_endian=True))
-            writer.write(topic, kind, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
-
-        text = files.encode(Run(start_ns, design.digest).document()).decode()
-        string = "std_msgs/msg/String"
-        write("/controller/run", string, start_ns, _make(string, text))
-        for k, (state, effort) in enumerate([(samples[0][0], np.ones(1)), *samples]):
-            stamp_ns = start_ns + (k - 1) * period_ns
-            stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
-            header = _make("std_msgs/msg/Header", stamp, "")
-            write("/joints", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], state, empty, empty))
-            write("/effort", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], empty, empty, effort))
+    period_ns = round(HELD * 1e9)
+    write_run(tmp_path / "bag", design, samples)
     replayed = [entry.reading for entry in replay_messages(design, tmp_path / "bag")]
     assert replayed[0].reason == "waiting for the controller to announce its start"
     monitor = Monitor(field, policy, funnel, period=HELD)
