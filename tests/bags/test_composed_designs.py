@@ -97,5 +97,5 @@ def test_it_is_driven_from_stage_to_stage_and_held_against_each(
     widths = HalfWidths(design)
     for k in (0, 19, 20, 40):
         stage: Any = design.stages[int(k >= 20)].funnel
-        said = widths.of(Reading(0.05 * k, Status.INSIDE))
-        assert said["half_width"] == pytest.approx(stage.widths(0.05 * k)[0])
+        shown = widths.of(Reading(0.05 * k, Status.INSIDE))
+        assert shown["half_width"] == pytest.approx(stage.widths(0.05 * k)[0])
