@@ -4,8 +4,9 @@ python -m benchmarks.nonlinear --data DIR [--json] [NAME ...]
 
 DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. One ladder of classes
 and methods serves every set, those for one input and output where a set has one of each. What is
-best is chosen by the simulation error on validation data among the models with a proof, fitted
-again to training and validation data together, and then simulated once over the test data.
+best is chosen, among the models with a proof, by the simulation error over training and validation
+data, each simulated by a model of the other, which no choice of the search has seen; it is fitted
+again to both together, then simulated once over the test data.
 Trials are as the owners divide them; where they name no validation data it is the end, or every
 third, of the training data. Comparators are chosen in the same way. On sets of more than
 `SAMPLES` training samples the choice is made on that many, and fitted to all.
@@ -20,6 +21,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -28,8 +30,8 @@ import numpy as np
 from scipy.io import loadmat
 
 from bags.samples import convert_dart
+from benchmarks import machine
 from benchmarks.arms import kuka, schunk
-from benchmarks.machine import describe
 from benchmarks.recorded import heat_exchanger, single, wiener_hammerstein
 from benchmarks.subspace import n4sid
 from nlsid_core.arrays import FloatArray
@@ -48,6 +50,7 @@ from nlsid_core.identification import (
     Rse,
     Sem,
     StateAffineClass,
+    describe,
     identify,
 )
 from nlsid_core.identification.cells import Limit
@@ -57,6 +60,7 @@ SAMPLES = 10_000
 STEPS = 15  # of an iterated search
 ORDERS = (2, 4)
 PERCENT = "%"
+Simulator = Callable[[Dataset], list[FloatArray]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,48 +248,67 @@ def best_of(
     case: PublicSet, candidates: Sequence[tuple[Any, Method]], data: tuple[Dataset, ...], *,
     proved: bool,
 ) -> Best | None:  # fmt: skip
-    """The candidate with the least validation error, fitted again and tested."""
+    """The candidate with the least cross-validated error, fitted again and tested."""
     train, validation, test = data
-    few = shortened(train)
-    found: list[tuple[float, Any, Method, Fit[Any]]] = []
+    found: list[tuple[float, Any, Method]] = []
     for model_class, method in candidates:
         started = time.process_time()
-        fit = fitted(few, validation, model_class, method, proved=proved)
-        if fit is None:
+
+        def simulator(
+            few: Dataset, model_class: Any = model_class, method: Method = method
+        ) -> Simulator:
+            model = fitted(few, None, model_class, method, proved=proved).model
+            return lambda trials: simulate_trials(model, trials.trajectories)
+
+        error = crossed(case, simulator, train, validation)
+        if error is None:
             continue
-        error = simulated(case, fit, validation)
-        found.append((error, model_class, method, fit))
+        found.append((error, model_class, method))
         seconds = time.process_time() - started
-        print(f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {model_class}", flush=True)
-    if not found:
-        return None
-    error, model_class, method, fit = min(found, key=lambda entry: entry[0])
+        print(
+            f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {describe(model_class)}", flush=True
+        )
     both = Dataset((*train.trajectories, *validation.trajectories))
-    needs = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
-    again = fitted(train if needs else both, validation, model_class, method, proved=proved)
-    kept = fit if again is None else again
-    return Best(f"{model_class}, {method.name}", error, simulated(case, kept, test))
+    for error, model_class, method in sorted(found, key=lambda entry: entry[0]):
+        knots = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
+        made, chosen_by = (train, validation) if knots else (both, None)
+        try:
+            fit = fitted(made, chosen_by, model_class, method, proved=proved)
+        except NlsidError:
+            continue
+        with np.errstate(over="ignore", invalid="ignore"):
+            outputs = simulate_trials(fit.model, test.trajectories)
+        reached = case.score(outputs, test, skipped=case.skipped)
+        return Best(f"{describe(model_class)}, {method.name}", error, reached)
+    return None
+
+
+def crossed(
+    case: PublicSet, simulator: Callable[[Dataset], Simulator], *halves: Dataset
+) -> float | None:
+    """The error over both halves, each simulated by a model of the other's first SAMPLES samples.
+
+    None if one of them makes no model.
+    """
+    outputs: list[FloatArray] = []
+    for judged, other in zip(halves, halves[::-1], strict=True):
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                outputs += simulator(shortened(other))(judged)
+        except (NlsidError, ValueError, np.linalg.LinAlgError) as reason:
+            print(f"    no model: {str(reason)[:100]}", flush=True)
+            return None
+    return case.score(outputs, Dataset((*halves[0], *halves[1])), skipped=case.skipped)
 
 
 def fitted(
-    train: Dataset, validation: Dataset, model_class: Any, method: Method, *, proved: bool
-) -> Fit[Any] | None:
-    """A fit; None if there is none, or none with a proof where one is asked for."""
-    try:
-        return identify(
-            train, model_class, method=method, comparators=(), validation=validation,
-            allow_unproved=not proved,
-        )  # fmt: skip
-    except NlsidError as reason:
-        print(f"    no {type(model_class).__name__} by {method.name}: {str(reason)[:100]}")
-        return None
-
-
-def simulated(case: PublicSet, fit: Fit[Any], data: Dataset) -> float:
-    """The case's score of a fit."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        outputs = simulate_trials(fit.model, data.trajectories)
-    return case.score(outputs, data, skipped=case.skipped)
+    train: Dataset, validation: Dataset | None, model_class: Any, method: Method, *, proved: bool
+) -> Fit[Any]:
+    """A fit; NlsidError if there is none, or none with a proof where one is asked for."""
+    return identify(
+        train, model_class, method=method, comparators=(), validation=validation,
+        allow_unproved=not proved,
+    )  # fmt: skip
 
 
 def shortened(data: Dataset) -> Dataset:
@@ -294,7 +317,7 @@ def shortened(data: Dataset) -> Dataset:
     for trial in data:
         N = min(left, len(trial))
         if N > 0:
-            kept.append(Trajectory(t=trial.t[:N], y=trial.y[:N], u=trial.u[:N], name=trial.name))
+            kept.append(trial.rows(slice(N)))
         left -= N
     return Dataset(tuple(kept))
 
@@ -302,21 +325,21 @@ def shortened(data: Dataset) -> Dataset:
 def subspace(case: PublicSet, data: tuple[Dataset, ...]) -> Best | None:
     """N4SID of the orders, chosen in the same way."""
     train, validation, test = data
+
+    def simulator(few: Dataset, order: int) -> Simulator:
+        model = n4sid(few, order)
+        return lambda trials: [model.simulate(trial) for trial in trials]
+
     found = []
     for order in ORDERS:
-        try:
-            model = n4sid(shortened(train), order)
-        except (ValueError, np.linalg.LinAlgError):
-            continue
-        error = case.score(
-            [model.simulate(t) for t in validation], validation, skipped=case.skipped
-        )
-        found.append((error, order))
+        error = crossed(case, partial(simulator, order=order), train, validation)
+        if error is not None:
+            found.append((error, order))
     if not found:
         return None
     error, order = min(found)
-    both = shortened(Dataset((*train.trajectories, *validation.trajectories)))
-    outputs = [n4sid(both, order).simulate(trial) for trial in test]
+    both = shortened(Dataset((*train, *validation)))
+    outputs = simulator(both, order)(test)
     return Best(f"order {order}", error, case.score(outputs, test, skipped=case.skipped))
 
 
@@ -349,7 +372,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", help="parts of names; all by default")
     arguments = parser.parse_args()
     wanted = [s for s in SETS if not arguments.names or any(n in s.name for n in arguments.names)]
-    print(f"test error in simulation, {describe()}\n")
+    print(f"test error in simulation, {machine.describe()}\n")
     rows = {}
     for case in wanted:
         print(case.name, flush=True)

@@ -373,8 +373,6 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"excitation, not by a {kind.__name__} with {said}; leave out `profile` for a tube "
             "around the model's simulation, or use `nlsid track` for a measured state"
         )
-    if kind is BlockCascadeClass and not config.split.validation:
-        yield "split.validation: a block_cascade chooses its knots on validation trials; name bags"
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):
         given = getattr(config.identification.model_class, key, None)
         if given is not None and len(given) not in options:

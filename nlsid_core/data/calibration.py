@@ -82,13 +82,8 @@ def windows(trials: Iterable[Trajectory], samples: int) -> tuple[Trajectory, ...
             part = slice(first, first + samples)
             where = f"[{before + first}:{before + first + samples}]"
             cut.append(
-                replace(
-                    trial,
-                    t=trial.t[part], y=trial.y[part], u=trial.u[part],
-                    x=None if trial.x is None else trial.x[part],
-                    name=trial.name + where, digest=recording(trial) + where,
-                )
-            )  # fmt: skip
+                replace(trial.rows(part, trial.name + where), digest=recording(trial) + where)
+            )
         before += len(trial)
     return tuple(cut)
 

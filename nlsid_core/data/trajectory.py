@@ -1,7 +1,7 @@
 """Recorded or nominal motions: `Trajectory`, and `Dataset`, several of them on one time grid."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -83,6 +83,15 @@ class Trajectory:
             )
         return period
 
+    def rows(self, part: slice, name: str | None = None) -> "Trajectory":
+        """These samples of it, called so (None: as it is)."""
+        return replace(
+            self,
+            t=self.t[part], y=self.y[part], u=self.u[part],
+            x=None if self.x is None else self.x[part],
+            name=self.name if name is None else name,
+        )  # fmt: skip
+
     @property
     def _label(self) -> str:
         return self.name or "trajectory"
@@ -139,6 +148,11 @@ class Dataset:
     def names(self) -> tuple[str, ...]:
         """The trajectories' names, in order."""
         return tuple(trajectory.name for trajectory in self.trajectories)
+
+    @property
+    def bags(self) -> tuple[tuple[str, str], ...]:
+        """(name, digest of its recording) of every trajectory, as a model names them."""
+        return tuple((trajectory.name, trajectory.digest) for trajectory in self.trajectories)
 
     def select(self, names: Sequence[str]) -> "Dataset":
         """The named trajectories, in the order given; DataError names an unknown one."""

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
+from scipy.sparse import csr_array, dia_array
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
@@ -56,19 +57,21 @@ class Rows:
         return max(self.offsets) - min(*self.offsets, 0) + own
 
     @cached_property
-    def groups(self) -> tuple[tuple[int, slice | list[int]], ...]:
-        """(diagonal, its left parameters), a slice where they are neighbours."""
+    def groups(self) -> tuple[tuple[int, slice | list[int], FloatArray], ...]:
+        """(diagonal, its left parameters, their weights), a slice where they are neighbours."""
         members: dict[int, list[int]] = {}
         for i, D in enumerate(self.offsets):
             members.setdefault(D, []).append(i)
-        return tuple(
-            (D, slice(found[0], found[-1] + 1) if found[-1] - found[0] + 1 == len(found) else found)
-            for D, found in members.items()
-        )
+        made = []
+        for D, found in members.items():
+            together = found[-1] - found[0] + 1 == len(found)
+            group = slice(found[0], found[-1] + 1) if together else found
+            made.append((D, group, self.weights[:, group]))
+        return tuple(made)
 
     def G(self, theta: FloatArray) -> Diagonals:
         """G(θ) by diagonals."""
-        return {D: self.weights[:, group] @ theta[group] for D, group in self.groups}
+        return {D: weights @ theta[group] for D, group, weights in self.groups}
 
     def weighed(self, G: Diagonals) -> Diagonals:
         """G W⁻¹."""
@@ -97,20 +100,11 @@ def shift(x: FloatArray, D: int) -> FloatArray:
     return moved
 
 
-def times(G: Diagonals, x: FloatArray) -> FloatArray:
-    """G x for x (N,) or (N, m)."""
-    result = np.zeros_like(x)
-    for D, diagonal in G.items():
-        result += (diagonal if x.ndim == 1 else diagonal[:, None]) * shift(x, D)
-    return result
-
-
-def transposed_times(G: Diagonals, x: FloatArray) -> FloatArray:
-    """G' x for x (N,)."""
-    result = np.zeros_like(x)
-    for D, diagonal in G.items():
-        result += shift(diagonal * x, -D)
-    return result
+def sparse(G: Diagonals) -> csr_array:
+    """G as a sparse matrix."""
+    N = len(next(iter(G.values())))
+    rows = np.array([shift(diagonal, -D) for D, diagonal in G.items()])
+    return dia_array((rows, [-D for D in G]), shape=(N, N)).tocsr()
 
 
 def product(G: Diagonals, H: Diagonals) -> Diagonals:

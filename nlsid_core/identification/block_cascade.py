@@ -22,7 +22,8 @@ from nlsid_core.identification.cascade_starts import (
 )
 from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.stability import StabilityProof, prove_stability
-from nlsid_core.models import BlockCascade, Signal
+from nlsid_core.models import BlockCascade
+from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_one_of, require_whole
 from nlsid_core.progress import Progress, silent
 
@@ -257,13 +258,6 @@ def _shortened(trial: Trial, samples: int) -> Trial:
 def _model(parameters: Parameters, scales: tuple[float, float], train: Dataset) -> BlockCascade:
     """Scaling undone: the only place where it is."""
     first = train.trajectories[0]
-
-    def signal(letter: str) -> Signal:
-        name, unit, path = (
-            getattr(first, f"{letter}_{key}")[0] for key in ("names", "units", "paths")
-        )
-        return Signal(name, unit, path)
-
     b1: FloatArray = parameters.b1 / scales[0]
     return BlockCascade(
         a1=parameters.a1,
@@ -272,11 +266,7 @@ def _model(parameters: Parameters, scales: tuple[float, float], train: Dataset) 
         a2=parameters.a2,
         b2=parameters.b2 * scales[1],
         period=train.period,
-        y=signal("y"),
-        u=signal("u"),
-        bags=tuple((trial.name, trial.digest) for trial in train),
+        y=signals_of(first, "y")[0],
+        u=signals_of(first, "u")[0],
+        bags=train.bags,
     )
-
-
-def _silent(_what: str, _fraction: float) -> None:
-    return None

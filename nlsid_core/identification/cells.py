@@ -20,11 +20,12 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, Infeasible, OptionError, ShapeError
 from nlsid_core.identification.fit import Step
 from nlsid_core.identification.stability import StabilityProof, prove_stability
-from nlsid_core.models import CellNetwork, PiecewiseLinear, Signal
+from nlsid_core.models import CellNetwork, PiecewiseLinear
+from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_one_of, require_whole
 
 MOST_CELLS, MOST_INTERVALS, MOST_START_SAMPLES = 3, 30, 10_000
@@ -488,15 +489,10 @@ def _network(
         start=cascade.x0.mean(axis=0),
         start_samples=model_class.start_samples,
         period=train.period,
-        y=_signals(first, "y"),
-        u=_signals(first, "u"),
-        bags=tuple((trial.name, trial.digest) for trial in train),
+        y=signals_of(first, "y"),
+        u=signals_of(first, "u"),
+        bags=train.bags,
     )
-
-
-def _signals(trial: Trajectory, letter: str) -> tuple[Signal, ...]:
-    keys = (getattr(trial, f"{letter}_{key}") for key in ("names", "units", "paths"))
-    return tuple(Signal(*signal) for signal in zip(*keys, strict=True))
 
 
 def _unit(i: int, size: int) -> FloatArray:

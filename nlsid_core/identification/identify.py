@@ -42,10 +42,11 @@ def identify(
     method: one that is for the class (`methods_of`), such as `Rse(iterations=20)`; None: the first
     of them. comparators: what else runs beside it; None: what is quick, with the options that it
     shares with the method. `test` is only scored; so is `validation`, but by it a block cascade
-    chooses its phases and knots. transient: samples at the start of every trial that are simulated
-    and not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a sample: two
-    solutions approach each other by it or faster, and a slower proof does not count (None: the
-    time constant is the length of the longest training trial). executor: shares work that splits,
+    chooses its phases and knots (without it by every third training trial, the second of two, or
+    the last third of one). transient: samples at the start of every trial that are simulated and
+    not scored. max_rate: of the models that are searched, 0 < max_rate < 1 a sample: two solutions
+    approach each other by it or faster, and a slower proof does not count (None: the time constant
+    is the length of the longest training trial). executor: shares work that splits,
     such as moments of many bags. progress: called with (what was done, fraction done).
     Raises ShapeError or DataError on data or options that cannot be used, SolverError if the search
     fails, Infeasible if the chosen model has no proof (unless `allow_unproved`).
@@ -102,9 +103,10 @@ def select(
 ) -> "Selection[M]":
     """Identify every class on `train`, choose by the error on `validation`, fit to both again.
 
-    A class that does not fit the data or (unless `allow_unproved`) has no proof counts as
-    infinitely bad. The chosen class is identified once more on both datasets together, unless it
-    needs `validation` for choices of its own. Options are those of `identify`. Raises Infeasible if
+    No class sees `validation` before it is judged by it. A class that does not fit the data or
+    (unless `allow_unproved`) has no proof counts as infinitely bad. The chosen class is identified
+    once more on both datasets together, or, where it makes choices by validation trials, on `train`
+    with these. Options are those of `identify`. Raises Infeasible if
     no class has a model.
     """
     tried: list[Tried[M]] = []
@@ -126,11 +128,13 @@ def select(
     for number, model_class in enumerate(classes):
         progress(describe(model_class), number / (len(classes) + 1))
         try:
-            fit = fitted(train, model_class, validation)
+            fit = fitted(train, model_class, None)
         except (DataError, SolverError) as refusal:
             tried.append(Tried(model_class, None, str(refusal)))
         else:
-            tried.append(Tried(model_class, fit))
+            judged = {fit.method.name: fit.chosen.error_percent(validation)}
+            errors = {"train": fit.errors["train"], "validation": judged, **fit.errors}
+            tried.append(Tried(model_class, replace(fit, errors=errors)))
     if not tried:
         raise DataError("no model class to select from")
     best = min(tried, key=lambda entry: entry.error("validation"))
@@ -138,17 +142,18 @@ def select(
         reasons = "; ".join(f"{describe(entry.model_class)}: {entry.refusal}" for entry in tried)
         raise Infeasible(f"no class has a proved model: {reasons}")
     progress("fitting to training and validation trials", len(classes) / (len(classes) + 1))
-    refit = None
-    if not OFFERS[type(best.model_class)].needs_validation:
-        try:
+    refit, chooses = best.fit, OFFERS[type(best.model_class)].needs_validation
+    try:
+        if chooses:
+            refit = fitted(train, best.model_class, validation)
+        else:
             both = Dataset((*train.trajectories, *validation.trajectories))
             refit = fitted(both, best.model_class, None)
-        except (DataError, SolverError) as refusal:
-            log.warning("not fitted to training and validation trials together: %s", refusal)
+    except (DataError, SolverError) as refusal:
+        log.warning("not fitted with the validation trials: %s", refusal)
     progress("done", 1.0)
-    return Selection(
-        tuple(tried), best.model_class, best.fit if refit is None else refit, refit is not None
-    )
+    refitted = refit is not best.fit and not chooses
+    return Selection(tuple(tried), best.model_class, refit, refitted)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,9 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.implicit_sets import Names
 from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.regressors import refuse_poor, signal_scale
-from nlsid_core.models import ImplicitModel, Signal
+from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
@@ -247,15 +248,8 @@ def with_signals(
 ) -> ImplicitModel:
     """The model with the signals and recordings it was made from."""
     first = dataset.trajectories[0]
-    y, u = (
-        tuple(Signal(*labels) for labels in zip(names, units, paths, strict=True))
-        for names, units, paths in (
-            (first.y_names, first.y_units, first.y_paths),
-            (first.u_names, first.u_units, first.u_paths),
-        )
-    )
-    bags = tuple((trial.name, trial.digest) for trial in dataset)
-    return replace(model, y=y, u=u, window=window, bags=bags)
+    y, u = signals_of(first, "y"), signals_of(first, "u")
+    return replace(model, y=y, u=u, window=window, bags=dataset.bags)
 
 
 def _refuse_data_outside(rows: ImplicitRows) -> None:

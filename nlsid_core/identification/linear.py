@@ -18,7 +18,8 @@ from nlsid_core.identification.newton import Descent
 from nlsid_core.identification.regressors import lagged, signal_scale
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import prove_stability
-from nlsid_core.models import DifferenceEquation, Signal
+from nlsid_core.models import DifferenceEquation
+from nlsid_core.models.signal import signals_of
 from nlsid_core.options import require_whole
 
 SLOWEST_POLE = 1.0 - 1e-7  # slower, and rounding may take the proof away
@@ -90,10 +91,10 @@ class Regression:
             b=b,
             c=float(c),
             period=self.dataset.period,
-            y=Signal(first.y_names[0], first.y_units[0], first.y_paths[0]),
-            u=Signal(first.u_names[0], first.u_units[0], first.u_paths[0]),
+            y=signals_of(first, "y")[0],
+            u=signals_of(first, "u")[0],
             u_range=(float(inputs.min()), float(inputs.max())),
-            bags=tuple((trial.name, trial.digest) for trial in self.dataset),
+            bags=self.dataset.bags,
         )
 
 

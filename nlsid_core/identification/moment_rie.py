@@ -27,7 +27,8 @@ from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError, Infeasible, ShapeError
 from nlsid_core.identification.moments import Moments, MonotoneClass, Offsets
 from nlsid_core.identification.stability import StabilityProof, prove_stability
-from nlsid_core.models import MonotoneEquation, Signal
+from nlsid_core.models import MonotoneEquation
+from nlsid_core.models.signal import signals_of
 
 DELTA = 1e-3  # δ of (3.8), V ≥ δ|Δ|² more than needed: what leaves the exact proof room
 SPLITS = 6  # τ: of y d, y²d, y³d, d², y² d², y²d²
@@ -131,11 +132,8 @@ def equation(
         y_offset=offsets.y,
         u_offset=offsets.u,
         period=template.period,
-        y=Signal(template.y_names[0], template.y_units[0], template.y_paths[0]),
-        u=tuple(
-            Signal(*labels)
-            for labels in zip(template.u_names, template.u_units, template.u_paths, strict=True)
-        ),
+        y=signals_of(template, "y")[0],
+        u=signals_of(template, "u"),
     )
 
 

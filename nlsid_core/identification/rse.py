@@ -19,14 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.identification.banded import (
-    Factor,
-    Rows,
-    shift,
-    symmetric_product,
-    times,
-    transposed_times,
-)
+from nlsid_core.identification.banded import Factor, Rows, shift, sparse, symmetric_product
 from nlsid_core.identification.newton import Point, minimise, project
 
 
@@ -74,6 +67,7 @@ class Bound:
         self.rows = rows
         G_m = rows.eye if theta_m is None else rows.G(theta_m)
         self.H = rows.weighed(G_m)
+        self._H = sparse(self.H)
         self._constant = -0.5 * symmetric_product(G_m, self.H, rows.bandwidth)
 
     def at(self, theta: FloatArray) -> Point:
@@ -88,10 +82,10 @@ class Bound:
 
     def slopes(self, x: FloatArray) -> FloatArray:
         """(N, n_g): K_i x, K_i = G_i H' + H G_i', of every left parameter i."""
-        rows, ahead = self.rows, transposed_times(self.H, x)
-        columns = np.empty_like(rows.weights)
-        for D, group in rows.groups:
-            weights = rows.weights[:, group]
+        rows, ahead = self.rows, self._H.T @ x
+        columns, behind = np.empty_like(rows.weights), np.empty(rows.weights.shape)
+        for D, group, weights in rows.groups:
             columns[:, group] = weights * shift(ahead, D)[:, None]
-            columns[:, group] += times(self.H, shift(weights * x[:, None], -D))
+            behind[:, group] = shift(weights * x[:, None], -D)
+        columns += self._H @ behind
         return columns

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -167,20 +167,15 @@ def block_cascade(
     train: Dataset, model_class: BlockCascadeClass, task: Task
 ) -> Trail[BlockCascade]:
     """Wiener, Hammerstein and Wiener-Hammerstein models of one input and one output."""
-    if task.validation is None:
-        raise DataError(
-            "a block cascade's phases and knots are chosen by the simulation error on validation "
-            "trials: give some that are not trained on"
-        )
-    validation = task.validation
+    fitted, judged = (train, task.validation) if task.validation else hold_out(train)
     trail: Trail[BlockCascade] = Trail(
         task, lambda _: None, f"validation error, rms [{_unit(train)}]"
     )
 
     def search(_: Sem) -> tuple[BlockCascade, Proof]:
         found = identify_block_cascade(
-            train,
-            validation,
+            fitted,
+            judged,
             model_class,
             transient=task.transient,
             slowest=min(MAX_RADIUS, task.searched_rate),
@@ -190,10 +185,22 @@ def block_cascade(
         steps = [Step(str(choice), choice.validation_rms) for choice in choices]
         steps.append(Step(f"{last}, minimised further", last.validation_rms))
         trail.history = History(trail.history.value, tuple(steps))
-        return found.model, found.proof
+        return replace(found.model, bags=train.bags), found.proof
 
     trail.add_proved(Sem, search)
     return trail
+
+
+def hold_out(train: Dataset) -> tuple[Dataset, Dataset]:
+    """(fitted, judged), judged on every third trial, the second of two or the end of one."""
+    if len(train) == 1:
+        (trial,), cut = train, 2 * len(train.trajectories[0]) // 3
+        return Dataset((trial.rows(slice(cut)),)), Dataset((trial.rows(slice(cut, None)),))
+    judged = [i % 3 == min(2, len(train) - 1) for i in range(len(train))]
+    return (
+        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if not out)),
+        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if out)),
+    )
 
 
 def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwork]:
@@ -368,7 +375,7 @@ def linear_states(train: Dataset, _: LinearStateClass, task: Task) -> Trail[Impl
 class Offer:
     """The methods of a class, the default first, and those that run beside what is asked for.
 
-    needs_validation: the search chooses by validation trials.
+    needs_validation: the search chooses by validation trials, or by some of the training trials.
     """
 
     search: Callable[[Dataset, Any, Task], Trail[Any]]

@@ -22,7 +22,7 @@ from nlsid_core.identification.banded import (
     lower_band,
     product,
     shift,
-    times,
+    sparse,
 )
 from nlsid_core.identification.newton import Point, Root, project
 
@@ -48,10 +48,10 @@ class SimulationError:
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
         """Gradient, and the Hessian of Gauss and Newton."""
         rows = self.rows
-        r = point.residual if self._root is None else times(self._root, point.residual)
+        r = point.residual if self._root is None else sparse(self._root) @ point.residual
         V = rows.errors.copy(order="F")
-        for D, group in rows.groups:
-            V[:, group] -= rows.weights[:, group] * shift(r, D)[:, None]
+        for D, group, weights in rows.groups:
+            V[:, group] -= weights * shift(r, D)[:, None]
         return 2.0 * V.T @ point.x, point.curvature(V)
 
 

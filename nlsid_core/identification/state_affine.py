@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.methods import MOST_LAGS
 from nlsid_core.identification.regressors import FEWER, lagged, signal_scale
-from nlsid_core.models import Signal, StateAffineModel
+from nlsid_core.models import StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
+from nlsid_core.models.signal import signals_of
 from nlsid_core.models.state_affine import OutOfRange
 from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
 from nlsid_core.polynomial import monomials
@@ -111,9 +112,9 @@ class StateAffineRows:
             u_range=self.u_range,
             on_out_of_range=self.on_out_of_range,
             period=self.dataset.period,
-            y=_signals(first, "y"),
-            u=_signals(first, "u"),
-            bags=tuple((trial.name, trial.digest) for trial in self.dataset),
+            y=signals_of(first, "y"),
+            u=signals_of(first, "u"),
+            bags=self.dataset.bags,
         )
 
 
@@ -227,9 +228,3 @@ def _refuse_rank(R: FloatArray, lags: int) -> None:
             f"the excitation does not excite {lags} lags: its polynomial basis of {len(R)} has "
             f"rank {rank}; {FEWER}"
         )
-
-
-def _signals(trial: Trajectory, letter: str) -> tuple[Signal, ...]:
-    columns = zip(*(getattr(trial, f"{letter}_{key}") for key in ("names", "units", "paths")),
-                  strict=True)  # fmt: skip
-    return tuple(Signal(*labels) for labels in columns)

@@ -17,8 +17,8 @@ import numpy as np
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, SolverError
-from nlsid_core.models import Signal
 from nlsid_core.models.measured_state import MeasuredState
+from nlsid_core.models.signal import signals_of
 from nlsid_core.models.state_map import StateModel
 from nlsid_core.models.trapezoidal import TrapezoidalModel
 
@@ -229,20 +229,13 @@ def _model(
         coefficients[np.flatnonzero(unit)[0], i] += 1.0  # θ was fitted to x⁺ - x
     ranges = np.stack([data.min(axis=0), data.max(axis=0)], axis=1)
     noise = noise_between(groups)
-    signals = [
-        tuple(Signal(*entry) for entry in zip(names, units, paths, strict=True))
-        for names, units, paths in (
-            (first.y_names, first.y_units, first.y_paths),
-            (first.u_names, first.u_units, first.u_paths),
-        )
-    ]
     make = TrapezoidalModel if implicit else StateModel
     model: MeasuredState = make(
         exponents=exponents,
         coefficients=coefficients,
         period=train.period,
-        x=signals[0],
-        u=signals[1],
+        x=signals_of(first, "y"),
+        u=signals_of(first, "u"),
         x_range=ranges[:n],
         u_range=ranges[n:],
         noise=noise,

@@ -237,27 +237,10 @@ def without_missing(trial: Trajectory, missing: FloatArray, *, shortest: int) ->
     ]  # fmt: skip
     if not stretches:
         raise DataError(f"{trial.name}: no stretch of {shortest} samples without gaps")
-    kept = tuple(_cut(trial, begin, end, i) for i, (begin, end) in enumerate(stretches, 1))
-    return kept, len(trial) - sum(map(len, kept))
-
-
-def _cut(trial: Trajectory, begin: int, end: int, number: int) -> Trajectory:
-    rows = slice(begin, end)
-    return Trajectory(
-        t=trial.t[rows],
-        y=trial.y[rows],
-        u=trial.u[rows],
-        x=None if trial.x is None else trial.x[rows],
-        y_names=trial.y_names,
-        u_names=trial.u_names,
-        y_units=trial.y_units,
-        u_units=trial.u_units,
-        y_paths=trial.y_paths,
-        u_paths=trial.u_paths,
-        name=f"{trial.name} part {number}",
-        group=trial.group,
-        digest=trial.digest,
+    kept = tuple(
+        trial.rows(slice(*ends), f"{trial.name} part {i}") for i, ends in enumerate(stretches, 1)
     )
+    return kept, len(trial) - sum(map(len, kept))
 
 
 def _simulated(model: Model, dataset: Dataset, first: int) -> list[tuple[FloatArray, FloatArray]]:

@@ -1,9 +1,11 @@
 """What every model document shares: its header and the signals it is about."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DocumentError
 
 FORMAT = "nlsid/model"
@@ -27,6 +29,12 @@ class Signal:
         return cls(
             *(files.member(document, key, str, source=source) for key in ("name", "unit", "path"))
         )
+
+
+def signals_of(trial: Trajectory, letter: Literal["y", "u"]) -> tuple[Signal, ...]:
+    """The responses or the excitations of a trajectory."""
+    columns = (getattr(trial, f"{letter}_{key}") for key in ("names", "units", "paths"))
+    return tuple(Signal(*labels) for labels in zip(*columns, strict=True))
 
 
 def objects(document: Json, key: str, *, source: str) -> list[Json]:

@@ -34,6 +34,7 @@ from nlsid_core.identification import (
     validate,
 )
 from nlsid_core.identification.prediction import history, simulate_trial, solve_increasing_at
+from nlsid_core.identification.searches import hold_out
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.proofs import check
@@ -306,6 +307,35 @@ def test_selection_works_for_every_class_and_says_why_one_has_no_model() -> None
     chosen = select(train, validation, orders, transient=60)
     assert chosen.best == orders[1]
     assert not chosen.refitted, "validation trials choose its knots"
+    assert chosen.fit.model.bags == train.bags
+
+
+def test_no_class_chooses_by_the_trials_that_it_is_judged_by() -> None:
+    train, validation = Dataset((saturated(400, 0), saturated(500, 1))), saturated(400, 2)
+    knots = replace(CASCADE, intervals=(1, 2, 8, 16))
+    alone = identify(train, knots, transient=60)
+    assert alone.model.bags == train.bags, "the trial its knots were chosen by is named too"
+    for sign in (1.0, -1.0):  # with other outputs the same model is judged
+        judged = Dataset((replace(validation, y=sign * validation.y),))
+        (tried,) = select(train, judged, [knots], transient=60).tried
+        assert tried.fit is not None
+        assert tried.fit.model.document() == alone.model.document()
+        assert tried.error("validation") == alone.chosen.error_percent(judged)
+
+
+def test_the_second_of_two_trials_and_the_last_third_of_one_are_held_out() -> None:
+    trials = [saturated(90 + k, k) for k in range(5)]
+    for count, judged in ((2, [1]), (3, [2]), (5, [2])):
+        left, out = hold_out(Dataset(tuple(trials[:count])))
+        assert out.names == tuple(trials[k].name for k in judged)
+        assert left.names == tuple(t.name for t in trials[:count] if t.name not in out.names)
+    (first,), (last,) = hold_out(Dataset((trials[0],)))
+    assert (len(first), len(last)) == (60, 30)
+    np.testing.assert_array_equal(np.concatenate([first.y, last.y]), trials[0].y)
+
+
+def test_a_selection_without_a_model_says_why() -> None:
+    train, validation = Dataset((saturated(400, 0),)), Dataset((saturated(400, 2),))
     with pytest.raises(Infeasible, match="share a `group`"):
         select(train, validation, [MonotoneClass(1), MonotoneClass(2)])
     with pytest.raises(DataError, match="no model class to select from"):

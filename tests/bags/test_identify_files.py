@@ -234,15 +234,12 @@ def test_a_selection_that_makes_no_sense_says_why(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_selection_and_a_cascade_need_validation_bags(folder: Path, tmp_path: Path) -> None:
-    alone = {"test": ["run_5"]}
-    for section, command in (({"lags": 1}, "select"), (CASCADE, "identify")):
-        config = write_config(tmp_path / "c.yaml", section, split=alone, select={"lags": [1]})
-        if command == "identify":
-            config = write_config(tmp_path / "c.yaml", section, split=alone)
-        made = nlsid(command, folder, "--config", config, "--out", tmp_path / "out")
-        assert isinstance(made.exception, NlsidError)
-        assert "validation trials" in str(made.exception)
+def test_a_selection_needs_validation_bags(folder: Path, tmp_path: Path) -> None:
+    split = {"test": ["run_5"]}
+    config = write_config(tmp_path / "c.yaml", {"lags": 1}, split=split, select={"lags": [1]})
+    made = nlsid("select", folder, "--config", config, "--out", tmp_path / "out")
+    assert isinstance(made.exception, NlsidError)
+    assert "validation trials" in str(made.exception)
 
 
 # -- several inputs and outputs, gaps ----------------------------------------------------------
