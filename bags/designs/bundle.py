@@ -51,13 +51,11 @@ class Bundle:
         folder = funnel.parent
         composed = funnel.name == designs.COMPOSITION
         proof = (funnel if composed else folder / designs.PROOF).read_bytes()
-        contents = {PROOF: proof}
-        with contextlib.suppress(OSError):  # the kernel says which is missing
-            for role, name in _names(proof).items():
-                contents[role] = read_regular(folder / name)
-                if composed:
-                    for part, file in _names(contents[role]).items():
-                        contents[f"{role}.{part}"] = read_regular(folder / file)
+        contents = {PROOF: proof, **_beside(folder, proof)}
+        for stage in list(contents) if composed else []:
+            if stage != PROOF:
+                inner = _beside(folder, contents[stage])
+                contents |= {f"{stage}.{role}": content for role, content in inner.items()}
         if not composed and contents.get("funnel") != funnel.read_bytes():
             raise CertificateMismatch(f"{designs.PROOF} beside {funnel} is not about this funnel")
         bundle = cls(contents)
@@ -197,6 +195,15 @@ def _design(parts: Mapping[str, bytes], proof: bytes, wiring: Wiring | None) -> 
     }
     claim = files.parse_document(proof, source=PROOF).get("claim")
     return read_design(documents, wiring=wiring, claim=claim)
+
+
+def _beside(folder: Path, proof: bytes) -> dict[str, bytes]:
+    """The files by role that a proof in `folder` is about; the kernel says which is missing."""
+    found = {}
+    for role, name in _names(proof).items():
+        with contextlib.suppress(OSError):
+            found[role] = read_regular(folder / name)
+    return found
 
 
 def _names(proof: bytes) -> dict[str, str]:
