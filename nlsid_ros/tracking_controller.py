@@ -5,7 +5,8 @@ into force, stamped a quarter of a period before its sample is due, so that a sa
 that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
 `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
 digest. Stale or impossible state, `~/stop`, a required monitor that no longer judges, and the end
-of the plan ramp the input to `stop_at`.
+of the plan ramp the input to `stop_at`. With `commissioning` it runs a policy from files of which
+nothing is proved, and says so in every status; `stop_service` then has to be there.
 """
 
 import math
@@ -27,6 +28,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
+from bags.designs.documents import load_unproved
 from bags.monitoring.announcement import Run
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
@@ -36,7 +38,13 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
+from nlsid_ros.documents import (
+    CHECKING,
+    DesignSubscription,
+    Unproved,
+    declare_expected,
+    declare_wiring,
+)
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import OTHERS, ZERO, SignalMessage, frame_of, off_clock, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
@@ -85,6 +93,16 @@ class TrackingController(ManagedNode):
         self._others = declare_text(self, "others", ZERO, what)
         what = "s until a robot that is stopped is at rest, faster than stop_rate if need be"
         number("stop_within", 5.0, what, between=(0.01, 60.0))
+        what = (
+            "folder of model.json (vector_field.json) and policy.json that are NOT proved: run them"
+        )
+        self._commissioning = declare_text(self, "commissioning", "", what)
+        what = (
+            "std_srvs/Trigger that stops the robot if a run of commissioning ends early; mandatory"
+        )
+        self._stop_service = declare_text(self, "stop_service", "", what)
+        if self._commissioning and not self._stop_service:
+            raise DataError("commissioning runs what is not proved: set stop_service")
         self._watched = bool(
             declare(self, "require_monitor", False, "track only while the monitor judges")
         )
@@ -125,14 +143,20 @@ class TrackingController(ManagedNode):
         self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self._funnel = DesignSubscription(
-            self,
-            self._source,
-            self._on_design,
-            self._report,
-            wiring=self._wiring,
-            expected=self._expected,
-        )
+        self._funnel: DesignSubscription | Unproved = Unproved()
+        if self._commissioning:
+            self._brake = self.create_client(Trigger, self._stop_service)
+            unproved: Any = load_unproved(self._commissioning, wiring=self._wiring)
+            self._on_design(unproved, unproved.digest)
+        else:
+            self._funnel = DesignSubscription(
+                self,
+                self._source,
+                self._on_design,
+                self._report,
+                wiring=self._wiring,
+                expected=self._expected,
+            )
         if self._watched:
             self._margin = self.create_subscription(
                 JointState, f"{self._monitor}/margin", self._on_margin, qos.STREAM
@@ -195,6 +219,8 @@ class TrackingController(ManagedNode):
         assert self._command is not None
         if lacking := self._command.lacking():
             return lacking
+        if self._commissioning and not self._brake.service_is_ready():
+            return f"{self._stop_service} is not there: nothing unproved runs without it"
         try:
             self._controller = self._design.controller(self._limits, self._settling)
         except NlsidError as error:
@@ -328,6 +354,8 @@ class TrackingController(ManagedNode):
         self._next.cancel()
         self._due.clear()
         self._stopping = reason
+        if self._commissioning and reason not in ENDED:
+            self._brake.call_async(Trigger.Request())
         away = np.abs(np.subtract(self._input, self._limits.stop_at))
         rate = np.maximum(self._limits.stop_rate, float(np.max(away)) / self._stop_within)
         self._ramp = replace(self._limits, stop_rate=rate)
@@ -360,6 +388,8 @@ class TrackingController(ManagedNode):
             text = "; ".join(part for part in (self._text, self._funnel.state) if part)
         if self._funnel.refusal:
             level = DiagnosticStatus.ERROR
+        if self._commissioning:
+            level, text = max(level, DiagnosticStatus.WARN), f"COMMISSIONING, not proved: {text}"
         values = {
             "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",

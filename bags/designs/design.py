@@ -36,7 +36,7 @@ from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
 
 M = TypeVar("M", bound=Dynamics)
 P = TypeVar("P", bound=AnyPolicy | None)
-F = TypeVar("F", bound=AnyFunnel)
+F = TypeVar("F", bound=AnyFunnel | None)
 CONTINUOUSLY = Held()
 
 
@@ -70,7 +70,7 @@ class WiredDesign(Generic[M, P, F]):
 
     wiring: of a continuous funnel, None until somebody says it. held: how the proof of a continuous
     funnel lets its policy be applied. later: of a composition, the stages that follow this one;
-    composition: the digest of its proof.
+    composition: the digest of its proof. funnel: None of a policy that is not proved.
     """
 
     model: M
@@ -141,8 +141,12 @@ class WiredDesign(Generic[M, P, F]):
 
     @property
     def digest(self) -> str:
-        """Of the funnel's document, or of the composition's proof: how an announcement names it."""
-        return self.composition or files.digest(self.funnel.document())
+        """Of the funnel's document, or of the composition's proof: how an announcement names it.
+
+        Without a funnel of the policy's.
+        """
+        named: Any = self.funnel if self.funnel is not None else self.policy
+        return self.composition or files.digest(named.document())
 
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
@@ -159,6 +163,8 @@ class WiredDesign(Generic[M, P, F]):
         period = self.period if isinstance(self.model, VectorField) else None
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
+        if self.funnel is None:
+            return Controller.unproved(self.model, self.policy, limits=limits, period=period)
         if self.later:
             parts: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
             return Controller.of_stages(

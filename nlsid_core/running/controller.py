@@ -131,6 +131,15 @@ class Controller:
         controller._follow(list(stages), limits, settling, period, held)
         return controller
 
+    @classmethod
+    def unproved(
+        cls, model: Dynamics, policy: AnyPolicy, *, limits: Limits, period: float | None = None
+    ) -> "Controller":
+        """A policy of which nothing is proved, to be commissioned: it runs from any state."""
+        controller = cls.__new__(cls)
+        controller._follow([(model, policy, None)], limits, 0.0, period, None)
+        return controller
+
     def _follow(
         self,
         stages: list[tuple[Any, Any, Any]],
@@ -153,11 +162,11 @@ class Controller:
                 raise DataError(f"the samples of a continuous funnel need a period: {period} s")
             self._held = held or Held()
             self._held.refuse(period)
-            self.period, self._origin = period, float(funnel.t0)
-            self._end = stages[-1][2].last - (1.0 - TOLERANCE) * period  # an input is held so long
+            self.period, self._origin = period, float(policy.t[0])
+            self._end = stages[-1][1].last - (1.0 - TOLERANCE) * period  # an input is held so long
         else:
             self.period, self._origin = float(model.period), 0.0
-            self._end = min(policy.last, funnel.last)
+            self._end = policy.last if funnel is None else min(policy.last, funnel.last)
         self._observer = _observer(model, policy)
         self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
         for _, planned, _ in stages:
@@ -210,7 +219,7 @@ class Controller:
 
     def _stage(self, when: float) -> tuple[Any, Any, Any]:
         """The stage that is on: of a composition the first that has not ended."""
-        self.stage = 1 + sum(when >= stage[2].last for stage in self._stages[:-1])
+        self.stage = 1 + sum(when >= stage[1].last for stage in self._stages[:-1])
         return self._stages[self.stage - 1]
 
     def _settle(self, t: float, y: Any) -> None:
@@ -222,10 +231,12 @@ class Controller:
             return
         x = self._observer.begin([y for y, _ in self._recent], [u for _, u in self._recent])
         _, policy, funnel = self._stages[0]
-        nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
-        size = funnel.start_size(x - nominal)
-        if self._continuous:
-            size += self._held.reach(funnel.shape(self._origin))
+        size = 0.0
+        if funnel is not None:
+            nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
+            size = funnel.start_size(x - nominal)
+            if self._continuous:
+                size += self._held.reach(funnel.shape(self._origin))
         if size <= 1.0:
             self.k = 1 - self._observer.ahead
             self._answer(self._origin, x)

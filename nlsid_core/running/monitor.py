@@ -251,12 +251,16 @@ class Monitor:
         return said
 
 
-def refuse_mismatch(model: Dynamics, policy: AnyPolicy | None, funnel: AnyFunnel) -> None:
+def refuse_mismatch(model: Dynamics, policy: AnyPolicy | None, funnel: AnyFunnel | None) -> None:
     """CertificateMismatch if the funnel was not made for this policy, or either for this model."""
     digest = files.digest(model.document())
+    if policy is not None and policy.made_for != digest:
+        raise CertificateMismatch("the policy was made for another model")
+    if funnel is None:
+        return
     made_for, its_policy = funnel.made_for
-    if made_for != digest or (policy is not None and policy.made_for != digest):
-        raise CertificateMismatch("policy or funnel was made for another model")
+    if made_for != digest:
+        raise CertificateMismatch("the funnel was made for another model")
     if its_policy is not None and policy is None:
         raise CertificateMismatch("the funnel is about a policy")
     if policy is not None and its_policy != files.digest(policy.document()):

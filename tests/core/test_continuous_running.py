@@ -215,6 +215,23 @@ def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
     assert "not at the start of the plan after 0.1 s" in controller.ended
 
 
+def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limits() -> None:
+    field, policy, _ = stage()
+    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    x, samples = np.array([3.0]), 0
+    while not controller.ended:
+        x = x + HELD * controller.update(samples * HELD, x)
+        samples += 1
+    assert (controller.ended, samples) == ("the proof is over", round(1.0 / HELD) + 1)
+    assert x[0] == pytest.approx(1.0, abs=0.1)
+    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    controller.update(0.0, np.array([-9.0]))
+    assert "is not proved: it is beyond" in controller.ended
+    with pytest.raises(CertificateMismatch, match="policy was made for another model"):
+        other = VectorField.from_function(lambda x, u: [u[0] - x[0]], 1, 1)
+        Controller.unproved(other, policy, limits=LIMITS, period=HELD)
+
+
 def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
     field, policy, funnel = stage()
     with pytest.raises(DataError, match="need a period"):
