@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bags.tools.fitness import Fitness, Level
-from bags.tools.info import BagInfo, TopicInfo
+from bags.tools.info import BagInfo
 from bags.tools.listing import Listed
 
 WORDS = {Level.GOOD: "good", Level.LOOK: "look", Level.BAD: "bad"}
@@ -54,7 +54,11 @@ def show_info(console: Console, info: BagInfo) -> None:
         )
     console.print(table)
     for topic in info.topics:
-        for what in _odd(topic):
+        if topic.clock is not None:
+            latency, spread = 1e3 * topic.clock.latency, 1e3 * topic.clock.spread
+            clock = f"{topic.clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)"
+            _say(console, f"{topic.topic}: {clock}")
+        for what in topic.odd:
             _say(console, f"{topic.topic}: {what}")
     for key, value in info.custom.items():
         _say(console, f"{key}: {value}")
@@ -155,25 +159,6 @@ def show_fitness(console: Console, fitness: Fitness) -> None:
         line = Text(f"  {WORDS[finding.level]} ", style=STYLES[finding.level])
         line.append(f"{finding.check}: {finding.what}", style="default")
         console.print(line, soft_wrap=True)
-
-
-def _odd(topic: TopicInfo) -> list[str]:
-    odd = []
-    if topic.clock is not None:
-        latency, spread = 1e3 * topic.clock.latency, 1e3 * topic.clock.spread
-        odd.append(f"{topic.clock}, latency {latency:.3g} ms (95 % {spread:.3g} ms)")
-    if topic.unstamped:
-        odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
-        return odd
-    if topic.backward:
-        odd.append(f"header stamps go back in {topic.backward} places")
-    if topic.duplicates:
-        odd.append(f"{topic.duplicates} header stamps repeat the one before")
-    if topic.missing:
-        odd.append(f"{topic.missing} sequence numbers are missing: messages were lost")
-    if topic.unreadable:
-        odd.append(f"cannot be read: {topic.unreadable[:300]}")
-    return odd
 
 
 def _say(console: Console, text: str) -> None:

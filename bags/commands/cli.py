@@ -341,10 +341,12 @@ def check(
 def report(
     folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
     bags: Annotated[
-        list[Path] | None, typer.Argument(help="Bags to hold against its funnel, for the page.")
+        list[Path] | None,
+        typer.Argument(help="Bags whose losses are listed, and that are held against its funnel."),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="Takes `split.test` (which bags) and `monitor.nominal`.")
+        Path | None,
+        typer.Option(help="Takes `split.test` (which are held against it) and `monitor.nominal`."),
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
@@ -361,16 +363,23 @@ def report(
     from bags.commands import show
     from bags.designs import documents
     from bags.monitoring.replay import replay_bag
+    from bags.monitoring.watch import Watch
     from bags.pictures.folder_report import print_page, write_folder_report
     from bags.pictures.report import report_available
     from bags.recordings.folders import expand_bags
+    from bags.tools.info import bag_info
 
     settings = load_config(config) if config is not None else None
     target = page or folder / documents.DESIGN_REPORT
-    replays, drawn = [], ""
+    recordings, replays, drawn = [], [], ""
     if bags:
         proved = documents.load_proved(folder / documents.FUNNEL)
         folders = expand_bags(bags)
+        topics = Watch(proved.design, centre=show.centre_of(settings)).pairing.topics
+        with progress_bar("reading") as progress:
+            for done, bag in enumerate(folders):
+                progress(bag.name, done / len(folders))
+                recordings.append(bag_info(bag, topics=topics))
         if settings is not None:
             folders = [f for f in folders if f.name in settings.split.test] or folders
         with progress_bar("replaying") as progress:
@@ -381,7 +390,7 @@ def report(
             from bags.pictures import plots
 
             drawn = plots.svg(plots.margins(replays))
-    write_folder_report(folder, target, replays=replays, drawn=drawn)
+    write_folder_report(folder, target, recordings=recordings, replays=replays, drawn=drawn)
     out.print(f"wrote {target}", soft_wrap=True)
     if pdf:
         print_page(target, target.with_suffix(".pdf"))

@@ -17,11 +17,11 @@ from bags.fleet.workers import Workers
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions, texts_of
 from bags.tools.fitness import Level, check_fitness
+from bags.tools.info import LOST
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.files import canonical
 from nlsid_core.progress import Progress, silent
 
-LOST = " lost"  # how the recorder's counts of lost messages end, after the topic
 UNREAD = "not read"
 
 

@@ -48,7 +48,7 @@ class Replay:
     @property
     def judged_span(self) -> float:
         """S of it that were judged."""
-        return self.period * len(self.judged)
+        return min(self.period * len(self.judged), self.span)
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:

@@ -5,6 +5,7 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 """
 
 import base64
+import math
 import os
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from pathlib import Path
 from bags.designs import documents
 from bags.monitoring.replay import Replay
 from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE
+from bags.tools.info import GAP, BagInfo, TopicInfo
 from nlsid_core import files, kernel
 from nlsid_core.errors import DataError, DocumentError
 
@@ -49,14 +51,21 @@ PATIENCE = 120.0  # s for one of them to print a page
 
 
 def write_folder_report(
-    folder: Path, out: Path, *, replays: Sequence[Replay] = (), drawn: str = ""
+    folder: Path,
+    out: Path,
+    *,
+    recordings: Sequence[BagInfo] = (),
+    replays: Sequence[Replay] = (),
+    drawn: str = "",
 ) -> None:
     """Write the page of a design folder.
 
-    replays: bags held against its funnel, `drawn` their picture as <svg> or empty. Raises
-    DocumentError if the folder has neither a proof nor a report.
+    recordings: bags whose losses are listed, with the topics to list. replays: bags held against
+    its funnel, `drawn` their picture as <svg> or empty. Raises DocumentError if the folder has
+    neither a proof nor a report.
     """
-    files.write_atomically(out, folder_page(folder, replays=replays, drawn=drawn).encode())
+    page = folder_page(folder, recordings=recordings, replays=replays, drawn=drawn)
+    files.write_atomically(out, page.encode())
 
 
 def print_page(page: Path, out: Path) -> None:
@@ -85,7 +94,13 @@ def print_page(page: Path, out: Path) -> None:
         files.write_atomically(out, printed.read_bytes())
 
 
-def folder_page(folder: Path, *, replays: Sequence[Replay] = (), drawn: str = "") -> str:
+def folder_page(
+    folder: Path,
+    *,
+    recordings: Sequence[BagInfo] = (),
+    replays: Sequence[Replay] = (),
+    drawn: str = "",
+) -> str:
     """The whole page as text."""
     proofs = sorted(folder.glob("*.proof.json"))
     decided = "".join(_proof(path) for path in proofs)
@@ -99,6 +114,7 @@ def folder_page(folder: Path, *, replays: Sequence[Replay] = (), drawn: str = ""
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
+        "recordings": ("Recordings and their losses", _recordings(recordings)),
         "replays": ("Recordings held against the funnel", _replays(replays, drawn)),
         "files": ("Files", _files(folder)),
     }
@@ -170,6 +186,35 @@ def _pictures(folder: Path, *, without: set[str]) -> str:
     return "".join(figures)
 
 
+def _recordings(recordings: Sequence[BagInfo]) -> str:
+    """A row for each topic of each bag: how much came, how regularly, and what was lost."""
+    if not recordings:
+        return ""
+    names = ("bag", "topic", "messages", "rate", "gaps", "longest interval", "lost", "remarks")
+    head = "".join(f"<th>{name}</th>" for name in names)
+    rows = "".join(_recorded(info, topic) for info in recordings for topic in info.topics)
+    return f"""<table class="left"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
+<p class="note">Gap: an interval of more than {GAP:g} times the median one. Lost: by
+the recorder's count or by the sequence numbers in the file; "not counted" where neither
+counts.</p>"""
+
+
+def _recorded(info: BagInfo, topic: TopicInfo) -> str:
+    lost = info.lost(topic)
+    remarks = [*([f"unfinished: {info.ending}"] if info.ending else []), *topic.odd]
+    cells = [
+        info.path.name,
+        topic.topic,
+        str(topic.count),
+        "-" if math.isnan(topic.rate) else f"{topic.rate:.4g} Hz",
+        str(topic.gaps),
+        "-" if math.isnan(topic.longest) else f"{topic.longest:.3g} s",
+        "not counted" if lost is None else str(lost),
+        "; ".join(remarks) or "none",
+    ]
+    return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
+
+
 def _replays(replays: Sequence[Replay], drawn: str) -> str:
     if not replays:
         return ""
@@ -179,8 +224,8 @@ def _replays(replays: Sequence[Replay], drawn: str) -> str:
         for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
     )
     return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
-<p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: of what is assumed,
-at the last judged sample.</p>{drawn}"""
+<p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
+most of what is assumed that any judged sample used.</p>{drawn}"""
 
 
 def _replay(replay: Replay) -> str:

@@ -3,7 +3,7 @@
 Memory: two integers a message, and one chunk.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +24,7 @@ from nlsid_core.progress import Progress, silent
 GAP: Final = 5.0  # median intervals without a message
 BINS: Final = np.array([0.0, 0.5, 0.8, 0.95, 1.05, 1.25, 2.0, 5.0, np.inf])  # median intervals
 BARS: Final = " ▁▂▃▄▅▆▇█"
+LOST: Final = " lost"  # how the recorder's counts of lost messages end, after the topic
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class TopicInfo:
     """One topic. Intervals are between log times, in s; NaN with fewer than two messages.
 
     histogram: intervals per bin of BINS, which are in median intervals. missing: sequence numbers
-    left out, where the recorder counted. clock: None without header stamps. unstamped: there are
+    left out, None where nobody counted. clock: None without header stamps. unstamped: there are
     header stamps and all are 0.
     """
 
@@ -47,7 +48,7 @@ class TopicInfo:
     longest: float = float("nan")
     backward: int = 0
     duplicates: int = 0
-    missing: int = 0
+    missing: int | None = None
     clock: ClockRelation | None = None
     unstamped: bool = False
     unreadable: str = ""
@@ -66,6 +67,23 @@ class TopicInfo:
         height = [np.ceil((len(BARS) - 1) * n / most) for n in self.histogram]
         return "".join(BARS[int(h)] for h in height)
 
+    @property
+    def odd(self) -> list[str]:
+        """What is wrong with its messages and stamps, in words."""
+        odd = []
+        if self.unstamped:
+            odd.append("every header stamp is 0: its publisher does not fill it in; use log time")
+        else:
+            if self.backward:
+                odd.append(f"header stamps go back in {self.backward} places")
+            if self.duplicates:
+                odd.append(f"{self.duplicates} header stamps repeat the one before")
+        if self.missing:
+            odd.append(f"{self.missing} sequence numbers are missing: messages were lost")
+        if self.unreadable:
+            odd.append(f"cannot be read: {self.unreadable[:300]}")
+        return odd
+
 
 @dataclass(frozen=True, eq=False)
 class BagInfo:
@@ -77,6 +95,13 @@ class BagInfo:
     ending: str | None
     custom: Mapping[str, str]
     topics: tuple[TopicInfo, ...]
+
+    def lost(self, topic: TopicInfo) -> int | None:
+        """Messages lost, by the recorder's count or sequence numbers; None if neither counts."""
+        said = self.custom.get(topic.topic + LOST, "")
+        counts = [int(said)] if said.isdecimal() else []
+        counts += [] if topic.missing is None else [topic.missing]
+        return max(counts, default=None)
 
     @property
     def messages(self) -> int:
@@ -96,17 +121,22 @@ class BagInfo:
 def bag_info(
     path: Path | str,
     *,
+    topics: Collection[str] | None = None,
     definitions: Mapping[str, Definition] | None = None,
     progress: Progress = silent,
 ) -> BagInfo:
-    """Read the whole bag once, an unfinished one as far as it goes.
+    """Read the whole bag once, or these topics; an unfinished one as far as it goes.
 
     Raises BagError as `Bag` does.
     """
     with Bag(path, unfinished=True, definitions=definitions) as bag:
-        found = {topic: _Collector(bag, topic, msgtype) for topic, msgtype in bag.topics.items()}
-        total, done = sum(channel.count for channel in bag.channels), 0
-        for channel, batch in bag.batches():
+        found = {
+            topic: _Collector(bag, topic, msgtype)
+            for topic, msgtype in bag.topics.items()
+            if topics is None or topic in topics
+        }
+        total, done = sum(c.count for c in bag.channels if c.topic in found), 0
+        for channel, batch in bag.batches(list(found)):
             found[channel.topic].add(batch)
             done += len(batch)
             progress("reading", done / max(total, 1))
@@ -188,9 +218,9 @@ class _Collector:
         return TopicInfo(**values)
 
 
-def _missing(sequence: IntArray) -> int:
-    """Numbers left out by a recorder that counted up from message to message."""
+def _missing(sequence: IntArray) -> int | None:
+    """Numbers left out by a recorder that counted up from message to message; None otherwise."""
     steps = np.diff(np.sort(sequence))
     if not len(steps) or not (steps == 1).sum() > 0.5 * len(steps):
-        return 0
+        return None
     return int(np.maximum(steps - 1, 0).sum())

@@ -49,13 +49,12 @@ class BlockError(Exception):
 def run_page(text: str, folder: Path, root: Path) -> str:
     """The page with the output of every block below it.
 
-    folder: made empty, the blocks run in it. root: the checkout, first on Python's path, and to the
-    blocks the folder `nlsid`. Raises BlockError.
+    folder: made empty, the blocks run in it. root: the checkout, first on Python's path. Raises
+    BlockError.
     """
     if folder.exists():
         shutil.rmtree(folder)
     folder.mkdir(parents=True)
-    (folder / "nlsid").symlink_to(root)
     page, done = FRONT.sub("", text), []
     with _Python(folder, root) as python:
         position = 0

@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,12 @@ def test_info_states_counts_rates_clocks_and_losses(tmp_path: Path) -> None:
             data = odometry(stamp - 5 * 10**9, float(k))
             times = {"log_time_ns": stamp, "publish_time_ns": stamp}
             writer.write(ODOM, ODOM_TYPE, data, **times, sequence=k + 3 * (k > 100))
-    [topic] = bag_info(tmp_path / "x").topics
+    info = bag_info(tmp_path / "x", topics={ODOM})
+    [topic] = info.topics
+    assert info.lost(topic) == 3
+    assert replace(info, custom={f"{ODOM} lost": "5"}).lost(topic) == 5
+    assert replace(info, custom={}).lost(replace(topic, missing=None)) is None
+    assert not bag_info(tmp_path / "x", topics=()).topics
     assert (topic.count, topic.missing, topic.backward, topic.duplicates) == (200, 3, 0, 0)
     assert topic.rate == pytest.approx(40.0)
     assert topic.clock is not None

@@ -55,7 +55,8 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     for proof in (documents.MODEL_PROOF, documents.FUNNEL_PROOF):
         assert str(kernel.check(design / proof)).split("\n")[0] in page.text
     for chapter in ("What is proved", "How well it simulates", "what it can catch",
-                    "Recordings held against the funnel", bag.name, "car <1>"):  # fmt: skip
+                    "Recordings held against the funnel", bag.name, "car <1>",
+                    "Recordings and their losses", "/odom", "lost"):  # fmt: skip
         assert chapter in page.text
     assert page.tags.count("svg") > 3
     assert "script" not in page.tags

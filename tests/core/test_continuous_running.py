@@ -227,8 +227,8 @@ def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limit
     controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
     controller.update(0.0, np.array([-9.0]))
     assert "is not proved: it is beyond" in controller.ended
+    other = VectorField.from_function(lambda x, u: [u[0] - x[0]], 1, 1)
     with pytest.raises(CertificateMismatch, match="policy was made for another model"):
-        other = VectorField.from_function(lambda x, u: [u[0] - x[0]], 1, 1)
         Controller.unproved(other, policy, limits=LIMITS, period=HELD)
 
 
