@@ -155,7 +155,10 @@ class WiredDesign(Generic[M, P, F]):
             held = [stage.held for stage in self.stages]
             return Monitor.of_stages(parts, period=self.period, held=held)
         period = self.period if isinstance(self.model, VectorField) else None
-        return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period,
+        funnel: AnyFunnel | None = self.funnel
+        if funnel is None:
+            raise DocumentError("nothing is proved of this policy: no funnel to hold a robot to")
+        return Monitor(self.model, self.policy, funnel, centre=centre, period=period,
                        held=self.held)  # fmt: skip
 
     def controller(self, limits: Limits, settling: float) -> Controller:
