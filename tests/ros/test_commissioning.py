@@ -74,7 +74,7 @@ def test_an_unproved_policy_runs_in_its_mode_only_and_with_what_stops_the_robot(
         assert not answer.success
         assert "/robot/stop is not there" in answer.message
         node.create_service(Trigger, "/robot/stop", stop)
-        spin_until(lambda: node.count_subscribers("/joints") and call("start").success)
+        spin_until(lambda: node.count_subscribers("/joints") >= 1 and bool(call("start").success))
         first_ns, x = time.time_ns(), 0.9  # far outside of where any funnel of it would be
         for k in range(-1, 10):
             stamp_ns = first_ns + (k + 1) * PERIOD_NS
