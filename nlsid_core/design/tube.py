@@ -537,7 +537,7 @@ def _best(
         )
     if refused:
         raise Infeasible(
-            f"the solver's {MOST} best tubes are too inaccurate for the exact decision; try another "
+            "the solver's tubes are too inaccurate for the exact decision; try another "
             f"reaction_time, or a model with fewer lags. The last one: {refused}"
         )
     raise Infeasible(
