@@ -52,7 +52,6 @@ SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 SHOWN: Final = 4  # of the classes that were tried
 OTHERS: Final = 3  # commands that are named besides
-STALE: Final = 5.0  # periods without a response that are one too many
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ def _name(text: str) -> str:
     steps = [
         step for step in fields.split(".") if step not in ("twist", "pose", "data", "transform")
     ]
-    words = " ".join(steps[-2:]) if steps else topic
+    words = " ".join(steps[-2:])
     words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
     rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
     return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
@@ -384,9 +383,6 @@ def _say_grid(proposal: Proposal, read: _Read) -> None:
                 "before"
             )
     proposal.content["grid"] = grid
-    stale = max(0.1, _up(STALE * grid["period"]))
-    proposal.content["monitor"] = {"stale_after": stale}
-    why["stale_after"] = f"{STALE:g} periods, at least 0.1 s"
     if read.repeated:
         walls.append(
             f"{read.repeated} stamps of the response repeat the one before, which identification "
