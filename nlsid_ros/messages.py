@@ -93,13 +93,9 @@ class SignalMessage:
 
     def lacking(self) -> str:
         """Why the other fields are not known, empty if they are."""
-        if not self._topic or time.monotonic() - self._heard <= LEAST_PATIENCE: Final = 0.1  # s without a response,
-PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
-OTHERS_PATIENCE:
+        if not self._topic or time.monotonic() - self._heard <= OTHERS_PATIENCE:
             return ""
-        return f"nothing on {self._topic} for {LEAST_PATIENCE: Final = 0.1  # s without a response,
-PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
-OTHERS_PATIENCE:g} s, which has the other fields"
+        return f"nothing on {self._topic} for {OTHERS_PATIENCE:g} s, which has the other fields"
 
     def make(self, stamp_ns: int, values: ArrayLike) -> Any:
         """A message stamped `stamp_ns`; all that is not the signal is as `others` says."""

@@ -25,8 +25,9 @@ from bags.setup.candidates import Found, slope_window
 from bags.signals.columns import read_columns
 from bags.signals.expressions import factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
-from nlsid_core.data.trajectory import Dataset
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
 from nlsid_core.progress import silent
@@ -137,6 +138,9 @@ def propose(
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
+    proposal.walls += trials.apart
+    if _say_motions(proposal, trials.every):
+        trials = _tried(proposal, bags, definitions)
     if linear:
         _say_lags(proposal, trials.train, found)
     else:
@@ -405,6 +409,30 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
             "one bag: a tube is designed on one trial and its level measured on another; record "
             "more, or cut it: nlsid bag split BAG --out PART --every 5"
         )
+
+
+def _say_motions(proposal: Proposal, trials: Dataset) -> bool:
+    """Spread repeated motions over training, calibration and test; whether there are any.
+
+    Bags by name often come motion after motion, or in turn: every fifth may be of one motion only.
+    """
+    motions: list[list[Trajectory]] = []
+    for trial in trials:
+        known = next((m for m in motions if same_excitation(m[0].u[:, 0], trial.u[:, 0])), None)
+        if known is None:
+            motions.append([trial])
+        else:
+            known.append(trial)
+    repeats = min(map(len, motions))
+    if proposal.content["split"].get("share") or repeats < TEST_EVERY:
+        return False
+    names = [trial.name for motion in motions for trial in motion]
+    tests, scales = names[TEST_EVERY - 1 :: TEST_EVERY], names[TEST_EVERY // 2 :: TEST_EVERY]
+    proposal.content["split"] = {"test": sorted(tests), "calibration": sorted(scales)}
+    what = f"{len(motions)} motions, each recorded {repeats} times or more"
+    proposal.why["test"] = f"{what}: every {TEST_EVERY}th of each"
+    proposal.why["calibration"] = f"{what}: another {TEST_EVERY}th sets the tube's level"
+    return True
 
 
 def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]) -> Trials:
