@@ -361,7 +361,8 @@ def _model_refusals(config: Config) -> Iterator[str]:
     model = next(name for name, one in CLASSES.items() if one is kind)
     if kind in ONE_BY_ONE and counts != (1, 1):
         yield (
-            f"identification.model: {model} has one response and one excitation, not {said}; take state_affine or implicit, or leave out signals"
+            f"identification.model: {model} has one response and one excitation, not {said}; take "
+            "state_affine or implicit, or leave out signals"
         )
     elif kind is CellClass and counts[0] != 1:
         yield (
