@@ -310,7 +310,8 @@ def _decide_valid(
     |g'x̄| <= d wherever W <= ρ if ρ g'P⁻¹g <= d², so if d²P - ρgg' ⪰ 0, which holds between knots if
     it does at them. A held input is within W of clip(ũ), and within the limits.
     Centres and gains between knots are convex combinations of their control points. A limit within
-    the bounds keeps its side by itself; no limit may lie beyond the other side.
+    the bounds keeps its side by itself. Of another side the other limit has to be W away: it is the
+    input where ũ is beyond it, and a held one may be from before these bounds began.
     """
     rooms: list[dict[tuple[int, tuple[Fraction, ...]], Fraction]] = [{} for _ in funnel.t]
     for k, entries in enumerate(bounds):
@@ -322,7 +323,7 @@ def _decide_valid(
             room = [min(middle) - low - off, high - max(middle) - off]
             if i in policy.limits:
                 least, most = policy.limits[i]
-                if not (low <= most and least <= high):
+                if (least < low and most < low + off) or (most > high and least > high - off):
                     raise Rejected(f"the limits of u{i} lie where its dynamics are not valid")
                 room = room[least >= low : 2 - (most <= high)]
             for row, knot in product(rows, (k, k + 1)):

@@ -9,7 +9,6 @@ shortest decimal form (or an equal one): so no changed digit goes unnoticed. Who
 import hashlib
 import json
 import os
-import re
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -29,13 +28,6 @@ MAX_DEGREE = 63  # of a monomial, all exponents together
 MAX_STATED = 20_000  # monomials of one list
 MAX_COMMON = 10_000  # bits of the common denominator of a polynomial or of a matrix
 VERSION = 2  # of proofs and of all documents they are about
-
-_LABEL = re.compile(r"(?!e[-+0-9])(1/|[A-Za-z_/%°µ])[A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
-
-# Digits in exponents only: "0.2 m/1000" and "0.2 /1000" would be other numbers.
-_UNIT = re.compile(
-    r"(?![eE][-+^0-9])(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
-)
 
 Read = Callable[[str], bytes]  # a file's bytes by its plain name; OSError if it cannot be read
 Terms = list[tuple[tuple[int, ...], Fraction]]  # of a polynomial: exponents and coefficients
@@ -165,7 +157,8 @@ class Node:
         if any(e < 0 for row in rows for e in row):
             raise Rejected(f"{self.where}: an exponent is negative")
         if len(set(rows)) < len(rows) or (order and rows != sorted(rows, key=order)):
-            raise Rejected(f"{self.where}: monomials should be distinct, in increasing order")
+            wanted = "in increasing order" if order else "each once"
+            raise Rejected(f"{self.where}: monomials should be distinct, {wanted}")
         if any(sum(row) > degree for row in rows):
             raise Rejected(f"{self.where}: monomials should have degree at most {degree}")
         return rows
@@ -281,19 +274,6 @@ def plain(text: str) -> str:
     """`text` on one line, without control characters, for messages."""
     shown = "".join(sign if sign.isprintable() else "?" for sign in text[:MAX_NAME])
     return shown + ("..." if len(text) > MAX_NAME else "")
-
-
-def label(text: str) -> str:
-    """A name or a unit as one word of a sentence: as it is if it is plain, else quoted.
-
-    Quoted are spaces, punctuation, other scripts, and what could be read as a number's end.
-    """
-    return text if _LABEL.fullmatch(text) else json.dumps(text)
-
-
-def unit_label(text: str) -> str:
-    """A unit behind a number: as it is if it cannot change how the number is read, else quoted."""
-    return text if not text or _UNIT.fullmatch(text) else json.dumps(text)
 
 
 def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:

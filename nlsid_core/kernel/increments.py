@@ -17,31 +17,22 @@ from math import comb, prod
 from . import text
 from .exact import Matrix, combined, definite, transposed
 from .exact import product as times
-from .files import Node, Rejected, label, unit_label
+from .files import MAX_STATED, Node, Rejected
 from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
+from .polynomials import Work
+from .signals import Signal, read_signal, read_signals, within
 from .terms import derivative
 
 MAX_STATES = 120
 MAX_PHASES = 8  # a cascade or a network has 2^phases or 2^maps matrices
 MAX_POWER = 20  # of a variable of the window in a monomial
-MAX_WORK = 2 * 10**8  # order³ over all matrices that are decided: about a minute
+MAX_WORK = 2 * 10**8  # order³ + MATRIX over all matrices of a claim: about a minute
+MATRIX = 500  # what deciding one costs at the least
 MAX_SLOPES = 10**7  # entries of all coefficients of ∂h/∂(v, x), in which a term may occur often
 MAX_SPLITS = 40  # of one box, one inside the other
 
 Box = list[tuple[Fraction, Fraction]]
 Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
-
-
-@dataclass(frozen=True)
-class Signal:
-    """A signal's name and unit, as words of a sentence."""
-
-    name: str
-    unit: str
-
-    def quantity(self, number: str) -> str:
-        """The number with the unit, if there is one."""
-        return f"{number} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -88,13 +79,16 @@ class Model:
         return len(self.F[0]) - len(self.F)
 
 
-def positive(model: Model, multipliers: Node | None, forms: Sequence[tuple[str, Matrix]]) -> None:
+def positive(
+    model: Model, multipliers: Node | None, forms: Sequence[tuple[str, Matrix]], work: Work
+) -> None:
     """Raise Rejected unless M + sym(N [E 0]) ≻ 0 for each form (what, M), at every vertex E.
 
-    M is of order m + n or more. `multipliers` is a leaf {N}, N of M's order × m, a list of one for
-    each form if there are several; or {split, parts}: the variable of the box that is halved, and
-    the multipliers of the lower and of the upper half. A leaf may state `ends` beside N: bounds of
-    the one entry of E that varies, in the place of the vertices (`_between`).
+    work: MAX_WORK of a claim, shared by all that it decides. M is of order m + n or more.
+    `multipliers` is a leaf {N}, N of M's order × m, a list of one for each form if there are
+    several; or {split, parts}: the variable of the box that is halved, and the multipliers of the
+    lower and of the upper half. A leaf may state `ends` beside N: bounds of the one entry of E that
+    varies, in the place of the vertices (`_between`).
     """
     m, size = model.unknowns, len(forms[0][1])
     if multipliers is None:
@@ -105,19 +99,15 @@ def positive(model: Model, multipliers: Node | None, forms: Sequence[tuple[str, 
         return
     if not m:
         raise Rejected("this class of models has no multipliers")
-    work, first = 0, forms[0][0]
+    slow = f"{forms[0][0]} takes too long to decide: too many"
     for box, leaf in _leaves(multipliers, model.box, model.whole, 0):
         given = leaf["N"]
         Ns = given.array(len(forms), size, m) if len(forms) > 1 else [given.array(size, m)]
-        work += 30 * model.effort
         if model.ray and any(N[0][0] < 0 or any(row[0] for row in N[1:]) for N in Ns):
             raise Rejected("the multiplier of an unbounded slope should be (T, 0, ..., 0), T >= 0")
-        if work > MAX_WORK:
-            raise Rejected(f"{first} takes too long to decide: too many coefficients")
+        work.spend(30 * model.effort, f"{slow} coefficients")
         for E in model.vertices(box, leaf.get("ends")):
-            work += len(forms) * size**3
-            if work > MAX_WORK:
-                raise Rejected(f"{first} takes too long to decide: too many matrices")
+            work.spend(len(forms) * (size**3 + MATRIX), f"{slow} matrices")
             wide = [row + [Fraction(0)] * (size - len(row)) for row in E]
             for (what, M), N in zip(forms, Ns, strict=True):
                 cross = times(N, wide)
@@ -180,9 +170,6 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
         raise Rejected(f"a model of kind {kind} needs no box: its increments are known everywhere")
     if not 0 < model.states <= MAX_STATES:
         raise Rejected(f"{node.where}: {model.states} states; 1 to {MAX_STATES} are decided")
-    for signals, what in ((model.y, "outputs"), (model.u, "inputs")):
-        if len({signal.name for signal in signals}) < len(signals):
-            raise Rejected(f"{node.where}: two {what} have the same name")
     return model
 
 
@@ -198,7 +185,7 @@ def _difference_equation(node: Node) -> Model:
         raise Rejected(f"{node.where} u_range is empty")
     A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
     return Model(
-        _period(parts), (_signal(parts["y"]),), (_signal(parts["u"]),),
+        _period(parts), (read_signal(parts["y"]),), (read_signal(parts["u"]),),
         A, [_unit(0, n)], "for every input", [], lambda _, __: [],
         linear=Linear(
             [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)],
@@ -213,10 +200,11 @@ def _state_affine(node: Node) -> Model:
         node,
         "y u window G p y_offset y_scale u_offset u_scale u_range on_out_of_range",
     )
-    y, u = (tuple(_signal(s) for s in parts[key].items(1, 50)) for key in ("y", "u"))
+    y, u = read_signals(parts["y"], "outputs", 1), read_signals(parts["u"], "inputs", 1)
     p, n_u = len(y), len(u)
     window = parts["window"].wholes(None, 2)
-    G = [_polynomials(entry, len(window), p, p) for entry in parts["G"].items(2, MAX_STATES)]
+    size = _size(p * (len(parts["G"].items(2)) - 1), parts["G"])
+    G = [_polynomials(entry, len(window), p, p) for entry in parts["G"].items()]
     whole = _side_by_side(G, p)
     _polynomials(parts["p"], len(window), p)
     parts["y_offset"].array(p)
@@ -227,7 +215,6 @@ def _state_affine(node: Node) -> Model:
     if any(not (0 <= i < n_u and 0 <= d < len(G)) for i, d in window):
         raise Rejected(f"{node.where} window names inputs or delays that are not there")
     box = [tuple((end - offsets[i]) / u_scale[i] for end in ranges[i]) for i, _ in window]
-    size = p * (len(G) - 1)
     F = [_unit(i, p + size) for i in range(size)]  # x⁺ = [ν; all but the oldest of x]
     H = [[y_scale[i] * entry for entry in _unit(i, p + size)] for i in range(p)]
     return Model(
@@ -282,7 +269,7 @@ def _block_cascade(node: Node) -> Model:
 
     covered = f"[{text.below(least)}, {text.above(most)}]"
     return Model(
-        _period(parts), (_signal(parts["y"]),), (_signal(parts["u"]),), F, [H],
+        _period(parts), (read_signal(parts["y"]),), (read_signal(parts["u"]),), F, [H],
         f"for every input (the slopes of its nonlinearity are in {covered} everywhere)",
         [], corners,
     )  # fmt: skip
@@ -295,7 +282,7 @@ def _cell_network(node: Node) -> Model:
     and on beyond them. into is strictly lower triangular in ν, so every output is determined.
     """
     parts = _members(node, "y u maps into next output start start_samples")
-    y, u = (tuple(_signal(s) for s in parts[key].items(i, 50)) for key, i in (("y", 1), ("u", 0)))
+    y, u = read_signals(parts["y"], "outputs", 1), read_signals(parts["u"], "inputs")
     ends = [_slope_range(f) for f in parts["maps"].items(1, MAX_PHASES)]
     m, n = len(ends), _size(len(parts["start"].array(None)), parts["start"])
     parts["start_samples"].whole(1)
@@ -338,7 +325,7 @@ def _monotone_equation(node: Node) -> Model:
     first, second, third = parts["e"].array(3)
     a = parts["a"].array(None)
     n = _size(len(a), parts["a"])
-    u = tuple(_signal(s) for s in parts["u"].items(0, 50))
+    u = read_signals(parts["u"], "inputs")
     window = parts["window"].wholes(None, 2)
     parts["b"].array(len(window))
     parts["u_offset"].array(len(u))
@@ -352,7 +339,7 @@ def _monotone_equation(node: Node) -> Model:
     E = [[least, *(-entry for entry in a)]]
     F = [_unit(i, n + 1) for i in range(n)]
     return Model(
-        _period(parts), (_signal(parts["y"]),), u, F, [_unit(0, n + 1)],
+        _period(parts), (read_signal(parts["y"]),), u, F, [_unit(0, n + 1)],
         "for every input", [], lambda _, __: [E], ray=third > 0,
     )  # fmt: skip
 
@@ -368,7 +355,7 @@ def _implicit(node: Node, bounds: Node | None) -> Model:
     """
     given = read_implicit_model(node)
     parts = node.members("y u window", f"{MEMBERS} training bags")
-    y, u = (tuple(_signal(s) for s in parts[key].items(0, 50)) for key in "yu")
+    y, u = read_signals(parts["y"], "outputs"), read_signals(parts["u"], "inputs")
     window = parts["window"].wholes(given.inputs, 2)
     p, n = given.unknowns, given.states
     if len(y) != p or n % p or any(not (0 <= i < len(u) and d >= 0) for i, d in window):
@@ -466,12 +453,15 @@ def _side_by_side(G: Sequence[Terms], rows: int) -> Terms:
     """[G_0 … G_n] as one matrix polynomial."""
     zeros = [[Fraction(0)] * rows for _ in range(rows)]
     found = [{tuple(powers): block for powers, block in g} for g in G]
+    used = sorted({powers for g in found for powers in g})
+    if len(used) > MAX_STATED:
+        raise Rejected(f"the model has {len(used)} monomials; at most {MAX_STATED} are taken")
     return [
         (
             list(powers),
             [[entry for g in found for entry in g.get(powers, zeros)[i]] for i in range(rows)],
         )
-        for powers in sorted({powers for g in found for powers in g})
+        for powers in used
     ]
 
 
@@ -578,13 +568,11 @@ def _extreme(E: list[Matrix]) -> list[Matrix]:
 
 def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
     parts = node.members("exponents coefficients")
-    exponents = parts["exponents"].wholes(None, variables)
+    exponents = parts["exponents"].monomials(variables, MAX_POWER * variables)
     coefficients = parts["coefficients"].array(len(exponents), *shape)
-    if len({tuple(row) for row in exponents}) != len(exponents) or not exponents:
-        raise Rejected(f"{node.where} should have monomials, each once")
-    if any(not 0 <= power <= MAX_POWER for row in exponents for power in row):
-        raise Rejected(f"{node.where}: powers should be from 0 to {MAX_POWER}")
-    return list(zip(exponents, coefficients, strict=True))
+    if not exponents or any(power > MAX_POWER for row in exponents for power in row):
+        raise Rejected(f"{node.where} should have monomials, with powers from 0 to {MAX_POWER}")
+    return list(zip(map(list, exponents), coefficients, strict=True))
 
 
 def _members(node: Node, names: str) -> dict[str, Node]:
@@ -606,20 +594,10 @@ def _period(parts: dict[str, Node]) -> Fraction:
     return period
 
 
-def _signal(node: Node) -> Signal:
-    parts = node.members("name unit path")
-    parts["path"].text()
-    name, unit = parts["name"].text(), parts["unit"].text()
-    return Signal(label(name), unit_label(unit))
-
-
 def _inputs_in_range(beyond: str, u: Sequence[Signal], ranges: Sequence[Sequence[Fraction]]) -> str:
     if beyond not in ("clip", "refuse"):
         raise Rejected(f"on_out_of_range is {beyond!r}; known: clip, refuse")
-    shown = ", ".join(
-        signal.quantity(f"{signal.name} in [{text.above(low)}, {text.below(high)}]")
-        for signal, (low, high) in zip(u, ranges, strict=True)
-    )
+    shown = ", ".join(within(*pair) for pair in zip(u, ranges, strict=True))
     if beyond == "clip":
         return f"for every input (the model clips its inputs: {shown})"
     return f"for every input in the model's range ({shown}; it refuses others)"

@@ -13,7 +13,7 @@ from fractions import Fraction
 from . import text
 from .exact import Matrix
 from .files import Node, Rejected
-from .increments import Signal
+from .signals import Signal
 
 MAX_TERMS = 200
 MAX_FACTORS = 4
@@ -86,8 +86,8 @@ def _square(term: Term, u: tuple[Signal, ...]) -> str:
     """v² in words; empty where it is 1."""
     if not term.inputs and not term.change and term.centre == 0 and term.scale == 1:
         return ""
-    product = " x ".join(_plain(u[i].name) for i in term.inputs) or "1"
-    unit = Signal("", " ".join(_plain(u[i].unit) for i in term.inputs if u[i].unit))
+    product = " x ".join(_plain(u[i].name, "()+*^/-") for i in term.inputs) or "1"
+    unit = Signal("", " ".join(_plain(u[i].unit, "()+*^") for i in term.inputs if u[i].unit))
     if term.change:
         of = f"change of {product}"
     elif term.centre:
@@ -97,8 +97,7 @@ def _square(term: Term, u: tuple[Signal, ...]) -> str:
     return f"({of} / {unit.quantity(text.exact(term.scale))})^2"
 
 
-def _plain(word: str) -> str:
+def _plain(word: str, operators: str) -> str:
     """A name or unit in a formula: quoted if it could be read as a part of it."""
-    return (
-        json.dumps(word) if not word.startswith('"') and any(c in word for c in "()+*^") else word
-    )
+    own = not word.startswith('"') and any(sign in operators for sign in word)
+    return json.dumps(word) if own else word

@@ -52,12 +52,15 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         return min((left.get(key, Fraction(0)) for key in forms or [0]), default=Fraction(0))
 
     margin = at_width(n + len(M), Work(MOST_WORK, FREE_OF_S), build)
-    where = [f"{shown(g, names)} >= 0" for g in domain]
-    where += [f"{shown(h, names)} = 0" for h in equalities]
+    where = [f"{shown(g, names, f'domain[{i}]')} >= 0" for i, g in enumerate(domain)]
+    where += [f"{shown(h, names, f'equalities[{i}]')} = 0" for i, h in enumerate(equalities)]
     condition = f" with {' and '.join(where)}" if where else ""
-    inequality = f"{shown(p, names)} >= {text.below(bound, BOUND_DIGITS)}"
+    inequality = f"{shown(p, names, 'polynomial')} >= {text.below(bound, BOUND_DIGITS)}"
     if is_matrix:
-        rows = "; ".join(", ".join(shown(entry, names) for entry in row) for row in M)
+        rows = "; ".join(
+            ", ".join(shown(entry, names, f"matrix[{i}][{j}]") for j, entry in enumerate(row))
+            for i, row in enumerate(M)
+        )
         inequality = f"the matrix [{rows}] is positive semidefinite"
     return Decision(f"{inequality} for all real {', '.join(names)}{condition}", margin, (), digests)
 

@@ -44,11 +44,11 @@ class Work:
     left: int = MAX_WORK
     width: int = WIDTHS[0]
 
-    def spend(self, amount: int) -> None:
+    def spend(self, amount: int, what: str = "") -> None:
         """Raise Rejected when it is used up."""
         self.left -= amount
         if self.left < 0:
-            raise Rejected("the claim takes more products to decide than are spent on one")
+            raise Rejected(what or "the claim takes more products to decide than are spent on one")
 
 
 @dataclass(frozen=True)

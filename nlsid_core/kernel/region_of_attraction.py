@@ -46,10 +46,10 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         return positive_except_origin(decrease, witness, ring, "the decrease of V")
 
     margin = at_width(n, Work(MOST_WORK, FREE_OF_S), build)
-    rates = zip(names, field, strict=True)
-    dynamics = ", ".join(f"d{name}/dt = {shown(f, names)}" for name, f in rates)
+    rates = enumerate(zip(names, field, strict=True))
+    dynamics = ", ".join(f"d{x}/dt = {shown(f, names, f'field[{i}]')}" for i, (x, f) in rates)
     start = ""
     if level is not None:
-        start = f" that starts in {{{shown(V, names)} <= {text.below(level, LEVEL_DIGITS)}}}"
+        start = f" that starts in {{{shown(V, names, 'V')} <= {text.below(level, LEVEL_DIGITS)}}}"
     sentence = f"every solution of {dynamics}{start} tends to the origin"
     return Decision(sentence, margin, (), digests)

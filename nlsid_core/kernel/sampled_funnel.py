@@ -15,9 +15,10 @@ from math import comb, factorial, prod
 
 from .decision import Decision
 from .exact import Matrix, at_most, combined, inverse_forms, product, semidefinite, transposed
-from .files import Node, Read, Rejected, Terms, bound_files, label, unit_label
+from .files import Node, Read, Rejected, Terms, bound_files
 from .polynomials import BITS, FREE_OF_S, Polynomial, Ring, Work, at_width
 from .positivity import expanded, positive, powers_of_two, read_squares
+from .signals import Signal, apart, read_signals
 from .text import above, below
 from .trials import LONGEST, Recorded, read_trials, shared
 
@@ -30,12 +31,13 @@ MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variable
 
 @dataclass(frozen=True)
 class Model:
-    """A map (trapezoidal: of accelerations); signals: name, unit and box, states first."""
+    """A map (trapezoidal: of accelerations); signals and their box, states first."""
 
     trapezoidal: bool
     map: list[Terms]
     period: Fraction
-    signals: list[tuple[str, str, Fraction, Fraction]]
+    signals: list[Signal]
+    box: Matrix
     states: int
     bags: list[Recorded]
 
@@ -324,12 +326,12 @@ def _prove_box(model: Model, funnel: Funnel, k: int, centres: list[Fraction], K:
     tube, inlet = (funnel.radii[chain][k] + funnel.widens for chain in CHAINS)
     rows = [[Fraction(i == j) for j in range(n)] for i in range(n)] + K
     forms = inverse_forms(product(transposed(funnel.S[k]), funnel.S[k]), rows, "S'S")
-    signals, stays = model.signals, "the box of the model's data"
+    names, stays = [signal.name for signal in model.signals], "the box of the model's data"
     rooms = [(tube, width, "its stated half-width") for width in funnel.half_widths[k]]
-    for centre, (_, _, low, high) in zip(centres, signals, strict=False):
+    for centre, (low, high) in zip(centres, model.box, strict=False):
         rooms.append((max(tube, inlet), min(high - centre, centre - low), stays))
-    named = zip(rooms, [*forms[:n], *forms], [*signals[:n], *signals], strict=False)
-    for (radius, room, kept), form, (name, *_) in named:
+    named = zip(rooms, [*forms[:n], *forms], [*names[:n], *names], strict=False)
+    for (radius, room, kept), form, name in named:
         if room < 0 or radius**2 * form > room**2:
             raise Rejected(f"sample {k}: {name} can leave {kept}")
 
@@ -341,13 +343,10 @@ def _read_model(node: Node) -> Model:
         "state_map trapezoidal",
     )
     trapezoidal = parts["kind"].value == "trapezoidal"
-    x, u = (parts[key].items(1, MAX_SIGNALS) for key in "xu")
+    x = read_signals(parts["x"], "states", 1, MAX_SIGNALS)
+    u = read_signals(parts["u"], "inputs", 1, MAX_SIGNALS)
     box = parts["x_range"].array(len(x), 2) + parts["u_range"].array(len(u), 2)
-    signals = []
-    for entry, (low, high) in zip(x + u, box, strict=True):
-        named = entry.members("name unit path")
-        name, unit = named["name"].text(), named["unit"].text()
-        signals.append((label(name), unit_label(unit), low, high))
+    signals = [*x, *apart(u, x)]
     exponents, period = parts["exponents"].monomials(len(signals)), parts["period"].number()
     if (trapezoidal and len(x) % 2) or period <= 0 or not exponents:
         raise Rejected("a model needs a positive period, monomials, and a rate for each position")
@@ -355,7 +354,7 @@ def _read_model(node: Node) -> Model:
     columns = transposed(parts["coefficients"].array(len(exponents), outputs))
     polynomials = [list(zip(exponents, column, strict=True)) for column in columns]
     bags = read_trials(parts["bags"])
-    model = Model(trapezoidal, polynomials, period, signals, len(x), bags)
+    model = Model(trapezoidal, polynomials, period, signals, box, len(x), bags)
     degree, variables = max(map(sum, exponents)), _variables(model)
     if comb(variables + degree, degree) > MAX_MONOMIALS:
         raise Rejected(f"degree {degree} in {variables} variables is too large to decide")
@@ -418,16 +417,14 @@ def _sentence(model: Model, funnel: Funnel, steps: int) -> str:
     tube, inlet = (funnel.radii[chain] for chain in CHAINS)
     ends, goal = (
         ", ".join(
-            f"{name} {above(width * wider)} {unit}".rstrip()
-            for (name, unit, _, _), width in zip(
-                model.signals, funnel.half_widths[-1], strict=False
-            )
+            signal.quantity(f"{signal.name} {above(width * wider)}")
+            for signal, width in zip(model.signals, funnel.half_widths[-1], strict=False)
         )
         for wider in (Fraction(1), (inlet[-1] + funnel.widens) / (tube[-1] + funnel.widens))
     )
     box = ", ".join(
-        f"{name} in [{below(low)}, {above(high)}] {unit}".rstrip()
-        for name, unit, low, high in model.signals
+        signal.quantity(f"{signal.name} in [{below(low)}, {above(high)}]")
+        for signal, (low, high) in zip(model.signals, model.box, strict=True)
     )
     start, size = "starts with |S[0] (xhat - x[0])| <=", "|S[k] (xhat - x[k])| <= tube[k]"
     return (

@@ -11,7 +11,8 @@ from . import text
 from .decision import Decision
 from .exact import combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
-from .increments import block_diagonal, positive, read_model, scaled, zero
+from .increments import MAX_WORK, block_diagonal, positive, read_model, scaled, zero
+from .polynomials import Work
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -28,7 +29,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     supply = block_diagonal(zero(model.unknowns), scaled(P, rate**2))
     gap = combined(supply, congruence(model.F, P), -1)
     what = "the decrease of V = x'Px at the stated rate"
-    positive(model, given.get("multipliers"), [(what, gap)])
+    positive(model, given.get("multipliers"), [(what, gap)], Work(MAX_WORK))
     return Decision(
         statement=(
             f"incremental stability: two solutions with the same input approach each other, in "

@@ -49,8 +49,8 @@ def along(
     return [ring.dot(found[i : i + size], direction) for i in range(0, size * len(ps), size)]
 
 
-def shown(p: Terms, names: Sequence[str]) -> str:
-    """p with its exact coefficients, highest degree first; its size alone if that is too long."""
+def shown(p: Terms, names: Sequence[str], what: str) -> str:
+    """p with its exact coefficients, highest degree first; if too long, its place and size."""
     result = ""
     for exponents, coefficient in reversed(p):
         if not coefficient:
@@ -69,5 +69,5 @@ def shown(p: Terms, names: Sequence[str]) -> str:
         result += " ".join(parts)
         if len(result) > MAX_SHOWN:
             degree = max(sum(e) for e, _ in p)
-            return f"the claim's polynomial of degree {degree} with {len(p)} terms"
+            return f"the claim's {what} of degree {degree} with {len(p)} terms"
     return result or "0"

@@ -16,8 +16,10 @@ from . import text
 from .decision import Decision
 from .exact import Matrix, at_most, combined, congruence, definite
 from .files import Node, Read, Rejected, bound_files
-from .increments import Model, Signal, block_diagonal, positive, read_model, scaled, zero
+from .increments import MAX_WORK, Model, block_diagonal, positive, read_model, scaled, zero
 from .levels import CommandLevel, formula, read_level
+from .polynomials import Work
+from .signals import Signal, apart, within
 from .trials import MEASURED, Measured, Recorded, calibration, read_measured, read_trials
 
 MAX_SAMPLES = 10**9
@@ -89,7 +91,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
     trees: list[Node] | list[None] = [None] * len(tubes)
     if given is not None:
         trees = given.items(len(tubes), len(tubes))
-    margin = Fraction(1)
+    margin, work = Fraction(1), Work(MAX_WORK)
     for tube, tree in zip(tubes, trees, strict=True):
         if policy and tube.L != policy.L:
             raise Rejected("the observer of a tube is not the policy's: L is another")
@@ -98,7 +100,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         definite(tube.P, "P")
         definite(tube.R, "R")
         for mode, moved in _modes(model, policy):
-            positive(moved, tree, _forms(moved, tube, mode))
+            positive(moved, tree, _forms(moved, tube, mode), work)
         for tau, width, signal in zip(tube.tau, tube.half_widths, model.y, strict=True):
             used = (tube.assumed.level + tube.rho * tube.inlet) / (tau * width**2)
             left = f"{signal.name} can leave the stated half-width {text.above(width)}"
@@ -300,9 +302,9 @@ def _start(model: Model, policy: Policy | None, tubes: list[Tube], settling: int
 def _inside(model: Model, box: Node) -> str:
     ranges = box.members("y u")
     shown = ", ".join(
-        signal.quantity(f"{signal.name} in [{text.above(low)}, {text.below(high)}]")
-        for signals, key in ((model.y, "y"), (model.u, "u"))
-        for signal, (low, high) in zip(signals, ranges[key].array(len(signals), 2), strict=True)
+        within(*pair)
+        for signals, key in ((model.y, "y"), (apart(model.u, model.y), "u"))
+        for pair in zip(signals, ranges[key].array(len(signals), 2), strict=True)
     )
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 

@@ -455,7 +455,7 @@ def stays_valid(oracle: "Oracle", k: int) -> bool:
         room = [min(middle) - low - off, high - max(middle) - off]
         if j >= n and j - n in limits:
             least, most = limits[j - n]
-            if low > most or least > high:
+            if (least < low and low + off > most) or (most > high and least > high - off):
                 return False
             room = [r for r, kept in zip(room, (least >= low, most <= high), strict=True)
                     if not kept]  # fmt: skip

@@ -1,0 +1,80 @@
+"""Signals as files state them, and their names and units as words that change no sentence."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from . import text
+from .files import Node, Rejected
+
+MAX_SIGNALS = 50
+
+_NAME = re.compile(r"(?!e[-+0-9])[A-Za-z_/%°µ][A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
+
+# Digits in exponents only: "0.2 m/1000" and "0.2 /1000" would be other numbers.
+_UNIT = re.compile(
+    r"(?![eE][-+^0-9])(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
+)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal's name and unit, as words of a sentence."""
+
+    name: str
+    unit: str
+
+    def quantity(self, number: str) -> str:
+        """The number with the unit, if there is one."""
+        return f"{number} {self.unit}".rstrip()
+
+
+def name_label(name: str) -> str:
+    """A name as one word of a sentence: as it is if it is plain, else quoted.
+
+    Quoted are spaces, punctuation, other scripts, and what could be read as a number.
+    """
+    return name if _NAME.fullmatch(name) else json.dumps(name)
+
+
+def unit_label(unit: str) -> str:
+    """A unit behind a number: as it is if it cannot change how the number is read, else quoted."""
+    return unit if not unit or _UNIT.fullmatch(unit) else json.dumps(unit)
+
+
+def read_signal(node: Node) -> Signal:
+    """One {name, unit, path}."""
+    parts = node.members("name unit path")
+    parts["path"].text()
+    return Signal(name_label(parts["name"].text()), unit_label(parts["unit"].text()))
+
+
+def read_signals(
+    node: Node, what: str, least: int = 0, most: int = MAX_SIGNALS
+) -> tuple[Signal, ...]:
+    """A list of `least` to `most` of `what`, each with a name of its own."""
+    signals = tuple(read_signal(entry) for entry in node.items(least, most))
+    if len({signal.name for signal in signals}) < len(signals):
+        raise Rejected(f"{node.where}: two {what} have the same name")
+    return signals
+
+
+def apart(inputs: Sequence[Signal], outputs: Sequence[Signal]) -> list[Signal]:
+    """The inputs, named `input NAME` where an output, or a state, has the name."""
+    names = {signal.name for signal in outputs}
+    return [
+        Signal(f"input {signal.name}" if signal.name in names else signal.name, signal.unit)
+        for signal in inputs
+    ]
+
+
+def within(signal: Signal, ends: Sequence[Fraction]) -> str:
+    """`NAME in [LOW, HIGH] UNIT` for low < high, rounded inward, to digits that leave a range."""
+    low, high = ends
+    digits = text.DIGITS
+    while Fraction(text.above(low, digits)) >= Fraction(text.below(high, digits)):
+        digits += 1
+    shown = f"[{text.above(low, digits)}, {text.below(high, digits)}]"
+    return signal.quantity(f"{signal.name} in {shown}")
