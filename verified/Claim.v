@@ -96,6 +96,12 @@ Definition inside_segment (g : segment) (x : list (R -> R)) (t : R) : Prop :=
 Definition inside (d : problem) (x : list (R -> R)) (t : R) : Prop :=
   forall g, In g (segments d) -> begins g <= t <= ends g -> inside_segment g x t.
 
+(* Where the equations are valid: entries of (x, u) within their bounds. *)
+Definition in_bounds (d : problem) (x : list (R -> R)) (t : R) : Prop :=
+  forall g b, In g (segments d) -> begins g <= t <= ends g -> In b (bounds g) ->
+  val (fst (snd b)) <= nth (fst b) (at_time x t ++ input d g (place g t) (at_time x t)) 0
+    <= val (snd (snd b)).
+
 (* (x - centre)'B(x - centre) <= 1 at the end *)
 Definition in_goal (d : problem) (x : list (R -> R)) : Prop :=
   match goal d with

@@ -1,6 +1,6 @@
 (* The checker as a program: whole numbers become zarith's. Trusts extraction and zarith. *)
 From Coq Require Import ZArith List Extraction ExtrOcamlBasic ExtrOcamlNatInt ExtrOcamlZBigInt.
-From Verified Require Import Integers Positive Claim Funnel Goal Tubes Boxes Near Driven.
+From Verified Require Import Integers Positive Claim Funnel Goal Files Tubes Boxes Near Driven.
 
 Extract Constant Z.gcd => "Big_int_Z.gcd_big_int".
 Extract Constant Z.leb => "Big_int_Z.le_big_int".
@@ -8,7 +8,7 @@ Extract Constant Z.ltb => "Big_int_Z.lt_big_int".
 Extract Constant Pos.leb => "Big_int_Z.le_big_int".
 Extract Constant Pos.eqb => "Big_int_Z.eq_big_int".
 
-Definition decide_funnel (d : problem) (w : @witness plain) : bool := @funnel_ok plain d w.
+Definition decide_funnel := @files_ok plain.
 Definition decide_tubes := @tubes_ok plain.
 Definition decide_plans a b b0 feedback ts := forallb (@plan_ok plain a b b0 feedback) ts.
 Definition decide_stability := @stability_ok plain.

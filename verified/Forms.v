@@ -45,3 +45,23 @@ Fixpoint update {A : Type} (i : nat) (f : A -> A) (l : list A) : list A :=
   end.
 Lemma update_length {A} (f : A -> A) l : forall i, length (update i f l) = length l.
 Proof. induction l as [|a l IH]; intros [|i]; cbn; auto. Qed.
+
+Lemma dot_plus b : forall y d, length y = length d ->
+  dot b (zip Rplus y d) = dot b y + dot b d.
+Proof.
+  induction b as [|b0 b IH]; intros [|y0 y] [|d0 d] H; try discriminate; cbn; try ring.
+  rewrite IH by (now injection H). ring.
+Qed.
+Lemma form_plus M : forall y d w, length y = length d ->
+  form M (zip Rplus y d) w = form M y w + form M d w.
+Proof.
+  induction M as [|[|a b] M IH]; intros [|y0 y] [|d0 d] [|w0 w] H; try discriminate; cbn; try ring.
+  rewrite IH, dot_plus by (now injection H). ring.
+Qed.
+Lemma dot_scaled_r c a : forall b, dot a (map (fun v => v * c) b) = dot a b * c.
+Proof. induction a as [|y a IH]; intros [|z b]; cbn; try ring. rewrite IH. ring. Qed.
+Lemma form_scaled_r c M : forall y z, form M y (map (fun v => v * c) z) = form M y z * c.
+Proof.
+  induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
+  rewrite IH, !dot_scaled_r. ring.
+Qed.

@@ -1,22 +1,25 @@
 (* A continuous funnel: what is decided about it, and why solutions then stay inside. *)
 From Coq Require Import ZArith Reals List Lra Lia.
-From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition.
+From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition Definite Pushed.
 Import ListNotations.
 Open Scope R_scope.
 
 Section Funnel.
 Context {K : Ints}.
 
-(* The part [index, index + 1] / 2^depth of a segment, at a vertex of w and in a mode (by their
-   places in [vertices] and [modes]), with its multipliers and squares. *)
+(* The part [index, index + 1] / 2^depth of a segment, at a corner of w and in a mode (by their
+   places in [corners] and [modes]), with its multipliers and squares; [kappa]: of every w, if w is
+   at its centre and bounded by what it adds at most. *)
 Record piece := Piece {
-  depth : Z; index : Z; vertex : nat; mode : nat;
+  depth : Z; index : Z; vertex : nat; mode : nat; kappa : list num;
   mu : list (Z * (I * I)); columns : list Z; gram_factors : squares;
   tau : list (list Z * squares) }.
 Record witness := Witness {
   margin : num; basis : list mono; multiplier : list mono; sides : list mono;
   pieces : list (list piece);
-  goal_multiplier : num }.
+  pushed : bool; goal_multiplier : num }.
+Definition corners (w : witness) (box : list (num * num)) : list (list num) :=
+  if pushed w then [map middle box] else vertices box.
 
 Definition num_eqb (a b : num) : bool :=
   andb (Z.eqb (fst a) (fst b)) (Pos.eqb (snd a) (snd b)).
@@ -48,15 +51,21 @@ Fixpoint all_expanded (rows : list mono) (l : list (list Z * squares)) : option 
       end
   end.
 
+Definition kappa_ok (d : problem) (g : segment) (p : piece) (skipped : nat) : bool :=
+  andb (forallb (pushes_only skipped) (equations g))
+    (andb (Nat.eqb (length (kappa p)) (length (box d))) (forallb (num_ltb (0%Z, xH)) (kappa p))).
 Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (p : piece)
   : bool :=
-  match nth_error (vertices (box d)) (vertex p), nth_error (modes (limits d)) (mode p),
+  match nth_error (corners w (box d)) (vertex p), nth_error (modes (limits d)) (mode p),
     all_expanded (sides w) (tau p) with
   | Some v, Some m, Some taus =>
       let f := fmu (multiplier w) (mu p) in
-      andb (andb (0 <=? depth p)%Z (ipos (den f)))
+      let skipped := (1 + length (nominal g) + length (limits d))%nat in
+      let c := fcondition (margin w) (limits d) m v g (depth p) (index p) f taus in
+      andb (andb (andb (0 <=? depth p)%Z (ipos (den f)))
+             (if pushed w then kappa_ok d g p skipped else true))
         (is_positive (basis w) products (columns p) (gram_factors p)
-          (fcondition (margin w) (limits d) m v g (depth p) (index p) f taus))
+          (if pushed w then fsub c (fpushed (kappa p) (box d) g (depth p) (index p) skipped) else c))
   | _, _, _ => false
   end.
 
@@ -70,9 +79,9 @@ Fixpoint reached (v m : nat) (sofar : Z) (ps : list piece) : Z :=
       then reached v m (Z.max sofar ((index p + 1) * 2 ^ (16 - depth p))) ps'
       else reached v m sofar ps'
   end.
-Definition covered (d : problem) (ps : list piece) : bool :=
+Definition covered (d : problem) (w : witness) (ps : list piece) : bool :=
   forallb (fun v => forallb (fun m => (2 ^ 16 <=? reached v m 0 ps)%Z)
-    (seq 0 (length (modes (limits d))))) (seq 0 (length (vertices (box d)))).
+    (seq 0 (length (modes (limits d))))) (seq 0 (length (corners w (box d)))).
 
 Fixpoint triangle_ok {A : Type} (k : nat) (M : list (list A)) : bool :=
   match k, M with
@@ -106,7 +115,7 @@ Definition check (d : problem) (w : witness) : bool :=
   andb (andb (andb (num_ltb (0%Z, xH) (margin w)) (linked (segments d)))
          (forallb (fun l => match l with Some (a, b) => num_ltb a b | None => true end) (limits d)))
     (andb (Nat.eqb (length (pieces w)) (length (segments d)))
-      (forallb (fun e => andb (andb (segment_ok n d (fst e)) (covered d (snd e)))
+      (forallb (fun e => andb (andb (segment_ok n d (fst e)) (covered d w (snd e)))
                           (forallb (piece_ok d w products (fst e)) (snd e)))
         (combine (segments d) (pieces w)))).
 
@@ -199,15 +208,6 @@ Proof.
 Qed.
 
 (* The equations are affine in w, and so is the growth of W. *)
-Lemma power_split L : forall e (post : list R), exists c, forall y,
-  power e (L ++ y :: post) = c * y ^ (nth (length L) e O).
-Proof.
-  induction L as [|a L IH]; intros [|k e] post; cbn [app power length nth].
-  - exists 1. intros; cbn; ring.
-  - exists (power e post). intros; ring.
-  - exists 1. intros; cbn; ring.
-  - destruct (IH e post) as [c Hc]. exists (a ^ k * c). intros y'. rewrite Hc. ring.
-Qed.
 Definition linear_beyond (n : nat) (e : equation) : Prop :=
   Forall (fun t => Forall (fun k => (k <= 1)%nat) (skipn n (fst t))) e.
 Lemma rate_affine n e L pre post a b l : linear_beyond n e -> length L = n ->
@@ -340,7 +340,7 @@ Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
 Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
-Hypothesis Hcov : covered d ps = true.
+Hypothesis Hcov : covered d w ps = true.
 Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
 
 Record facts : Prop := {
@@ -387,7 +387,7 @@ Proof.
   pose proof (Rmult_le_pos s (val (level (stop g))) ltac:(lra) ltac:(lra)). lra.
 Qed.
 
-Lemma piece_at v m s : 0 <= s <= 1 -> (v < length (vertices (box d)))%nat ->
+Lemma piece_at v m s : 0 <= s <= 1 -> (v < length (corners w (box d)))%nat ->
   (m < length (modes (limits d)))%nat ->
   exists p, In p ps /\ vertex p = v /\ mode p = m /\ holds p s.
 Proof.
@@ -398,7 +398,8 @@ Proof.
   - apply Forall_forall. intros p Hp. rewrite forallb_forall in Hps. specialize (Hps p Hp).
     unfold piece_ok in Hps. destruct (nth_error _ _); [|discriminate].
     destruct (nth_error _ _); [|discriminate]. destruct (all_expanded _ _); [|discriminate].
-    apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _]. now apply Z.leb_le in X.
+    apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _]. apply andb_prop in X as [X _].
+    now apply Z.leb_le in X.
   - apply IZR_le in Hcov. change (IZR (2 ^ 16)) with 65536 in Hcov. lra.
   - change (2 ^ 16)%Z with 65536%Z in Hcov. lia.
   - exists p. replace (s * 65536 / 65536) with s in Hp by field. exact Hp.
@@ -419,32 +420,66 @@ Proof.
   rewrite Hin.
   assert (Lapp : length (applied (limits d) m us) = length (limits d)).
   { rewrite Happ. rewrite zip_length; congruence. }
-  apply (below_on_box (box d)); auto.
-  { apply (growth_affine (1 + n + length (limits d))); auto. rewrite app_length, Lapp. lia. }
-  intros v Hv. apply In_nth_error in Hv as [iv Hiv]. apply In_nth_error in Hm as [im Him].
-  destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
-  { apply nth_error_Some. congruence. } { apply nth_error_Some. congruence. }
-  rewrite forallb_forall in Hps. specialize (Hps p Hp). unfold piece_ok in Hps.
-  rewrite Ev, Em, Hiv, Him in Hps.
-  destruct (all_expanded (sides w) (tau p)) as [taus|] eqn:Etau; [|discriminate].
-  apply andb_prop in Hps as [A B]. apply andb_prop in A as [A1 A2].
-  apply Z.leb_le in A1. apply r_pos in A2.
-  set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
-  assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
-  destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
-  assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (mu_at (multiplier w) p s z)).
-  { split; auto. unfold mu_at. fold r0. field. lra. }
-  pose proof (means_condition s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring) (margin w)
-    (limits d) m v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
-  pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hc) as Hpos.
-  unfold condition in Hpos. fold z in Hpos. fold us in Hpos.
-  pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
-  pose proof (rho_pos s Hs) as Hrho.
-  assert (Hdur : 0 < duration g) by (unfold duration; lra).
-  pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
-  pose proof (mu_bound_above (multiplier w) ps p s z Hp) as Hab.
-  pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hgap) Hab) as Hab'.
-  nra.
+  apply In_nth_error in Hm as [im Him].
+  assert (At : forall iv v, nth_error (corners w (box d)) iv = Some v -> exists p,
+    (pushed w = true -> kappa_ok d g p (1 + n + length (limits d)) = true) /\
+    growth g s x (applied (limits d) m us) (map val v)
+      + (if pushed w then cost (kappa p) (box d) g s z (1 + n + length (limits d)) else 0)
+      < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s)).
+  { intros iv v Hiv. destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
+    { apply nth_error_Some. congruence. } { apply nth_error_Some. congruence. }
+    exists p. rewrite forallb_forall in Hps. specialize (Hps p Hp). unfold piece_ok in Hps.
+    rewrite Ev, Em, Hiv, Him in Hps.
+    destruct (all_expanded (sides w) (tau p)) as [taus|] eqn:Etau; [|discriminate].
+    cbn zeta in Hps. rewrite f_nominal0 in Hps. set (skipped := (1 + n + length (limits d))%nat) in *.
+    apply andb_prop in Hps as [A B]. apply andb_prop in A as [A A3]. apply andb_prop in A as [A1 A2].
+    apply Z.leb_le in A1. apply r_pos in A2. split. { intros E. now rewrite E in A3. }
+    set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
+    assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
+    destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
+    assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (mu_at (multiplier w) p s z)).
+    { split; auto. unfold mu_at. fold r0. field. lra. }
+    pose proof (means_condition s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring) (margin w)
+      (limits d) m v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
+    assert (Hall : means r0 (env z)
+      (if pushed w
+       then fsub (fcondition (margin w) (limits d) m v g (depth p) (index p)
+              (fmu (multiplier w) (mu p)) taus)
+              (fpushed (kappa p) (box d) g (depth p) (index p) skipped)
+       else fcondition (margin w) (limits d) m v g (depth p) (index p)
+              (fmu (multiplier w) (mu p)) taus)
+      (condition (margin w) (limits d) m v g s x (mu_at (multiplier w) p s z) ts
+        - (if pushed w then cost (kappa p) (box d) g s z skipped else 0))).
+    { destruct (pushed w).
+      - apply means_sub; [exact Hc|]. apply means_fpushed; auto; try congruence.
+        { unfold r0. ring. }
+        unfold kappa_ok in A3. apply andb_prop in A3 as [_ A3]. apply andb_prop in A3 as [_ A3].
+        apply Forall_forall. intros k Hk. rewrite forallb_forall in A3. specialize (A3 k Hk).
+        apply num_ltb_lt in A3. now rewrite val_zero in A3.
+      - eapply means_equal; [exact Hc|ring]. }
+    pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hall) as Hpos.
+    unfold condition in Hpos. fold z in Hpos. fold us in Hpos.
+    pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
+    pose proof (rho_pos s Hs) as Hrho.
+    assert (Hdur : 0 < duration g) by (unfold duration; lra).
+    pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
+    pose proof (mu_bound_above (multiplier w) ps p s z Hp) as Hab.
+    pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hgap) Hab) as Hab'.
+    set (cst := if pushed w then _ else 0) in *. nra. }
+  unfold corners in At. destruct (pushed w).
+  - destruct (At O _ eq_refl) as [p [Hk Hg]]. specialize (Hk eq_refl). unfold kappa_ok in Hk.
+    apply andb_prop in Hk as [K1 K2]. apply andb_prop in K2 as [K2 K3]. apply Nat.eqb_eq in K2.
+    eapply Rle_lt_trans; [|exact Hg].
+    apply (below_pushed g s z (duration g)); auto.
+    + unfold duration. lra.
+    + apply Forall_forall. intros k Hk'. rewrite forallb_forall in K3. specialize (K3 k Hk').
+      apply num_ltb_lt in K3. now rewrite val_zero in K3.
+    + intros pre y c post. apply growth_push; try congruence.
+      * apply Forall_forall. intros e He. rewrite forallb_forall in K1. now apply K1.
+      * rewrite app_length, Lapp. lia.
+  - apply (below_on_box (box d)); auto.
+    { apply (growth_affine (1 + n + length (limits d))); auto. rewrite app_length, Lapp. lia. }
+    intros v Hv. apply In_nth_error in Hv as [iv Hiv]. destruct (At iv v Hiv) as [p [_ Hg]]. lra.
 Qed.
 End Segment.
 End Funnel.

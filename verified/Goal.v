@@ -69,19 +69,6 @@ Proof.
     - rewrite map_length, zip_length; congruence. }
   rewrite D. pose proof (IH P B q corner z HP HB Hq Hz) as E. rewrite E. ring.
 Qed.
-Lemma dot_plus b : forall y d, length y = length d ->
-  dot b (zip Rplus y d) = dot b y + dot b d.
-Proof.
-  induction b as [|b0 b IH]; intros [|y0 y] [|d0 d] H; try discriminate; cbn; try ring.
-  rewrite IH by (now injection H). ring.
-Qed.
-Lemma form_plus M : forall y d w, length y = length d ->
-  form M (zip Rplus y d) w = form M y w + form M d w.
-Proof.
-  induction M as [|[|a b] M IH]; intros [|y0 y] [|d0 d] [|w0 w] H; try discriminate; cbn; try ring.
-  rewrite IH, dot_plus by (now injection H). ring.
-Qed.
-
 Section Goal.
 Context {K : Ints}.
 

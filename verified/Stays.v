@@ -1,6 +1,6 @@
 (* The theorem: what is inside a checked funnel stays inside. *)
 From Coq Require Import ZArith Reals List Lra Lia.
-From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition Funnel.
+From Verified Require Import Integers Forms Polynomials Positive Claim Calculus Condition Definite Pushed Funnel.
 Import ListNotations.
 Open Scope R_scope.
 
@@ -47,7 +47,7 @@ Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
 Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
-Hypothesis Hcov : covered d ps = true.
+Hypothesis Hcov : covered d w ps = true.
 Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
 Let F := segment_facts d g n Hok.
 
@@ -159,13 +159,6 @@ Lemma form_scaled c M : forall y z, form (map (map (fun v => v * c)) M) y z = fo
 Proof.
   induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
   rewrite IH, !dot_scaled. ring.
-Qed.
-Lemma dot_scaled_r c a : forall b, dot a (map (fun v => v * c) b) = dot a b * c.
-Proof. induction a as [|y a IH]; intros [|z b]; cbn; try ring. rewrite IH. ring. Qed.
-Lemma form_scaled_r c M : forall y z, form M y (map (fun v => v * c) z) = form M y z * c.
-Proof.
-  induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
-  rewrite IH, !dot_scaled_r. ring.
 Qed.
 Lemma d_gap t : begins g < t < ends g -> forall w0,
   Forall2 (fun f v => derivable_pt_lim f t v) x
@@ -370,14 +363,14 @@ Definition first_size (d : problem) : nat :=
   match segments d with [] => O | g :: _ => length (nominal g) end.
 Lemma checked_segments d w : check d w = true ->
   Forall (fun g => segment_ok (first_size d) d g = true) (segments d) /\
-  forall g, In g (segments d) -> exists ps, covered d ps = true /\
+  forall g, In g (segments d) -> exists ps, covered d w ps = true /\
     forallb (piece_ok d w (products (basis w)) g) ps = true.
 Proof.
   intros H. unfold check in H. fold (first_size d) in H.
   apply andb_prop in H as [_ H]. apply andb_prop in H as [Hlen H].
   apply Nat.eqb_eq in Hlen.
   assert (Each : forall g, In g (segments d) -> exists ps, segment_ok (first_size d) d g = true /\
-    covered d ps = true /\ forallb (piece_ok d w (products (basis w)) g) ps = true).
+    covered d w ps = true /\ forallb (piece_ok d w (products (basis w)) g) ps = true).
   { intros g Hg. rewrite forallb_forall in H.
     assert (G : exists ps, In (g, ps) (combine (segments d) (pieces w))).
     { clear - Hg Hlen. revert Hg Hlen. generalize (pieces w).

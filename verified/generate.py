@@ -2,11 +2,12 @@
 """Turn a proof file of version 2 into data for the second kernel, without deciding anything.
 
     python generate.py FILE.proof.json --coq OUT.v     a theorem for Coq about the file's numbers
-    python generate.py FILE.proof.json --words OUT     the same numbers for the extracted checker
-    python generate.py FILE.proof.json --ask CHECKER   what that says: status 0, 1; 3 is not covered
+    python generate.py FILE.proof.json --ask CHECKER   what the extracted checker says of these
+                                                       numbers: status 0, 1; 3 is not covered
 
-Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them. What the second
-kernel does not cover is refused by name (NotCovered). Standard library only.
+Untrusted: a theorem of Coq is about the numbers that it shows, whoever wrote them, and printed.py
+prints those back into the files before anything is said. What the second kernel does not cover is
+refused by name (NotCovered). Standard library only.
 """
 
 import argparse
@@ -21,8 +22,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import printed
+
 WORD = 2**61  # rows of factors are machine words in Coq
 SHIFT, LEVEL = 400, 16  # of powers of two, of subdivision
+MONOMIALS = 20_000
+
+
+Files = dict[str, tuple[str, Any]]  # text and content, by role
 
 
 class NotCovered(Exception):  # noqa: N818 - says what the second kernel does not decide
@@ -34,7 +41,9 @@ class Funnel:
 
     def __init__(self, claim: Any, proof: Any, folder: Path) -> None:
         _only(claim, "kind about", "goal")
-        files, digests = _bound(claim["about"], folder, "vector_field policy funnel")
+        self.files: Files = {}
+        roles = "vector_field policy funnel"
+        files, digests = _bound(claim["about"], folder, roles, self.files)
         _kinds(files)
         if any(file["vector_field"] != digests["vector_field"] for file in files[1:]):
             raise NotCovered("a file names another vector field")
@@ -43,8 +52,6 @@ class Funnel:
         self.field, self.policy, self.funnel = files
         required = "margin basis multiplier pieces"
         _only(proof, required, "goal_multiplier sides kappa")
-        if "kappa" in proof:
-            raise NotCovered("kappa is not covered by the second kernel")
         self.claim, self.proof = claim, proof
         field, policy, funnel = files
         _only(field, "format version states inputs uncertain breaks valid expansion pieces")
@@ -52,13 +59,14 @@ class Funnel:
         _only(funnel, "format version kind vector_field policy t x P rho")
         if policy["t"] != funnel["t"] or policy["x"] != funnel["x"]:
             raise NotCovered("the funnel is around another nominal than the policy's")
-        self.spans = [sum(at <= start for at in field["breaks"]) for start in funnel["t"][:-1]]
-        t = funnel["t"]
-        if any(t[0] < at < t[-1] and at not in t for at in field["breaks"]):
-            raise NotCovered("the dynamics change at a time that is no knot")
-        rows = policy["limits"]
-        if [row[0] for row in rows] != sorted({row[0] for row in rows}):
+        inputs = [row[0] for row in policy["limits"]]
+        if inputs != sorted(inputs):
             raise NotCovered("limits that are not sorted by input")
+        self.intervals = len(funnel["t"]) - 1
+        kappa = proof.get("kappa", [[]] * self.intervals)
+        if "kappa" in proof and not field["uncertain"]:
+            raise NotCovered("kappa without uncertain inputs")
+        self.kappa = [row for row, _ in zip(kappa, funnel["t"][:-1], strict=True)]
 
 
 def _load(content: bytes, name: str) -> Any:
@@ -94,10 +102,13 @@ def _only(members: dict[str, Any], required: str, optional: str = "") -> None:
         raise NotCovered(f"not covered by the second kernel: {', '.join(sorted(unknown))}")
 
 
-def _bound(about: dict[str, Any], folder: Path, roles: str) -> tuple[list[Any], dict[str, str]]:
-    """The files of these roles, by digests of their bytes."""
+def _bound(
+    about: dict[str, Any], folder: Path, roles: str, texts: Files
+) -> tuple[list[Any], dict[str, str]]:
+    """The files of these roles, by digests of their bytes; their text and content go to `texts`."""
     _only(about, roles)
-    files, digests = [], {}
+    files: list[Any] = []
+    digests = {}
     for role in roles.split():
         name = about[role]["file"]
         if not name or any(sign in name for sign in "/\\:"):
@@ -107,6 +118,7 @@ def _bound(about: dict[str, Any], folder: Path, roles: str) -> tuple[list[Any], 
         if digests[role] != about[role]["digest"]:
             raise NotCovered(f"{name} is not the file that the proof is about")
         files.append(_load(content, name))
+        texts[role] = content.decode(), files[-1]
     return files, digests
 
 
@@ -114,11 +126,12 @@ class Increments:
     """The numbers of a model, and of tubes around it or of its stability, with the multipliers."""
 
     def __init__(self, claim: Any, proof: Any, folder: Path) -> None:
+        self.files: Files = {}
         self.tubes: list[Any] | None = None
         self.policy: Any = None
         if claim["kind"] == "stability":
             _only(claim, "kind about rate")
-            (self.model,), _ = _bound(claim["about"], folder, "model")
+            (self.model,), _ = _bound(claim["about"], folder, "model", self.files)
             _only(proof, "P", "multipliers")
             self.P, self.rate = proof["P"], claim["rate"]
             self.trees = [proof.get("multipliers")]
@@ -126,7 +139,7 @@ class Increments:
             _only(claim, "kind about")
             planned = "policy" in claim["about"]
             roles = "model policy funnel" if planned else "model funnel"
-            (self.model, *plan, funnel), digests = _bound(claim["about"], folder, roles)
+            (self.model, *plan, funnel), digests = _bound(claim["about"], folder, roles, self.files)
             if any(entry["model"] != digests["model"] for entry in (*plan, funnel)):
                 raise NotCovered("a file names another model")
             if planned:
@@ -157,6 +170,13 @@ def integer(value: Any, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
         raise NotCovered(f"{value!r} is not a whole number from {least} to {most}")
     return value
+
+
+def _whole(value: Any) -> int:
+    """An index that is stored as a number."""
+    if number(value).denominator != 1 or not 0 <= value <= 1000:
+        raise NotCovered(f"{value!r} is not an index")
+    return int(value)
 
 
 def bits(value: Any) -> int:
@@ -213,37 +233,6 @@ class Coq:
         return name
 
 
-class Words:
-    """Whole numbers in a row: a list begins with its length, an option with 0 or 1."""
-
-    def whole(self, value: int) -> str:
-        return str(value)
-
-    variable = count = whole
-
-    def row(self, entries: list[int]) -> str:
-        return self.listed(map(str, entries))
-
-    def pair(self, a: str, b: str) -> str:
-        return f"{a} {b}"
-
-    def listed(self, entries: Iterable[str]) -> str:
-        terms = list(entries)
-        return " ".join([str(len(terms)), *terms])
-
-    def maybe(self, term: str | None) -> str:
-        return "0" if term is None else f"1 {term}"
-
-    def made(self, _constructor: str, *terms: str) -> str:
-        return " ".join(terms)
-
-    def chosen(self, _constructor: str, place: int, *terms: str) -> str:
-        return " ".join([str(place), *terms])
-
-    def named(self, _name: str, term: str) -> str:
-        return term
-
-
 def shifted(n: int, p: int) -> list[list[Fraction]]:
     """The first n - p of n entries, as a matrix."""
     return [[Fraction(int(i == j)) for j in range(n)] for i in range(n - p)]
@@ -267,7 +256,7 @@ def listing(entries: Iterable[str]) -> str:
 class Writer:
     """A problem and its witness, by either way of writing."""
 
-    def __init__(self, to: Coq | Words) -> None:
+    def __init__(self, to: Coq) -> None:
         self.to = to
 
     def num(self, value: Any) -> str:
@@ -435,87 +424,90 @@ class Writer:
         """Exponents of a monomial."""
         return self.to.listed(self.to.count(integer(e, 0, most)) for e in values)
 
-    def segments(self, problem: Funnel) -> str:
-        """Every interval between knots."""
-        to, field, policy, funnel = self.to, problem.field, problem.policy, problem.funnel
-        n, m = field["states"], field["inputs"]
-        rows = zip(funnel["t"], funnel["P"], funnel["rho"], strict=True)
-        knots = [
-            to.named(
-                f"knot_{k}",
-                to.made("Knot", self.num(t), self.upper(P, f"P at knot {k}"), self.num(rho)),
-            )
-            for k, (t, P, rho) in enumerate(rows)
-        ]
-        fields, bounds, size = [], [], 1 + n + m + len(field["uncertain"])
-        for span, piece in enumerate(field["pieces"]):
-            terms = [
-                zip(equation["exponents"], equation["coefficients"], strict=True)
-                for equation in piece
-            ]
-            if any(len(row) != size for equation in piece for row in equation["exponents"]):
-                raise NotCovered(f"a monomial should have {size} exponents")
+    def field(self, field: dict[str, Any]) -> str:
+        """The vector field, as its file has it."""
+        to, size = self.to, 1 + field["states"] + field["inputs"] + len(field["uncertain"])
+        spans = []
+        for k, piece in enumerate(field["pieces"]):
+            equations = []
             for equation in piece:
-                if any(a >= b for a, b in pairwise(equation["exponents"])):
+                exponents = equation["exponents"]
+                if any(a >= b for a, b in pairwise(exponents)) or len(exponents) > MONOMIALS:
                     raise NotCovered("monomials should be distinct, in increasing order")
-            equations = to.listed(
-                to.listed(to.pair(self.counts(row), self.fraction(rational(c))) for row, c in rows)
-                for rows in terms
-            )
-            fields.append(to.named(f"field_{span}", equations))
-            valid = [row for row in field["valid"] if len(row) == 3 or row[3] == span]
-            kept = to.listed(
-                to.pair(to.count(int(row[0])), to.pair(self.num(row[1]), self.num(row[2])))
-                for row in valid
-            )
-            bounds.append(to.named(f"bounds_{span}", kept))
-        made = []
-        for k, span in enumerate(problem.spans):
-            x = to.listed(self.nums(point[i] for point in funnel["x"][k]) for i in range(n))
-            u = to.listed(self.nums(point[i] for point in policy["u"][k]) for i in range(m))
-            gains = to.listed(
-                to.listed(self.nums(point[i][j] for point in policy["K"][k]) for j in range(n))
-                for i in range(m)
-            )
-            ends = knots[k], knots[k + 1]
-            term = to.made("Segment", *ends, x, u, gains, fields[span], bounds[span])
-            made.append(to.named(f"segment_{k}", term))
-        return to.listed(made)
+                if any(len(row) != size or sum(row) > 7 for row in exponents):
+                    raise NotCovered(
+                        f"a monomial should have {size} exponents, of degree 7 at most"
+                    )
+                rows = zip(exponents, map(rational, equation["coefficients"]), strict=True)
+                terms = [to.pair(self.counts(row), self.fraction(c)) for row, c in rows]
+                equations.append(to.listed(terms))
+            spans.append(to.named(f"span_{k}", to.listed(equations)))
+        valid = []
+        for j, low, high, *span in field["valid"]:
+            only = to.maybe(to.count(_whole(span[0])) if span else None)
+            bound = to.pair(to.count(_whole(j)), self.ends([low, high]))
+            valid.append(to.pair(bound, only))
+        sizes = to.count(integer(field["states"], 1, 16)), to.count(integer(field["inputs"], 0, 16))
+        box = to.listed(map(self.ends, field["uncertain"]))
+        return to.made(
+            "Field", *sizes, box, self.nums(field["breaks"]), to.listed(valid), to.listed(spans)
+        )
 
-    def problem(self, problem: Funnel) -> str:
-        """What the theorem is about."""
-        to, field = self.to, problem.field
-        limits: list[str | None] = [None] * field["inputs"]
-        for i, low, high in problem.policy["limits"]:
-            limits[int(i)] = to.pair(self.num(low), self.num(high))
-        box = to.listed(to.pair(self.num(low), self.num(high)) for low, high in field["uncertain"])
+    def ends(self, row: list[Any]) -> str:
+        """A row [low, high]."""
+        low, high = row
+        return self.to.pair(self.num(low), self.num(high))
+
+    def curves(self, name: str, intervals: Iterable[Any], entry: Any) -> str:
+        """Control points, by interval."""
+        to = self.to
+        rows = (to.listed(map(entry, points)) for points in intervals)
+        return to.listed(to.named(f"{name}_{k}", row) for k, row in enumerate(rows))
+
+    def problem(self, problem: Funnel) -> None:
+        """What the theorem is about: field, policy, funnel, goal."""
+        to, policy, funnel = self.to, problem.policy, problem.funnel
+        to.named("field", self.field(problem.field))
+        limits = (
+            to.pair(to.count(_whole(i)), self.ends([low, high]))
+            for i, low, high in policy["limits"]
+        )
+        if len(policy["limits"]) > 3:
+            raise NotCovered("more than three limits")
+        feeds = self.curves("feed", policy["u"], self.nums)
+        gains = self.curves("gain", policy["K"], self.matrix)
+        to.named("policy", to.made("Policy", feeds, gains, to.listed(limits)))
+        nominals = self.curves("nominal", funnel["x"], self.nums)
+        shapes = to.listed(
+            to.named(f"shape_{k}", self.matrix(P)) for k, P in enumerate(funnel["P"])
+        )
+        sides = self.nums(funnel["t"]), nominals, shapes, self.nums(funnel["rho"])
+        to.named("funnel", to.made("Funnel", *sides))
         goal = None
         if "goal" in problem.claim:
             stated = problem.claim["goal"]
             _only(stated, "centre P")
-            matrix = self.upper(stated["P"], "the matrix of the goal")
-            goal = to.pair(self.nums(stated["centre"]), matrix)
-        clipped = to.listed(map(to.maybe, limits))
-        return to.made("Problem", self.segments(problem), clipped, box, to.maybe(goal))
+            goal = to.pair(self.nums(stated["centre"]), self.matrix(stated["P"]))
+        to.named("goal : option (list num * list (list num))", to.maybe(goal))
 
     def witness(self, problem: Funnel) -> str:
         """What is used to decide it."""
         to, proof = self.to, problem.proof
-        by_segment: list[list[str]] = [[] for _ in problem.spans]
+        by_segment: list[list[str]] = [[] for _ in range(problem.intervals)]
         order = sorted(
             proof["pieces"], key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"]))
         )
         for i, piece in enumerate(order):
-            by_segment[integer(piece["interval"], 0, len(by_segment) - 1)].append(
-                to.named(f"piece_{i}", self.piece(piece))
-            )
+            k = integer(piece["interval"], 0, len(by_segment) - 1)
+            by_segment[k].append(to.named(f"piece_{i}", self.piece(piece, problem.kappa[k])))
         names, n = ("basis", "multiplier", "sides"), problem.field["states"]
         bases = [self.monomials(proof.get(name, []), n) for name in names]
         pieces = to.listed(map(to.listed, by_segment))
+        pushed = "true" if "kappa" in proof else "false"
         least = self.num(proof.get("goal_multiplier", 0))
-        return to.made("Witness", self.num(proof["margin"]), *bases, pieces, least)
+        return to.made("Witness", self.num(proof["margin"]), *bases, pieces, pushed, least)
 
-    def piece(self, piece: dict[str, Any]) -> str:
+    def piece(self, piece: dict[str, Any], kappa: list[Any]) -> str:
         """One part of time, at a vertex and in a mode."""
         to = self.to
         _only(piece, "interval vertex level index mu columns squares", "mode tau")
@@ -540,19 +532,21 @@ class Writer:
         vertex = integer(piece["vertex"], 0, 1023)
         place = to.whole(level), to.whole(index), to.count(vertex), to.count(mode)
         return to.made(
-            "Piece", *place, to.made("big_mu", lines),
+            "Piece", *place, self.nums(kappa), to.made("big_mu", lines),
             self.shifts(piece["columns"]), self.squares(piece["squares"]), tau,
         )  # fmt: skip
 
 
 THEOREM = """\
-Theorem accepted : funnel_ok data proof = true.
+Definition data := stated field policy funnel goal.
+Theorem accepted : files_ok field policy funnel goal proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
-Theorem funnel : forall x, solution data x ->
+Theorem funnel_stays : forall x, solution data x ->
   forall ta, (begin data <= ta <= finish data)%R -> inside data x ta ->
-  (forall t, (ta <= t <= finish data)%R -> inside data x t) /\\ in_goal data x.
-Proof. exact (funnel_proved data proof accepted). Qed.
-Print Assumptions funnel.
+  (forall t, (ta <= t <= finish data)%R -> inside data x t /\\ in_bounds data x t) /\\
+  in_goal data x.
+Proof. exact (funnel_theorem field policy funnel goal proof accepted). Qed.
+Print Assumptions funnel_stays.
 """
 NEAR = """\
 Theorem accepted : tubes_ok data tubes proofs = true.
@@ -579,22 +573,27 @@ Print Assumptions stable.
 
 def read(path: Path) -> Funnel | Increments:
     """The numbers of a proof file of a kind that is covered."""
-    document = _load(path.read_bytes(), path.name)
+    content = path.read_bytes()
+    document = _load(content, path.name)
+    _only(document, "format version claim proof")
+    if document["format"] != "nlsid/proof":
+        raise NotCovered(f"{path.name} is not a proof")
     claim, proof = document["claim"], document["proof"]
-    if claim["kind"] == "continuous_funnel":
-        return Funnel(claim, proof, path.parent)
-    if claim["kind"] in ("tube", "stability"):
-        return Increments(claim, proof, path.parent)
-    raise NotCovered(f"claims of kind {claim['kind']} are not covered by the second kernel")
+    kinds = {"continuous_funnel": Funnel, "tube": Increments, "stability": Increments}
+    if claim["kind"] not in kinds:
+        raise NotCovered(f"claims of kind {claim['kind']} are not covered by the second kernel")
+    problem = kinds[claim["kind"]](claim, proof, path.parent)
+    problem.files["proof"] = content.decode(), document
+    return problem
 
 
 def coq(problem: Funnel | Increments) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
     if isinstance(problem, Funnel):
-        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Data")
+        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Data")
         writer = Writer(to)
-        data, proof = writer.problem(problem), writer.witness(problem)
-        to.lines += [f"Definition data : problem := {data}.", f"Definition proof := {proof}."]
+        writer.problem(problem)
+        to.named("proof", writer.witness(problem))
         return "\n".join(to.lines) + "\n" + THEOREM
     to = Coq("Integers Forms Claim Data Tubes Boxes Near Driven")
     writer = Writer(to)
@@ -621,27 +620,32 @@ def trees(writer: Writer, problem: Increments) -> list[str]:
     return [writer.tree(tree, 1 + len(tube["tau"])) for tube, tree in pairs]
 
 
-def words(problem: Funnel | Increments) -> str:
-    """The same as whole numbers, for the extracted checker."""
-    to = Words()
-    writer = Writer(to)
-    if isinstance(problem, Funnel):
-        return f"funnel {writer.problem(problem)}\n{writer.witness(problem)}\n"
-    model = writer.model(problem.model)
-    if problem.tubes is None:
-        stated = writer.symmetric(problem.P, "P"), writer.num(problem.rate)
-        return "\n".join(["stability", model, *stated, writer.tree(problem.trees[0], 1)])
-    tubes = to.listed(map(writer.tube, problem.tubes))
-    terms = [model, tubes, to.listed(trees(writer, problem))]
-    if problem.policy is None:
-        return "\n".join(["tube", *terms])
-    return "\n".join(["plan", *terms, *writer.plan(problem)])
+ASKED = {
+    "funnel": "field policy funnel goal proof",
+    "plan": "data tubes proofs a b b0 feedback",
+    "tube": "data tubes proofs",
+    "stability": "data storage rate proof",
+}
 
 
-def asked(checker: Path, problem: Funnel | Increments) -> int:
+def words(terms: dict[str, Any]) -> str:
+    """The terms of a theorem for the extracted checker, which a word tells what they are about."""
+    kind = next(kind for kind, names in ASKED.items() if set(names.split()) <= set(terms))
+    return " ".join([kind, *(printed.words(terms[name]) for name in ASKED[kind].split())]) + "\n"
+
+
+def compared(problem: Funnel | Increments, text: str) -> dict[str, Any]:
+    """The terms of the theorem, which print as the files that it was made of."""
+    terms = printed.read(text)
+    write = printed.funnel if isinstance(problem, Funnel) else printed.near
+    printed.differences(write(terms, problem.files), problem.files)
+    return terms
+
+
+def asked(checker: Path, terms: dict[str, Any]) -> int:
     """The extracted checker's status: 0 accepted, 1 refused."""
     with tempfile.NamedTemporaryFile("w", suffix=".words") as file:
-        file.write(words(problem))
+        file.write(words(terms))
         file.flush()
         return subprocess.run([checker, file.name], check=False).returncode
 
@@ -650,15 +654,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--coq", type=Path)
-    parser.add_argument("--words", type=Path)
     parser.add_argument("--ask", type=Path, metavar="CHECKER")
     given = parser.parse_args()
     try:
         problem = read(given.file)
-        for path, write in ((given.coq, coq), (given.words, words)):
-            if path is not None:
-                path.write_text(write(problem))
-        return asked(given.ask, problem) if given.ask is not None else 0
+        text = coq(problem)
+        terms = compared(problem, text)
+        if given.coq is not None:
+            given.coq.write_text(text)
+        return asked(given.ask, terms) if given.ask is not None else 0
+    except printed.Differs as error:
+        print(f"not covered: not written as the theorem prints it: {error}", file=sys.stderr)
+        return 3
     except (NotCovered, KeyError, ValueError, TypeError, IndexError) as error:
         said = error if isinstance(error, NotCovered) else f"{type(error).__name__} {error}"
         print(f"not covered: {said}", file=sys.stderr)

@@ -1,4 +1,4 @@
-(* second WORDS: "accepted" (status 0) or "refused" (status 1). Reads what generate.py --words writes:
+(* second WORDS: "accepted" (status 0) or "refused" (status 1). Reads what generate.py writes (printed.words):
    whole numbers in a row; a list begins with its length, an option with 0 or 1. *)
 open Checker
 
@@ -17,20 +17,19 @@ let num () =
   if Big_int_Z.sign_big_int q <= 0 then failwith "a denominator"; (p, q)
 let nums () = listed num
 let matrix () = listed nums
-let knot () = let time = num () in let shape = matrix () in { time; shape; level = num () }
 let equation () = listed (pair (fun () -> listed count) num)
-let segment () =
-  let start = knot () in let stop = knot () in
-  let nominal = matrix () in let feed = matrix () in
-  let gains = listed matrix in let equations = listed equation in
-  { start; stop; nominal; feed; gains; equations;
-    bounds = listed (pair count (pair num num)) }
 let maybe read () = if count () = 0 then None else Some (read ())
-let problem () =
-  let segments = listed segment in
-  let limits = listed (maybe (pair num num)) in
-  let box = listed (pair num num) in
-  { segments; limits; box; goal = maybe (pair nums matrix) () }
+let ends () = pair num num ()
+let field () =
+  let states = count () in let inputs = count () in let uncertain = listed ends in
+  let breaks = nums () in let valid = listed (pair (pair count ends) (maybe count)) in
+  { states; inputs; uncertain; breaks; valid; spans = listed (fun () -> listed equation) }
+let policy () =
+  let feeds = listed matrix in let feedback = listed (fun () -> listed matrix) in
+  { feeds; feedback; clips = listed (pair count ends) }
+let funnel () =
+  let knots = nums () in let nominals = listed matrix in let shapes = listed matrix in
+  { knots; nominals; shapes; levels = nums () }
 let squares () =
   let unit0 = whole () in let scale = entry () in
   { unit0; scale; factors = listed (fun () -> listed (pair entry (fun () -> listed entry))) }
@@ -38,14 +37,15 @@ let wholes () = listed whole
 let piece () =
   let depth = whole () in let index = whole () in
   let vertex = count () in let mode = count () in
-  let mu = listed (pair whole (pair entry entry)) in
+  let kappa = nums () in let mu = listed (pair whole (pair entry entry)) in
   let columns = wholes () in let gram_factors = squares () in
-  { depth; index; vertex; mode; mu; columns; gram_factors; tau = listed (pair wholes squares) }
+  { depth; index; vertex; mode; kappa; mu; columns; gram_factors; tau = listed (pair wholes squares) }
 let witness () =
   let margin = num () in
   let basis = listed wholes in let multiplier = listed wholes in let sides = listed wholes in
   let pieces = listed (fun () -> listed piece) in
-  { margin; basis; multiplier; sides; pieces; goal_multiplier = num () }
+  let pushed = count () = 1 in
+  { margin; basis; multiplier; sides; pieces; pushed; goal_multiplier = num () }
 
 let model () = match count () with
   | 0 -> Linear (nums ())
@@ -68,11 +68,13 @@ let rec tree () = match count () with
 
 let () =
   let accepted = match word () with
-    | "funnel" -> let d = problem () in decide_funnel d (witness ())
+    | "funnel" ->
+      let f = field () in let p = policy () in let u = funnel () in
+      let g = maybe (pair nums matrix) () in decide_funnel f p u g (witness ())
     | "tube" -> let m = model () in let ts = listed tube in decide_tubes m ts (listed tree)
     | "plan" ->
       let m = model () in let ts = listed tube in let proofs = listed tree in
-      let a = nums () in let b = nums () in let b0 = num () in let _c = num () in
+      let a = nums () in let b = nums () in let b0 = num () in
       let feedback = nums () in
       decide_tubes m ts proofs && decide_plans a b b0 feedback ts
     | "stability" ->

@@ -109,8 +109,9 @@ class IdentificationConfig:
         for key in options:
             if key not in own:
                 raise DataError(
-                    f"select.{key}: a {self.given.get('model', 'linear')} model has no such "
-                    f"option; there are: {', '.join(own)}"
+                    f"select.{key}: no option of `model: {self.given.get('model', 'linear')}`, "
+                    f"whose options this section tries; remove select.{key}, or try: "
+                    f"{', '.join(own)}"
                 )
         made = []
         for values in product(*options.values()):

@@ -350,9 +350,18 @@ class _Form:
         form = _read(model, bounds)
         proof = prove_stability(model) if bounds is None else storage_on(form)
         if proof is None:
+            where = bounds and "; ".join(
+                f"{letter} in {', '.join(f'[{low:.3g}, {high:.3g}]' for low, high in rows)}"
+                for letter, rows in bounds.items()
+            )
             raise Infeasible(
-                "no proof that the model forgets its start, so no tube of it lasts"
-                + ("; give a smaller box" if bounds is not None else "")
+                "no one storage proves that the model forgets its start, so no tube of it lasts"
+                + (
+                    f": tried for {where}, the `box` of the tube or else a tenth more than the "
+                    "training trials reach; take a smaller one, another `set`, or fewer lags"
+                    if where
+                    else ""
+                )
             )
         F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
         m = form.unknowns

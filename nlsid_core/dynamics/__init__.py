@@ -1,5 +1,6 @@
 """Continuous time: polynomial dynamics, motions, and functions of time in pieces."""
 
+from nlsid_core.dynamics.identified import identified_field
 from nlsid_core.dynamics.nominal import Nominal
 from nlsid_core.dynamics.piecewise import (
     PiecewisePolynomial,
@@ -19,6 +20,7 @@ __all__ = [
     "VectorField",
     "constant_on",
     "cubic_through",
+    "identified_field",
     "linear_through",
     "solve",
     "taylor_field",

@@ -42,7 +42,9 @@ class ImplicitClass:
     5. coupled: whether w is multiplied with x to total degree right_degree instead of added. box:
     (low, high) of every output, then every input, in their units, for stability on it (None:
     everywhere).
-    storage_degree: of the storage's metric in "2.10", 0 to 4.
+    storage_degree: of the storage's metric in "2.10", 0 to 4. continuous: of measured states, only
+    models that E dx/dt = g(x) + r(u) makes by the trapezoidal rule, e = Ex - hg/2 and f = Ex + hg/2
+    + hr: `dynamics.identified_field` is then the equation itself.
     Raises OptionError, or DataError for a combination that no model can satisfy.
     """
 
@@ -55,6 +57,7 @@ class ImplicitClass:
     coupled: bool = False
     box: Box | None = None
     storage_degree: int = 0
+    continuous: bool = False
     kind: ClassVar[type[ImplicitModel]] = ImplicitModel
 
     def __post_init__(self) -> None:
@@ -72,6 +75,13 @@ class ImplicitClass:
             raise DataError(f"storage_degree is for set 2.10, not {self.set}")
         if self.set == "2.19" and (self.left_degree, self.right_degree, self.box) != (1, 1, None):
             raise DataError("set 2.19 is linear: left_degree 1, right_degree 1, no box")
+        if self.continuous and (self.lags, self.delays, self.coupled) != (1, (1,), False):
+            raise DataError("continuous models have measured states: lags 1, delays [1], uncoupled")
+        if self.continuous and self.left_degree != self.right_degree:
+            raise DataError(
+                f"continuous models have left_degree and right_degree the same, not "
+                f"{self.left_degree} and {self.right_degree}"
+            )
         if self.box is None:
             self._refuse_growth()
 

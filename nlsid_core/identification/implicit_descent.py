@@ -21,6 +21,7 @@ from nlsid_core.identification.implicit_search import (
     indeterminates_of,
     kept_in_set,
     left_coefficients,
+    right_coefficients,
     set_constraints,
     unknowns,
 )
@@ -105,10 +106,10 @@ class ImplicitSet:
         n_v, n_e = len(rows.y_scale[0]), len(rows.left)
         e, f = unknowns(rows)
         S = np.array([[constant(MONOTONE * (i == j)) for j in range(n_v)] for i in range(n_v)])
-        columns = []
-        for i in range(n_v):
-            right = variables([f"f{i}[{k}]" for k in range(len(rows.right))])
-            columns.append([*left_coefficients(rows, i, n_v), *right])
+        columns = [
+            [*left_coefficients(rows, i, n_v), *right_coefficients(rows, i, n_v)]
+            for i in range(n_v)
+        ]
         names = np.array(columns, dtype=object).T.ravel()
         bound_terms = np.concatenate([np.ones(n_e, bool), rows.right[:, : rows.states].any(axis=1)])
         kept = np.repeat(bound_terms, n_v)

@@ -141,7 +141,7 @@ def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
             e[i] = template(f"e{i}", rows.left, names.v)
         else:
             e[i] = sum(entry * v for entry, v in zip(symmetric[i], variables(names.v), strict=True))
-        f[i] = template(f"f{i}", rows.right, known)
+        f[i] = template(f"f{i}", rows.right, known).substitute(_tied(rows, i, len(e)))
     return e, f
 
 
@@ -222,7 +222,7 @@ def _residual(rows: ImplicitRows) -> Objects:
     """(p, n_v): R times the coefficients of [e; -f], affine in the decisions."""
     columns, n_v = [], len(rows.y_scale[0])
     for i in range(n_v):
-        right = [-c for c in variables([f"f{i}[{k}]" for k in range(len(rows.right))])]
+        right = [-c for c in right_coefficients(rows, i, n_v)]
         columns.append([*left_coefficients(rows, i, n_v), *right])
     return np.asarray(rows.R @ np.array(columns, dtype=object).T)
 
@@ -233,6 +233,22 @@ def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
         return list(variables([f"e{i}[{k}]" for k in range(len(rows.left))]))
     E = symmetric_template("E", n_v)
     return [E[i, int(np.argmax(unit))] for unit in rows.left]
+
+
+def right_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
+    """The decisions in f of equation i, in the order of the rows' monomials."""
+    tied, names = _tied(rows, i, n_v), [f"f{i}[{k}]" for k in range(len(rows.right))]
+    return [tied.get(name, own) for name, own in zip(names, variables(names), strict=True)]
+
+
+def _tied(rows: ImplicitRows, i: int, n_v: int) -> dict[str, Polynomial]:
+    """What replaces decisions in f: e + f of a continuous class is affine in the states."""
+    if not rows.model_class.continuous:
+        return {}
+    left = left_coefficients(rows, i, n_v)
+    of_e = {tuple(row): -c for row, c in zip(rows.left.tolist(), left, strict=True)}
+    powers = [tuple(row[: rows.states]) for row in rows.right.tolist()]
+    return {f"f{i}[{k}]": of_e[row] for k, row in enumerate(powers) if sum(row) > 1}
 
 
 def _interior(constraints: list[Constraint], names: Names) -> tuple[Solution, float]:
@@ -255,7 +271,7 @@ def coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, Float
     """e (m_e, n_v) and f (m_f, n_v)."""
     n_v = len(rows.y_scale[0])
     e = [[float(found.value(p)) for p in left_coefficients(rows, i, n_v)] for i in range(n_v)]
-    f = [[found.values[f"f{i}[{k}]"] for k in range(len(rows.right))] for i in range(n_v)]
+    f = [[float(found.value(p)) for p in right_coefficients(rows, i, n_v)] for i in range(n_v)]
     return np.array(e).T, np.array(f).T
 
 

@@ -219,7 +219,10 @@ def test_select_tries_every_combination_and_shows_what_has_no_model(
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"orders": [1]}, "select.orders: a linear model has no such option; there are: lags"),
+        (
+            {"orders": [1]},
+            "select.orders: no option of `model: linear`, .*remove select.orders, or try: la",
+        ),
         ({"method": ["rse"]}, "select.method"),
         ({"lags": [2, 0]}, r"select.lags: should be a whole number from 1 to 100 \(found 0\)"),
         ({}, "nothing to select from"),

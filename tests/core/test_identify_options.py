@@ -65,7 +65,10 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (CertifiedRse, "iterations"): ((1, 1000), (0, 1001)),
     (CertifiedSem, "iterations"): ((1, 1000), (0, 1001)),
 }
-FREE = {(MomentRie, "accept_untested_repeats"), (ImplicitClass, "coupled")}  # true or false
+FREE = {
+    (MomentRie, "accept_untested_repeats"), (ImplicitClass, "coupled"),
+    (ImplicitClass, "continuous"),
+}  # true or false  # fmt: skip
 
 
 @pytest.mark.parametrize(("kind", "key"), LIMITS, ids=lambda part: getattr(part, "__name__", part))

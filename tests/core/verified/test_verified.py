@@ -1,10 +1,13 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
 import hashlib
+import importlib
 import json
+import random
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +30,7 @@ Json = dict[str, Any]
 ROOT = Path(__file__).resolve().parents[3]
 VERIFIED = ROOT / "verified"
 CORPUS = ROOT / "tests" / "core" / "kernel" / "corpus"
-CLIPPED = CORPUS / "continuous_funnel" / "clipped"
+FUNNELS = CORPUS / "continuous_funnel"
 GAPS = re.compile(r"\b(Admitted|admit|Axiom|Parameter|Conjecture|Unset Guard Checking)\b")
 
 needs_coq = pytest.mark.skipif(
@@ -60,10 +63,12 @@ def accepted(proof: Path, build: Path) -> subprocess.CompletedProcess[str]:
 
 @needs_coq
 @pytest.mark.coq
-def test_coq_proves_the_theorem_of_a_clipped_funnel(build: Path) -> None:
-    done = accepted(CLIPPED / "claim.proof.json", build)
+@pytest.mark.parametrize("name", ["clipped", "pushed"])
+def test_coq_proves_the_theorem_of_a_funnel(name: str, build: Path) -> None:
+    done = accepted(FUNNELS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
     assert "accepted: " in done.stdout
+    assert "in_bounds data x t" in (build / "theorem.v").read_text()
 
 
 def rho_raised(files: Files) -> None:
@@ -100,18 +105,54 @@ def goal_smaller(files: Files) -> None:
     goal["P"] = [[1.5 * entry for entry in row] for row in goal["P"]]
 
 
+def bounds_too_narrow(files: Files) -> None:
+    """The equations are said to be valid for |x0| <= 0.01 only."""
+    files[FIELD]["valid"] = [[0.0, -0.01, 0.01]]
+
+
+def input_bounds_too_narrow(files: Files) -> None:
+    """The equations are said to be valid for |u0| <= 0.01 only."""
+    n = files[FIELD]["states"]
+    files[FIELD]["valid"].append([float(n), -0.01, 0.01])
+
+
+def kappa_smaller(files: Files) -> None:
+    """A twentieth: 1 / kappa is what w adds in the middle."""
+    kappa = files[PROOF]["proof"]["kappa"]
+    kappa[:] = [[entry / 20 for entry in row] for row in kappa]
+
+
+def pushed_more(files: Files) -> None:
+    """Twenty times."""
+    box = files[FIELD]["uncertain"]
+    box[:] = [[20 * end for end in row] for row in box]
+
+
+def pushed_by_the_state(files: Files) -> None:
+    """x0 w0 in the place of w0: the centre and kappa do not cover it."""
+    exponents = files[FIELD]["pieces"][0][1]["exponents"]
+    row = next(row for row in exponents if row[4] == 1)
+    row[1] = 1
+    exponents.sort()
+
+
 @needs_coq
 @pytest.mark.coq
 @pytest.mark.parametrize(
-    "forge",
-    [rho_raised, gain_lower, multiplier_sign, piece_missing, limit_wider, goal_smaller],
-)
+    ("name", "forge"),
+    [("clipped", forge) for forge in
+     (rho_raised, gain_lower, multiplier_sign, piece_missing, limit_wider, goal_smaller,
+      bounds_too_narrow, input_bounds_too_narrow)]
+    + [("pushed", forge) for forge in
+       (bounds_too_narrow, input_bounds_too_narrow, kappa_smaller, pushed_more,
+        pushed_by_the_state)],
+)  # fmt: skip
 def test_both_kernels_refuse_a_forgery(
-    forge: Callable[[Files], None], build: Path, tmp_path: Path
+    name: str, forge: Callable[[Files], None], build: Path, tmp_path: Path
 ) -> None:
     names = {"claim.proof.json": PROOF, "vector_field.json": FIELD}
     names |= {"policy.json": POLICY, "funnel.json": FUNNEL}
-    files = {new: json.loads((CLIPPED / old).read_text()) for old, new in names.items()}
+    files = {new: json.loads((FUNNELS / name / old).read_text()) for old, new in names.items()}
     forge(files)
     bind(files)
     write(files, tmp_path)
@@ -122,14 +163,60 @@ def test_both_kernels_refuse_a_forgery(
     assert "theorem.v" in done.stderr, "refused by Coq, not before"
 
 
+MODELS = (
+    "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
+    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
+    "stability/moving_lags", "stability/split", "stability/two_outputs",
+)  # fmt: skip
+
+
+def generator() -> Any:
+    """verified/generate.py, which is a program and no part of the package."""
+    sys.path.insert(0, str(VERIFIED))
+    try:
+        return importlib.import_module("generate")
+    finally:
+        sys.path.remove(str(VERIFIED))
+
+
+@pytest.mark.parametrize("name", [*MODELS, "continuous_funnel/clipped", "continuous_funnel/pushed"])
+def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
+    """And each of them counts: another one prints as another file."""
+    generate = generator()
+    problem = generate.read(CORPUS / name / "claim.proof.json")
+    text = generate.coq(problem)
+    generate.compared(problem, text)
+    rng = random.Random(name)
+    lines = text.splitlines()
+    places = [i for i, line in enumerate(lines) if re.match(r"Definition .*[^0-9a-z_]\d", line)]
+    assert len(places) > 1
+    for i in rng.sample(places, min(len(places), 25)):
+        head, assigned, term = lines[i].partition(" := ")
+        digits = rng.choice(list(re.finditer(r"(?<![\w.])\d+", term)))
+        more = str(int(digits[0]) + 2)
+        changed = head + assigned + term[: digits.start()] + more + term[digits.end() :]
+        with pytest.raises((generate.printed.Differs, IndexError, ValueError)):
+            generate.compared(problem, "\n".join([*lines[:i], changed, *lines[i + 1 :]]))
+
+
+def test_a_file_that_is_not_in_canonical_form_is_refused(tmp_path: Path) -> None:
+    generate = generator()
+    names = {"claim.proof.json": PROOF, "vector_field.json": FIELD}
+    names |= {"policy.json": POLICY, "funnel.json": FUNNEL}
+    files = {new: json.loads((FUNNELS / "pushed" / old).read_text()) for old, new in names.items()}
+    coefficients = files[FIELD]["pieces"][0][1]["coefficients"]
+    assert coefficients[-1] == "1/6"
+    coefficients[-1] = "2/12"
+    bind(files)
+    write(files, tmp_path)
+    problem = generate.read(tmp_path / PROOF)
+    with pytest.raises(generate.printed.Differs, match="2/12"):
+        generate.compared(problem, generate.coq(problem))
+
+
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize(
-    "name",
-    ["tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
-     "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
-     "stability/moving_lags", "stability/split", "stability/two_outputs"],
-)  # fmt: skip
+@pytest.mark.parametrize("name", MODELS)
 def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
     done = accepted(CORPUS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
