@@ -192,9 +192,9 @@ def measure(trials: int) -> dict[str, dict[str, float | bool]]:
         f"n{n}_T{T}": {
             **{m: statistics.mean(errors[n, T, m]) for m in METHODS if (n, T, m) in errors},
             **{
-                f"{m}_spread": statistics.stdev(errors[n, T, m]) if trials > 1 else 0.0
+                f"{m}_spread": statistics.stdev(errors[n, T, m])
                 for m in METHODS
-                if (n, T, m) in errors
+                if (n, T, m) in errors and trials > 1
             },
             "seconds": statistics.median(seconds[n, T]),
             "proved": all(proved[n, T]),
@@ -221,10 +221,12 @@ def main() -> None:
     print(f"{'':14s}{columns}{'thesis':>8s}{'seconds':>16s}  proved")
     for name, entry in keys.items():
         n, T = (int(part[1:]) for part in name.split("_"))
-        golden = GOLDEN.get((n, T), (None,) * 5)
+        golden = dict(zip(METHODS, GOLDEN.get((n, T), ()), strict=False))
         cells = "".join(
-            f"{entry[m]:9.2f}{'' if g is None else f'({g:.2f})':>9s}" if m in entry else " " * 18
-            for m, g in zip(METHODS, golden, strict=True)
+            f"{entry[m]:9.2f}{f'({g:.2f})' if (g := golden.get(m)) is not None else '':>9s}"
+            if m in entry
+            else " " * 18
+            for m in METHODS
         )
         thesis = PUBLISHED.get((n, T))
         published = f" ({PUBLISHED_SECONDS[n]})" if n in PUBLISHED_SECONDS and T == TEST else ""

@@ -25,10 +25,12 @@ from nlsid_core.errors import DataError, DocumentError
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 PRINT = """
-nav a { margin-right: 1rem } figure { margin: 1rem 0 } figure img { max-width: 100% }
+nav a { margin-right: 1rem; display: inline-block }
+figure { margin: 1rem 0 } figure img { max-width: 100% }
 section { overflow-x: auto } h2 { font-size: 1.3rem } h3 { font-size: 1.05rem }
 td code { white-space: nowrap } .digests td code { white-space: normal }
-@media (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem } }
+@media screen and (max-width: 40rem) { body { font-size: 14px } th, td { padding: .25rem .4rem }
+  svg, figure img { max-width: 200% } }
 @page { size: A4; margin: 15mm }
 @media print { nav { display: none } h2, h3 { break-after: avoid }
   figure, tr, svg { break-inside: avoid } section { overflow: visible }

@@ -3,7 +3,8 @@
 A RemotePath is a Path for whoever names, lists and opens bags. What is opened delivers the bytes
 that are asked for and no others: ranges that lie close together are one request, several requests
 run beside each other, and a request that fails is repeated for a stated time. fsspec knows the
-protocols; credentials are those it finds in the environment, and are never part of a name.
+protocols; credentials are those it finds in the environment, and are never part of a name. Where
+they are an AWS_ACCESS_KEY_ID, ranges of S3 are fetched by obstore, for a quarter of the time.
 """
 
 import hashlib
@@ -15,6 +16,7 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any, Final, TypeVar
 
@@ -171,7 +173,13 @@ class RemotePath(PosixPath):
 
         def ask(fs: Any, name: str, limit: dict[str, float]) -> list[bytes]:
             self.requests += len(starts)
-            parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
+            store = (
+                _obstore(name.partition("/")[0], self.patience) if self.parts[0] == "s3:" else None
+            )
+            if store is not None:
+                parts = store(name.partition("/")[2], starts, ends)
+            else:
+                parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
             return [
                 _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
             ]
@@ -355,6 +363,47 @@ def _storage(url: str) -> tuple[Any, str]:
     return found
 
 
+_Ranges = Callable[[str, list[int], list[int]], list[Any]]
+
+
+def _obstore(bucket: str, patience: float) -> _Ranges | None:
+    """Ranges of an object (key, starts, ends) of an S3 bucket, by obstore.
+
+    None where obstore is not installed, or where credentials are not in the environment's variables
+    but in profiles, which it does not read.
+    """
+    if "AWS_ACCESS_KEY_ID" not in os.environ:
+        return None
+    return _by_obstore(bucket, os.environ.get("AWS_ENDPOINT_URL", ""), patience)
+
+
+@cache
+def _by_obstore(bucket: str, endpoint: str, patience: float) -> _Ranges | None:
+    try:
+        from obstore import get_ranges
+        from obstore.exceptions import (
+            NotFoundError,
+            PermissionDeniedError,
+            UnauthenticatedError,
+        )
+        from obstore.store import S3Store
+    except ImportError:
+        return None
+    options: Any = {"allow_http": endpoint.startswith("http://"), "timeout": f"{patience:g}s"}
+    no_retries: Any = {"max_retries": 0}  # RemotePath repeats, and counts what it loses
+    store = S3Store(bucket, client_options=options, retry_config=no_retries)
+
+    def ranges(key: str, starts: list[int], ends: list[int]) -> list[Any]:
+        try:
+            return list(get_ranges(store, key, starts=starts, ends=ends, coalesce=0))
+        except (NotFoundError, FileNotFoundError) as error:
+            raise FileNotFoundError(f"s3://{bucket}/{key} is not there") from error
+        except (PermissionDeniedError, UnauthenticatedError) as error:
+            raise PermissionError(f"s3://{bucket}/{key}: {_short(error)}") from error
+
+    return ranges
+
+
 def _entry(described: dict[str, Any]) -> Entry:
     size, folder = described.get("size"), described.get("type") == "directory"
     if size is None and not folder:
@@ -377,4 +426,4 @@ def _whole(part: Any, start: int, end: int, size: int) -> bytes:
 
 
 def _short(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error)[:200]}"
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}"

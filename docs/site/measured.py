@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from benchmarks.__main__ import BENCHMARKS
+
 LONGEST = 48  # characters of one value
 DEPTH = 3  # of keys in keys
 FIGURE = re.compile(r"\{\{(\w+) ([\w.]+) ([\w.]+)\}\}")
@@ -21,10 +23,10 @@ def page(results: Path, benchmarks: Path) -> str:
     lines = [
         "# Benchmarks",
         "",
-        "Every figure is measured beside its peer in one run, one thread, and is written by",
-        "`make benchmarks` with its date, machine and commit; what was published elsewhere is in",
-        "each description. Times of one run vary by some tens of percent. Words are in the",
-        "[glossary](glossary.md).",
+        "These figures are written by `make benchmarks`, each with its date, machine and commit. A",
+        "program that is compared with (*peers*) ran in the same run, each on one thread. Figures",
+        "that were published elsewhere are in the descriptions. Seconds are wall-clock time, on a",
+        "machine that other programs used too. Words are in the [glossary](glossary.md).",
         "",
     ]
     if not files:
@@ -35,6 +37,9 @@ def page(results: Path, benchmarks: Path) -> str:
             f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | "
             f"{found['seconds']:g} s | {found['commit'][:8]} | {_peers(found['result'])} |"
         )
+    if without := sorted(BENCHMARKS.keys() - dict(files).keys()):
+        lines += ["", f"Not measured on this checkout: {', '.join(without)}. To measure one:", ""]
+        lines += ["    python -m benchmarks NAME"]
     for name, found in files:
         module = str(found["command"][2]).removeprefix("benchmarks.")
         title, rest = _docstring(benchmarks / f"{module}.py")

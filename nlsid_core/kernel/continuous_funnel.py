@@ -359,8 +359,9 @@ def _assumptions(field: Field, policy: Policy, bounds: list[Bounds], hold: Hold)
     if hold.period:
         longest = text.exact(hold.period)
         obeyed += (
-            f"every {longest} s or more often: at every time, the input is the policy's for a state"
-            f" of at most {longest} s before, and not before the solution's start"
+            f"every {longest} s or more often: at every time, the input is the policy's of some "
+            f"time at most {longest} s before, and not before the solution's start, for the state "
+            "then"
         )
     else:
         obeyed += "continuously, with no hold and no delay"

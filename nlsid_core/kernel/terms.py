@@ -39,13 +39,11 @@ def derivative(p: Terms, j: int) -> Terms:
 
 
 def along(
-    ps: Sequence[Terms], at: Sequence[Polynomial], direction: Sequence[Polynomial], ring: Ring,
-    first: int = 0,
-) -> list[Polynomial]:  # fmt: skip
-    """Σ_j ∂p/∂(variable first + j) direction[j] of each p, with `at` in the variables' place."""
+    ps: Sequence[Terms], at: Sequence[Polynomial], direction: Sequence[Polynomial], ring: Ring
+) -> list[Polynomial]:
+    """Σ_j ∂p/∂(variable j) direction[j] of each p, with `at` in the variables' place."""
     size = len(direction)
-    slopes = [derivative(p, first + j) for p in ps for j in range(size)]
-    found = ring.substituted(slopes, at)
+    found = ring.substituted([derivative(p, j) for p in ps for j in range(size)], at)
     return [ring.dot(found[i : i + size], direction) for i in range(0, size * len(ps), size)]
 
 

@@ -90,23 +90,29 @@ def web_server(folder: Path, fault: Fault | None = None) -> Iterator[str]:
             if not file.is_file():
                 self._send(404, b"")
                 return
-            content, start = file.read_bytes(), 0
+            content, span = file.read_bytes(), ""
             size, wanted = len(content), self.headers.get("Range")
             code = 200
             if wanted:
                 first, _, last = wanted.removeprefix("bytes=").partition("-")
                 start, end = int(first), int(last) + 1
                 content, code = content[start:end], 206
+                span = f"bytes {start}-{end - 1}/{size}"
             if status == 200:
                 content = content[: len(content) // 2]
             tag = f'"{size}-{file.stat().st_mtime_ns}"'
-            self._send(code, content, body=body, tag=tag)
+            self._send(code, content, body=body, tag=tag, span=span)
 
-        def _send(self, code: int, content: bytes, *, body: bool = True, tag: str = "") -> None:
+        def _send(
+            self, code: int, content: bytes, *, body: bool = True, tag: str = "", span: str = ""
+        ) -> None:
             self.send_response(code)
             self.send_header("Content-Length", str(len(content)))
+            if span:
+                self.send_header("Content-Range", span)
             if tag:
                 self.send_header("ETag", tag)
+                self.send_header("Last-Modified", "Mon, 01 Jan 2024 00:00:00 GMT")
             self.end_headers()
             if body:
                 self.wfile.write(content)

@@ -153,6 +153,55 @@ def test_a_server_that_stays_busy_is_given_up_after_the_patience(tmp_path: Path)
         read_signals(remote(f"{url}/d.mcap", patience=1.0), [SPEED])
 
 
+def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
+    bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("obstore")
+    url = bucket.put(drive(tmp_path / "d.mcap", samples=60, image_bytes=40_000), "d.mcap")
+    by_obstore, by_fsspec = remote(url), RemotePath(place(url))
+    found = read_signals(by_obstore, WANTED)
+    monkeypatch.setattr("bags.recordings.remote._obstore", lambda *_: None)
+    wanted = read_signals(by_fsspec, WANTED)
+    for text in WANTED:
+        np.testing.assert_array_equal(found[text].values, wanted[text].values)
+    assert (by_obstore.requests, by_obstore.fetched) == (by_fsspec.requests, by_fsspec.fetched)
+    assert by_obstore.fetched < 0.1 * (tmp_path / "d.mcap").stat().st_size
+
+
+@pytest.mark.usefixtures("s3")  # its credentials; the server is another one, which fails
+@pytest.mark.parametrize(
+    ("statuses", "said"),
+    [
+        ((503, 503), ""),
+        ((503,) * 99, r"did not deliver; 1 s were lost .*503"),
+        ((403,), "s3://bucket/d.mcap"),
+        ((404,), "s3://bucket/d.mcap is not there"),
+    ],
+)
+def test_ranges_of_s3_are_asked_again_or_refused_as_others_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, statuses: tuple[int, ...], said: str
+) -> None:
+    pytest.importorskip("obstore")
+    local = drive(tmp_path / "bucket" / "d.mcap", samples=10)
+    asked = []
+
+    def fault(path: str, number: int) -> int | None:
+        asked.append(path)
+        return statuses[number - 1] if number <= len(statuses) else None
+
+    with web_server(tmp_path, fault) as url:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", url)
+        path = remote("s3://bucket/d.mcap", patience=1.0 if said else 60.0)
+        path._entry = remote(f"{url}/bucket/d.mcap").entry
+        if not said:
+            assert path.read_range(10, 500) == local.read_bytes()[10:500]
+            assert len(asked) == 1 + len(statuses)
+            return
+        with pytest.raises((BagError, OSError), match=said):
+            path.read_range(10, 500)
+        assert (len(asked) == 1) == (statuses[0] != 503)
+
+
 def test_what_is_forbidden_is_not_asked_again(tmp_path: Path) -> None:
     drive(tmp_path / "d.mcap")
     asked = []

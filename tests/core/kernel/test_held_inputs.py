@@ -96,5 +96,11 @@ def test_an_input_held_from_before_a_bound_began_may_be_outside_it() -> None:
 def test_a_bound_that_the_oldest_held_input_keeps_is_proved() -> None:
     """The input falls by at most 1 a second: held for 1 s it is at least 0."""
     files = claim(0.0)
-    assert "starts in it" in decided(files).statement
+    verdict = decided(files)
+    assert "starts in it" in verdict.statement
+    assert verdict.assumptions == (
+        "the state obeys the stored equations and the stored policy is applied every 1 s or more "
+        "often: at every time, the input is the policy's of some time at most 1 s before, and not "
+        "before the solution's start, for the state then, u0 clipped to [-1, 1]",
+    )
     assert agrees(files[PROOF], files)
