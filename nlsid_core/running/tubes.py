@@ -22,7 +22,7 @@ from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
-from nlsid_core.running.grid import TOLERANCE
+from nlsid_core.running.grid import TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status
 from nlsid_core.running.stepping import Stepper
 
@@ -91,7 +91,7 @@ class TubeRun:
 
     def restart(self) -> None:
         """A new run."""
-        self._due = math.nan
+        self._due = self._last = math.nan
         self._begin()
 
     def _begin(self, why: str = "") -> None:
@@ -145,15 +145,16 @@ class TubeRun:
             return f"stamp is {t}"
         lost = round(late)
         if lost < 0:
-            return f"the sample at t = {t:g} s came a second time, or time went back"
+            return early(t, self._last, self.period)
         if abs(late - lost) > TOLERANCE:
-            self._due = t + self.period
+            self._due, self._last = t + self.period, t
             off = (
                 f"the sample at t = {t:g} s is {late - lost:+.2g} periods of {self.period:g} s off "
                 f"the grid; {TOLERANCE:g} are allowed"
             )
             self._begin(off)
             return f"{off}; a new run starts"
+        self._last = t
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
         if lost:
             missing = "1 sample is" if lost == 1 else f"{lost} samples are"
