@@ -46,7 +46,15 @@ from nlsid_ros.documents import (
     declare_wiring,
 )
 from nlsid_ros.message_classes import installed_types, message_class
-from nlsid_ros.messages import OTHERS, ZERO, SignalMessage, frame_of, off_clock, stamp_ns_of
+from nlsid_ros.messages import (
+    OTHERS,
+    ZERO,
+    SignalMessage,
+    frame_of,
+    off_clock,
+    patience,
+    stamp_ns_of,
+)
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
@@ -81,7 +89,7 @@ class TrackingController(ManagedNode):
             declare(self, "start_at_once", False, "begin a run as soon as there is a design")
         )
         what = "s without a response, or from its stamp to this node's clock: stop"
-        number("stale_after", 0.1, what, between=(0.001, 60.0))
+        number("stale_after", 0.0, what, between=(0.0, 60.0))
         number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
         limit = partial(declare, self, tunable=True, several=True)
         limit("lowest", 0.0, "least input, or a list for each input", between=(-BIG, BIG))
@@ -127,6 +135,11 @@ class TrackingController(ManagedNode):
         self._limits, self._settling = limits, values["settling"]
         self._stale_after, self._stop_within = values["stale_after"], values["stop_within"]
         self._monitor_patience = values["monitor_patience"]
+
+    @property
+    def _patient_for(self) -> float:
+        """s without a response."""
+        return patience(self._stale_after, self._design.period if self._design else 0.0)
 
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
@@ -277,7 +290,7 @@ class TrackingController(ManagedNode):
         """Why a response is not to be acted on though its number could be; empty if it is."""
         if (frame := frame_of(message)) != self._frame_heard:
             return f"the response is in frame '{frame}', not in '{self._frame_heard}'"
-        return off_clock(stamp_ns, self.get_clock(), self._stale_after)
+        return off_clock(stamp_ns, self.get_clock(), self._patient_for)
 
     def _on_due(self) -> None:
         """Publish every input that is due, and wait for the next."""
@@ -317,8 +330,8 @@ class TrackingController(ManagedNode):
         assert self._design is not None
         assert self._command is not None
         now = time.monotonic()
-        unsent = 2.0 * (self._stale_after + self._design.period)
-        if now - self._heard > self._stale_after:
+        unsent = 2.0 * (self._patient_for + self._design.period)
+        if now - self._heard > self._patient_for:
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")
