@@ -3,8 +3,9 @@
     python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N]
 
 Each function is all that a user writes. A refusal is reported, not hidden. Starts on the boundary
-at t0 and at a later knot follow the true equations; w is at random corners of its box. The policy
-acts continuously on the state itself, as the claims say: none of them has a hold or an error.
+at t0 and at a later knot follow the true equations; w is at random corners of its box. Each is then
+designed for a computer: `hold="largest"`, states measured wrong by up to a hundredth of the goal;
+and simulated so, with samples a half to all of the hold apart.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import json
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,13 +29,14 @@ from nlsid_core.design import (
     integrate_nominal,
     plan_motion,
 )
-from nlsid_core.design.thesis.soundness import simulate_boundary
+from nlsid_core.design.thesis.soundness import simulate_boundary, simulate_held
 from nlsid_core.dynamics import Rates, solve
 from nlsid_core.errors import NlsidError
 from nlsid_core.proofs import check
 
-Written = tuple[Callable[..., Any], FunnelDesign]
+Written = tuple[Callable[..., Any], ContinuousTracking]
 SUBSTEPS = 10
+WRONG = 0.01  # of the goal's half-widths: what a state is measured wrong by
 
 
 def car() -> Written:
@@ -44,7 +47,7 @@ def car() -> Written:
 
     motion = plan_motion(rate, start=[0, 0, 0, 0], end=[31.5, 3, 0, 0], seconds=4, m=1)
     goal = [1.0, 0.5, 0.1, 0.05]
-    return rate, design(ContinuousTracking(rate, motion, goal=goal, limits=[[-0.3, 0.3]]))
+    return rate, ContinuousTracking(rate, motion, goal=goal, limits=[[-0.3, 0.3]])
 
 
 def bicycle() -> Written:
@@ -54,7 +57,7 @@ def bicycle() -> Written:
         return [10 * np.sin(x[1]), 10 / 2.7 * np.tan(x[2]), (u[0] - x[2]) / 0.2]
 
     motion = plan_motion(rate, start=[0, 0, 0], end=[3, 0, 0], seconds=3, m=1)
-    return rate, design(ContinuousTracking(rate, motion, goal=[0.3, 0.06, 0.06]))
+    return rate, ContinuousTracking(rate, motion, goal=[0.3, 0.06, 0.06])
 
 
 def rocket() -> Written:
@@ -67,7 +70,7 @@ def rocket() -> Written:
     start, end = [4, 20, 0, 0, -5, 0], [0, 0, 0, 0, 0, 0]
     motion = plan_motion(rate, start=start, end=end, seconds=5, u=[9.81, 0])
     goal = [0.5, 0.5, 0.1, 0.5, 0.5, 0.3]
-    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+    return rate, ContinuousTracking(rate, motion, goal=goal)
 
 
 def acrobot() -> Written:
@@ -83,7 +86,7 @@ def acrobot() -> Written:
         return [x[2], x[3], a[0], a[1]]
 
     motion = plan_motion(rate, start=[0, 0, 0, 0], end=[np.pi, 0, 0, 0], seconds=4, m=1)
-    return rate, design(ContinuousTracking(rate, motion, goal=[0.1, 0.1, 0.3, 0.3]))
+    return rate, ContinuousTracking(rate, motion, goal=[0.1, 0.1, 0.3, 0.3])
 
 
 def dubins(wind: float) -> Written:
@@ -100,7 +103,7 @@ def dubins(wind: float) -> Written:
     start, end = [0, 0, 0, 0, 0], [35, 15, 3, np.pi / 4, 0]
     motion = plan_motion(still, start=start, end=end, seconds=4, m=2)
     box = wind * np.array([[-1, 1], [-1, 1], [-1, 1]])
-    return rate, design(ContinuousTracking(rate, motion, goal=[4, 3, 3, 0.3, 0.3], uncertain=box))
+    return rate, ContinuousTracking(rate, motion, goal=[4, 3, 3, 0.3, 0.3], uncertain=box)
 
 
 def satellite() -> Written:
@@ -115,7 +118,7 @@ def satellite() -> Written:
 
     start, end = [0.3, -0.2, 0.2, 0, 0, 0], np.zeros(6)
     motion = plan_motion(rate, start=start, end=end, seconds=5, m=3)
-    return rate, design(ContinuousTracking(rate, motion, goal=[0.2, 0.2, 0.2, 0.2, 0.2, 0.2]))
+    return rate, ContinuousTracking(rate, motion, goal=[0.2, 0.2, 0.2, 0.2, 0.2, 0.2])
 
 
 def van_der_pol() -> Written:
@@ -126,7 +129,7 @@ def van_der_pol() -> Written:
 
     times = np.linspace(0, 4, 31)
     motion = integrate_nominal(rate, lambda _: np.zeros(0), t=times, start=[0, 0])
-    return rate, design(ContinuousTracking(rate, motion, goal=[0.5, 0.5]))
+    return rate, ContinuousTracking(rate, motion, goal=[0.5, 0.5])
 
 
 def flexible_arm() -> Written:
@@ -143,7 +146,7 @@ def flexible_arm() -> Written:
     start, end = np.zeros(8), [1, 0.8, 1, 0.8, 0, 0, 0, 0]
     motion = plan_motion(rate, start=start, end=end, seconds=2, m=2)
     goal = [0.1, 0.1, 0.1, 0.1, 0.5, 0.5, 0.5, 0.5]
-    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+    return rate, ContinuousTracking(rate, motion, goal=goal)
 
 
 def quadrotor_9() -> Written:
@@ -159,7 +162,7 @@ def quadrotor_9() -> Written:
     end[:3], start[8], end[8] = [2, 1, 0.5], 9.81, 9.81
     motion = plan_motion(rate, start=start, end=end, seconds=3, u=[0, 0, 9.81])
     goal = [0.2, 0.2, 0.2, 0.4, 0.4, 0.4, 0.2, 0.2, 1.0]
-    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+    return rate, ContinuousTracking(rate, motion, goal=goal)
 
 
 def quadrotor_16() -> Written:
@@ -179,7 +182,7 @@ def quadrotor_16() -> Written:
     end[:3], start[12:], end[12:] = [1, 1, 0.5], hover, hover
     motion = plan_motion(rate, start=start, end=end, seconds=3, u=[hover] * 4)
     goal = [0.2] * 3 + [0.4] * 3 + [0.2] * 3 + [1.0] * 3 + [1.0] * 4
-    return rate, design(ContinuousTracking(rate, motion, goal=goal))
+    return rate, ContinuousTracking(rate, motion, goal=goal)
 
 
 PROBLEMS: dict[str, Callable[[], Written]] = {
@@ -228,48 +231,79 @@ def lines_of(problem: Callable[..., Any]) -> int:
 
 
 def run(name: str, starts: int) -> dict[str, Any]:
-    """What became of one problem at the first try."""
+    """What became of one problem at the first try, and of its policy on a computer."""
     used = time.process_time()
+    lines = {"lines": lines_of(PROBLEMS[name])}
     try:
-        function, found = PROBLEMS[name]()
+        function, problem = PROBLEMS[name]()
+        found = design(problem)
     except NlsidError as refusal:
-        return {
-            "proved": False,
-            "seconds": time.process_time() - used,
-            "said": str(refusal),
-            "lines": lines_of(PROBLEMS[name]),
-        }
+        used = time.process_time() - used
+        return {"proved": False, "seconds": used, "said": str(refusal)} | lines
     seconds = time.process_time() - used
+    given = 0 if problem.uncertain is None else len(np.asarray(problem.uncertain))
+    t, later = found.funnel.t, len(found.funnel.t) // 2
+    told = {
+        "proved": True,
+        "seconds": seconds,
+        "states": found.funnel.n,
+        "knots": len(t),
+        "pieces": len(found.found.proved.pieces),
+        "half_widths_in_the_middle": found.funnel.widths(float(t[later])).tolist(),
+        "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
+    }
+    told |= judged(function, found, given, starts)
+    if found.model.m:  # without an input there is nothing to hold
+        used = time.process_time()
+        error = WRONG * np.asarray(problem.goal, dtype=np.float64)
+        try:
+            held = design(replace(problem, hold="largest", error=error))
+            computed = {"proved": True} | judged(function, held, given, starts)
+        except NlsidError as refusal:
+            computed = {"proved": False, "said": str(refusal)}
+        told["held"] = {"seconds": time.process_time() - used} | computed
+    return told | lines
+
+
+def judged(
+    function: Callable[..., Any], found: FunnelDesign, given: int, starts: int
+) -> dict[str, Any]:
+    """The proof decided again from its files, and starts on the boundary at t0 and later."""
     with tempfile.TemporaryDirectory() as folder:
         used = time.process_time()
         verdict = check(found.save(folder)[-1])
         check_seconds = time.process_time() - used
-    given = 3 if name.startswith("dubins") else 0
     truth, rng = Truth(function, found, given), np.random.default_rng(5)
-    later = len(found.funnel.t) // 2
-    runs = [
-        simulate_boundary(truth, found.policy, found.funnel, starts=count, rng=rng, knot=knot,
-                          substeps=SUBSTEPS)
-        for knot, count in ((0, starts), (later, starts // 4))
-    ]  # fmt: skip
-    t = found.funnel.t
-    return {
-        "proved": True,
-        "seconds": seconds,
+    parts = truth, found.policy, found.funnel
+    runs = []
+    for knot, count in ((0, starts), (len(found.funnel.t) // 2, starts // 4)):
+        at: dict[str, Any] = {"starts": count, "rng": rng, "knot": knot}
+        if "hold" in found.claim:
+            error = np.asarray(found.claim["error"])
+            runs.append(simulate_held(*parts, hold=found.claim["hold"], error=error, **at))
+        else:
+            runs.append(simulate_boundary(*parts, substeps=SUBSTEPS, **at))
+    return {key: found.claim[key] for key in ("hold", "error") if key in found.claim} | {
         "check_seconds": check_seconds,
-        "states": found.funnel.n,
-        "knots": len(t),
-        "pieces": len(found.found.proved.pieces),
         "margin": float(verdict.margin),
-        "half_widths": found.funnel.widths(float(t[0])).tolist(),
-        "half_widths_in_the_middle": found.funnel.widths(float(t[later])).tolist(),
-        "half_widths_at_the_end": found.funnel.widths(float(t[-1])).tolist(),
-        "policy_acts": "continuously",
+        "half_widths": found.funnel.widths(float(found.funnel.t[0])).tolist(),
         "starts": sum(r.starts for r in runs),
         "left": sum(r.violations for r in runs),
         "max_v": max(r.max_v for r in runs),
-        "lines": lines_of(PROBLEMS[name]),
     }
+
+
+def show(results: dict[str, Any], indent: str = "") -> None:
+    """A line for each figure."""
+    for key, value in results.items():
+        if isinstance(value, dict):
+            print(f"{indent}{key}")
+            show(value, indent + "  ")
+            continue
+        if isinstance(value, list):
+            value = ", ".join(f"{entry:.3g}" for entry in value)
+        name = f"{indent}{key}"
+        print(f"{name:26} {value:.5g}" if isinstance(value, float) else f"{name:26} {value}")
 
 
 def main() -> None:
@@ -284,14 +318,14 @@ def main() -> None:
     for name in arguments.only:
         results[name] = run(name, arguments.starts)
         print(f"\n{name}")
-        for key, value in results[name].items():
-            if isinstance(value, list):
-                value = ", ".join(f"{entry:.3g}" for entry in value)
-            print(f"{key:26} {value:.5g}" if isinstance(value, float) else f"{key:26} {value}")
+        show(results[name])
+    held = [found["held"] for found in results.values() if "held" in found]
     whole = {
         "proved_first_try": sum(found["proved"] for found in results.values()),
         "of": len(results),
         "left": sum(found.get("left", 0) for found in results.values()),
+        "proved_held": sum(found["proved"] for found in held),
+        "left_held": sum(found.get("left", 0) for found in held),
         "most_lines": max(found["lines"] for found in results.values()),
         "most_seconds": max(found["seconds"] for found in results.values()),
     }

@@ -25,6 +25,7 @@ VECTOR_FIELD = "vector_field.json"
 POLICY = "policy.json"
 FUNNEL = "funnel.json"
 PROOF = "funnel.proof.json"
+COMPOSITION = "composition.proof.json"  # of funnels that follow each other, its stages beside it
 
 D = TypeVar("D", bound=StableModel | MeasuredState | VectorField)
 P = TypeVar("P", bound=TubePolicy | SampledPolicy | ContinuousPolicy | None)

@@ -48,6 +48,15 @@ def declare_expected(node: Node) -> str:
     return "sha256:" + expected.removeprefix("sha256:") if expected else ""
 
 
+class Unproved:
+    """In the place of a `DesignSubscription`: a policy from files, of which nothing is proved."""
+
+    digest, refusal, state = "", "", "no design: a policy that is not proved"
+
+    def close(self) -> None:
+        """There is no check to call off."""
+
+
 class DesignSubscription:
     """Calls `taken` with the design that `source` publishes and its funnel's digest, once the
     kernel has proved it here, and again when it has proved another; the same one again changes

@@ -39,7 +39,7 @@ from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
 from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import installed_types, message_class
-from nlsid_ros.messages import frame_of, off_clock, stamp_ns_of
+from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
@@ -79,8 +79,11 @@ class FunnelMonitor(ManagedNode):
         self._wiring = declare_wiring(self)
         self._expected = declare_expected(self)
         number = partial(declare_number, self, tunable=True)
-        what = "s without a response, or from its stamp to this node's clock: unknown"
-        number("stale_after", 0.1, what, between=(0.001, 60.0))
+        what = (
+            "s without a response, or from its stamp to this node's clock: unknown; "
+            "0: 4 periods, at least 0.1"
+        )
+        number("stale_after", 0.0, what, between=(0.0, 60.0))
         number("command_wait", 0.02, "s a response waits for its command", between=(1e-4, 1.0))
         number("warning_margin", 0.2, "warn below", between=(0.0, 1.0))
         number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
@@ -105,6 +108,11 @@ class FunnelMonitor(ManagedNode):
         self._stale_after, self._command_wait = values["stale_after"], values["command_wait"]
         if self._watch is not None:
             self._watch.warn(self._options)
+
+    @property
+    def _patient_for(self) -> float:
+        """s without a response."""
+        return patience(self._stale_after, self._watch.design.period if self._watch else 0.0)
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
@@ -148,7 +156,7 @@ class FunnelMonitor(ManagedNode):
         self._retry = self.create_timer(RETRY, self._call, clock=wall)
         self._retry.cancel()
         self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
-        self._stale = self.create_timer(self._stale_after, self._on_stale, clock=self._patience)
+        self._stale = self.create_timer(self._patient_for, self._on_stale, clock=self._patience)
         self._stale.cancel()
         self._release = self.create_timer(
             self._command_wait, self._on_release, clock=self._patience
@@ -278,7 +286,7 @@ class FunnelMonitor(ManagedNode):
             return f"the response is in frame '{frame}', not in '{wanted}'"
         if self._allow_old_stamps:
             return ""
-        return off_clock(stamp_ns, self.get_clock(), self._stale_after)
+        return off_clock(stamp_ns, self.get_clock(), self._patient_for)
 
     def _release_in(self, ahead_ns: int) -> None:
         self._release.timer_period_ns = ahead_ns
@@ -297,7 +305,7 @@ class FunnelMonitor(ManagedNode):
 
     def _on_stale(self) -> None:
         """A response stopped coming, or did so a while ago: look again when it would have."""
-        patience_ns = round(self._stale_after * 1e9)
+        patience_ns = round(self._patient_for * 1e9)
         heard_ns = min(self._heard_ns.values(), default=0)
         ahead_ns = heard_ns + patience_ns - self._patience.now().nanoseconds
         self._stale.timer_period_ns = ahead_ns if ahead_ns > 0 else patience_ns
@@ -308,7 +316,7 @@ class FunnelMonitor(ManagedNode):
         if self._watch is not None:
             name = self._watch.design.name
             self._publish(self._watch.flush())
-            for entry in self._watch.missing(f"no {name} for {self._stale_after:g} s"):
+            for entry in self._watch.missing(f"no {name} for {self._patient_for:g} s"):
                 self._say(entry.reading, entry.state)
 
     def _publish(self, judged: Iterable[Stamped]) -> None:

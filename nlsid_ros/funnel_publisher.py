@@ -43,7 +43,7 @@ class FunnelPublisher(ManagedNode):
 
     def read_parameters(self) -> None:
         """Declare them; take the values that they have now."""
-        what = "funnel.json, with its proof beside it"
+        what = "funnel.json, with its proof beside it, or composition.proof.json with its stages"
         self._path = Path(declare_text(self, "funnel", "", what, tunable=True))
         self._frame = declare_text(
             self, "frame", "map", "frame the tube is drawn in and moves with"
@@ -94,7 +94,7 @@ class FunnelPublisher(ManagedNode):
             documents.FUNNEL_PROOF,
             path.name,
         )
-        found = (path.with_name(name) for name in names)
+        found = [*map(path.with_name, names), *sorted(path.parent.glob("stage*.json"))]
         states = (each.stat() for each in found if each.exists())
         return [(state.st_mtime_ns, state.st_size) for state in states]
 

@@ -22,6 +22,8 @@ from nlsid_ros.running import ManagedNode
 ZERO: Final = "zero"
 REFUSED: Final = "refused"
 OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
+LEAST_PATIENCE: Final = 0.1  # s without a response,
+PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
 OTHERS_PATIENCE: Final = 1.0  # s without a message on that topic
 SAID: Final = 6  # fields that are named
 
@@ -141,6 +143,11 @@ def frame_of(message: Any) -> str:
     """The frame that a message is in, and the one that moves if it names it."""
     child = getattr(message, "child_frame_id", "")
     return f"{message.header.frame_id}, {child}" if child else str(message.header.frame_id)
+
+
+def patience(stale_after: float, period: float) -> float:
+    """s to wait for a response: as given, or where that is 0 some periods (s), not too few."""
+    return stale_after or max(LEAST_PATIENCE, PATIENT_PERIODS * period)
 
 
 def off_clock(stamp_ns: int, clock: Clock, most: float) -> str:

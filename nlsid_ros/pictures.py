@@ -34,10 +34,16 @@ class Plan:
 def plan_of(design: AnyDesign) -> Plan:
     """The output of a linear model, y_k = C x_k + D u_k + c; of the others every state."""
     if is_continuous(design):
-        funnel = design.funnel
-        widths = np.array([funnel.widths(t) for t in funnel.t])
-        names = tuple(f"x{i}" for i in range(funnel.n))
-        return Plan(funnel.t - funnel.t0, names, funnel.x.ends(), widths, design.policy.planned)
+        names = tuple(f"x{i}" for i in range(design.funnel.n))
+        columns: list[list[FloatArray]] = [[], [], [], []]
+        for stage in design.stages:  # a knot where stages change belongs to the later one
+            funnel, end = stage.funnel, None if stage is design.stages[-1] else -1
+            widths = np.array([funnel.widths(t) for t in funnel.t])
+            parts = (funnel.t - design.funnel.t0, funnel.x.ends(), widths, stage.policy.planned)
+            for column, part in zip(columns, parts, strict=True):
+                column.append(part[:end])
+        t, nominal, half_widths, inputs = map(np.concatenate, columns)
+        return Plan(t, names, nominal, half_widths, inputs)
     if is_tube(design):
         model, policy = design.model, design.policy
         assert isinstance(model, DifferenceEquation)

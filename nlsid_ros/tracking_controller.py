@@ -5,7 +5,8 @@ into force, stamped a quarter of a period before its sample is due, so that a sa
 that much is still paired with it. Of a state model it answers sample k, and carries its stamp.
 `~/start` begins a run, `~/run` (latched) announces the stamp of its sample 0 and the funnel's
 digest. Stale or impossible state, `~/stop`, a required monitor that no longer judges, and the end
-of the plan ramp the input to `stop_at`.
+of the plan ramp the input to `stop_at`. With `commissioning` it runs a policy from files of which
+nothing is proved, and says so in every status; `stop_service` then has to be there.
 """
 
 import math
@@ -27,6 +28,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from bags.designs.design import AnyDesign
+from bags.designs.documents import load_unproved
 from bags.monitoring.announcement import Run
 from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
@@ -36,9 +38,23 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.running.controller import Controller, Limits
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.documents import CHECKING, DesignSubscription, declare_expected, declare_wiring
+from nlsid_ros.documents import (
+    CHECKING,
+    DesignSubscription,
+    Unproved,
+    declare_expected,
+    declare_wiring,
+)
 from nlsid_ros.message_classes import installed_types, message_class
-from nlsid_ros.messages import OTHERS, ZERO, SignalMessage, frame_of, off_clock, stamp_ns_of
+from nlsid_ros.messages import (
+    OTHERS,
+    ZERO,
+    SignalMessage,
+    frame_of,
+    off_clock,
+    patience,
+    stamp_ns_of,
+)
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "tracking_controller"
@@ -73,7 +89,7 @@ class TrackingController(ManagedNode):
             declare(self, "start_at_once", False, "begin a run as soon as there is a design")
         )
         what = "s without a response, or from its stamp to this node's clock: stop"
-        number("stale_after", 0.1, what, between=(0.001, 60.0))
+        number("stale_after", 0.0, what, between=(0.0, 60.0))
         number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
         limit = partial(declare, self, tunable=True, several=True)
         limit("lowest", 0.0, "least input, or a list for each input", between=(-BIG, BIG))
@@ -85,6 +101,16 @@ class TrackingController(ManagedNode):
         self._others = declare_text(self, "others", ZERO, what)
         what = "s until a robot that is stopped is at rest, faster than stop_rate if need be"
         number("stop_within", 5.0, what, between=(0.01, 60.0))
+        what = (
+            "folder of model.json (vector_field.json) and policy.json that are NOT proved: run them"
+        )
+        self._commissioning = declare_text(self, "commissioning", "", what)
+        what = (
+            "std_srvs/Trigger that stops the robot if a run of commissioning ends early; mandatory"
+        )
+        self._stop_service = declare_text(self, "stop_service", "", what)
+        if self._commissioning and not self._stop_service:
+            raise DataError("commissioning runs what is not proved: set stop_service")
         self._watched = bool(
             declare(self, "require_monitor", False, "track only while the monitor judges")
         )
@@ -110,6 +136,11 @@ class TrackingController(ManagedNode):
         self._stale_after, self._stop_within = values["stale_after"], values["stop_within"]
         self._monitor_patience = values["monitor_patience"]
 
+    @property
+    def _patient_for(self) -> float:
+        """s without a response."""
+        return patience(self._stale_after, self._design.period if self._design else 0.0)
+
     def start(self) -> None:
         """Listen for the funnel; it names the signals."""
         self._design: AnyDesign | None = None
@@ -125,14 +156,20 @@ class TrackingController(ManagedNode):
         self._announce = self.create_publisher(String, "~/run", qos.DOCUMENT)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        self._funnel = DesignSubscription(
-            self,
-            self._source,
-            self._on_design,
-            self._report,
-            wiring=self._wiring,
-            expected=self._expected,
-        )
+        self._funnel: DesignSubscription | Unproved = Unproved()
+        if self._commissioning:
+            self._brake = self.create_client(Trigger, self._stop_service)
+            unproved: Any = load_unproved(self._commissioning, wiring=self._wiring)
+            self._on_design(unproved, unproved.digest)
+        else:
+            self._funnel = DesignSubscription(
+                self,
+                self._source,
+                self._on_design,
+                self._report,
+                wiring=self._wiring,
+                expected=self._expected,
+            )
         if self._watched:
             self._margin = self.create_subscription(
                 JointState, f"{self._monitor}/margin", self._on_margin, qos.STREAM
@@ -195,6 +232,8 @@ class TrackingController(ManagedNode):
         assert self._command is not None
         if lacking := self._command.lacking():
             return lacking
+        if self._commissioning and not self._brake.service_is_ready():
+            return f"{self._stop_service} is not there: nothing unproved runs without it"
         try:
             self._controller = self._design.controller(self._limits, self._settling)
         except NlsidError as error:
@@ -203,7 +242,7 @@ class TrackingController(ManagedNode):
         if self._watched and not self.count_publishers(self._margin.topic_name):
             self._controller = None
             return f"require_monitor is set and nobody publishes {self._margin.topic_name}"
-        self._first_ns = None
+        self._first_ns, self._stage = None, 1
         self._tell("waiting for the response")
         return ""
 
@@ -235,15 +274,23 @@ class TrackingController(ManagedNode):
                 self._judged, self._announced_ns = self._heard, stamp_ns
                 announced = Run(stamp_ns, self._digest).document()
                 self._announce.publish(String(data=files.encode(announced).decode()))
-                self._tell("tracking")
+                self._tell(self._tracking(controller))
+            elif controller.stage != self._stage:
+                self._tell(self._tracking(controller))
         self._due.append((stamp_ns + round(controller.lead * 1e9), controller.u))
         self._on_due()
+
+    def _tracking(self, controller: Controller) -> str:
+        """What is being done, and of a composition in which stage."""
+        self._stage = controller.stage
+        many = controller.stages > 1
+        return f"tracking, stage {self._stage} of {controller.stages}" if many else "tracking"
 
     def _distrust(self, stamp_ns: int, message: Any) -> str:
         """Why a response is not to be acted on though its number could be; empty if it is."""
         if (frame := frame_of(message)) != self._frame_heard:
             return f"the response is in frame '{frame}', not in '{self._frame_heard}'"
-        return off_clock(stamp_ns, self.get_clock(), self._stale_after)
+        return off_clock(stamp_ns, self.get_clock(), self._patient_for)
 
     def _on_due(self) -> None:
         """Publish every input that is due, and wait for the next."""
@@ -283,8 +330,8 @@ class TrackingController(ManagedNode):
         assert self._design is not None
         assert self._command is not None
         now = time.monotonic()
-        unsent = 2.0 * (self._stale_after + self._design.period)
-        if now - self._heard > self._stale_after:
+        unsent = 2.0 * (self._patient_for + self._design.period)
+        if now - self._heard > self._patient_for:
             self._halt("the response stopped coming")
         elif now - self._sent > unsent:
             self._halt(f"no command has gone out for {unsent:g} s")
@@ -320,6 +367,8 @@ class TrackingController(ManagedNode):
         self._next.cancel()
         self._due.clear()
         self._stopping = reason
+        if self._commissioning and reason not in ENDED:
+            self._brake.call_async(Trigger.Request())
         away = np.abs(np.subtract(self._input, self._limits.stop_at))
         rate = np.maximum(self._limits.stop_rate, float(np.max(away)) / self._stop_within)
         self._ramp = replace(self._limits, stop_rate=rate)
@@ -352,6 +401,8 @@ class TrackingController(ManagedNode):
             text = "; ".join(part for part in (self._text, self._funnel.state) if part)
         if self._funnel.refusal:
             level = DiagnosticStatus.ERROR
+        if self._commissioning:
+            level, text = max(level, DiagnosticStatus.WARN), f"COMMISSIONING, not proved: {text}"
         values = {
             "input": ", ".join(f"{u:.6g}" for u in np.atleast_1d(self._input)),
             "sample": str(self._controller.k) if self._controller else "",

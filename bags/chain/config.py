@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from bags.chain.identification_config import Identification
+from bags.chain.identification_config import CLASSES, Identification
 from bags.chain.sections import (
     Corner,
     Key,
@@ -202,9 +202,13 @@ class MonitorConfig(Section):
         ),
     ] = "command"
     stale_after: Annotated[
-        Positive,
-        Key("without a response after which the state is unknown", unit="s", example=0.1),
-    ] = 0.1
+        Positive | None,
+        Key(
+            "without a response after which the state is unknown (none: 4 periods, at least 0.1 s)",
+            unit="s",
+            example=0.1,
+        ),
+    ] = None
     command_wait: Annotated[
         NonNegative,
         Key("for which a response waits for a command with its stamp", unit="s", example=0.02),
@@ -332,9 +336,10 @@ def _time_refusals(config: Config) -> Iterator[str]:
             f"grid.max_gap: {max_gap:g} s is shorter than the period, {period:g} s, so that every "
             "sample would be in a gap; give at least 1.5 periods"
         )
-    if config.monitor.stale_after <= period:
+    stale = config.monitor.stale_after
+    if stale is not None and stale <= period:
         yield (
-            f"monitor.stale_after: {config.monitor.stale_after:g} s is not longer than the period, "
+            f"monitor.stale_after: {stale:g} s is not longer than the period, "
             f"{period:g} s, so that the live monitor would call every response stale; give at "
             "least 2 periods"
         )
@@ -353,10 +358,11 @@ def _model_refusals(config: Config) -> Iterator[str]:
     counts = len(config.signals.response), len(config.signals.excitation)
     said = f"{counts[0]} responses and {counts[1]} excitations"
     kind = type(config.identification.model_class)
+    model = next(name for name, one in CLASSES.items() if one is kind)
     if kind in ONE_BY_ONE and counts != (1, 1):
         yield (
-            f"identification.model: a {kind.__name__} has one response and one excitation, not "
-            f"{said}; take state_affine or implicit, or leave out signals"
+            f"identification.model: {model} has one response and one excitation, not {said}; take "
+            "state_affine or implicit, or leave out signals"
         )
     elif kind is CellClass and counts[0] != 1:
         yield (
@@ -370,7 +376,7 @@ def _model_refusals(config: Config) -> Iterator[str]:
     ):
         yield (
             "funnel.profile: a plan is tracked by `model: linear` with one response and one "
-            f"excitation, not by a {kind.__name__} with {said}; leave out `profile` for a tube "
+            f"excitation, not by {model} with {said}; leave out `profile` for a tube "
             "around the model's simulation, or use `nlsid track` for a measured state"
         )
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):

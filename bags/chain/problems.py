@@ -3,6 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -15,26 +16,28 @@ from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
 MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "nominal", "goal",
-           "Q", "R", "limits")  # fmt: skip
+           "Q", "R", "limits", "hold", "error")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
-    """`ContinuousTracking` with a vector field, in its words. Q: (n, n), R: (m, m).
+    """`ContinuousTracking` with a vector field, in its words.
 
-    limits: (L, 3) rows (input, low, high) at which inputs saturate. In a file, objective
-    and limits may be left out.
+    limits: (L, 3) rows (input, low, high) at which inputs saturate. A file has format, version,
+    vector_field, nominal and goal; the rest may be left out.
     """
 
     field: VectorField
     nominal: Nominal
-    Q: FloatArray
-    R: FloatArray
+    Q: FloatArray | None = None
+    R: FloatArray | None = None
     goal: Goal | None = None
     shape: str = "rho"
     gain: str = "constant"
     objective: str = "volume"
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+    hold: float | Literal["largest"] | None = None
+    error: FloatArray | None = None
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -52,9 +55,11 @@ class FunnelProblem:
                 "u": self.nominal.u.control.tolist(),
             },
             "goal": goal,
-            "Q": self.Q.tolist(),
-            "R": self.R.tolist(),
+            "Q": None if self.Q is None else self.Q.tolist(),
+            "R": None if self.R is None else self.R.tolist(),
             "limits": self.limits.tolist(),
+            "hold": self.hold,
+            "error": None if self.error is None else self.error.tolist(),
         }
 
     @classmethod
@@ -78,16 +83,22 @@ class FunnelProblem:
             PiecewisePolynomial(t, files.array(motion, key, (None, None, None), source=source))
             for key in ("x", "u")
         ]
+        hold = document.get("hold")
+        if hold is not None:
+            hold = files.member(document, "hold", (int, float, str), source=source)
+        words = {"shape": "rho", "gain": "constant", "objective": "volume"} | document
         return cls(
             field,
             Nominal(*parts),
-            files.array(document, "Q", (field.n, field.n), source=source),
-            files.array(document, "R", (field.m, field.m), source=source),
+            _array(document, "Q", (field.n, field.n), source),
+            _array(document, "R", (field.m, field.m), source),
             _goal(document, field.n, source),
-            files.member(document, "shape", str, source=source),
-            files.member(document, "gain", str, source=source),
-            files.member({"objective": "volume"} | document, "objective", str, source=source),
+            files.member(words, "shape", str, source=source),
+            files.member(words, "gain", str, source=source),
+            files.member(words, "objective", str, source=source),
             _limits(document, source),
+            hold,
+            _array(document, "error", (field.n,), source),
         )
 
     def design(self, progress: Progress = silent) -> FunnelDesign:
@@ -102,8 +113,19 @@ class FunnelProblem:
             R=self.R,
             gain=self.gain,
             limits=self.limits if len(self.limits) else None,
+            hold=self.hold,
+            error=self.error,
         )
         return design(problem, progress=progress)
+
+
+def _array(
+    document: Json, name: str, shape: tuple[int | None, ...], source: str
+) -> FloatArray | None:
+    """The array, None where it is left out or null."""
+    if document.get(name) is None:
+        return None
+    return files.array(document, name, shape, source=source)
 
 
 def _limits(document: Json, source: str) -> FloatArray:

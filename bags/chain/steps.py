@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations
 from pathlib import Path
+from typing import Final, Literal
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
 from bags.signals.grid import read_dataset, skipped_samples
 from nlsid_core import files
+from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design
@@ -24,9 +26,12 @@ from nlsid_core.design.tube import least_window
 from nlsid_core.errors import DataError
 from nlsid_core.identification import Fit, Model
 from nlsid_core.models import StableModel
+from nlsid_core.models.signal import Signal, signals_of
 from nlsid_core.progress import Progress, part, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
+
+LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +47,32 @@ class Trials:
     calibration: Dataset | None = None
     skipped: int = 0
     absent: tuple[str, ...] = ()
+
+    @property
+    def every(self) -> Dataset:
+        """All of them, by name."""
+        parts = (self.train, self.test, self.validation, self.calibration)
+        trials = (trial for part in parts if part is not None for trial in part)
+        return Dataset(tuple(sorted(trials, key=lambda trial: trial.name)))
+
+    @property
+    def apart(self) -> list[str]:
+        """Trials where a signal is nowhere near what it is in all others, in words for people.
+
+        That is by more than the others' range: kelvin among degC, another sensor, another zero.
+        """
+        trials = self.every
+        if len(trials) < LEAST_APART:
+            return []
+        return [
+            f"{trial.name}: {signal.name} is {lows[k]:.4g} to {highs[k]:.4g} {signal.unit}, in all "
+            f"other trials {low:.4g} to {high:.4g}; is it in another unit, or of another sensor?"
+            for letter in ("y", "u")
+            for signal, lows, highs in _ranges(trials, letter)
+            for k, trial in enumerate(trials)
+            for low, high in [(np.delete(lows, k).min(), np.delete(highs, k).max())]
+            if max(lows[k] - high, low - highs[k]) > max(high - low, highs[k] - lows[k])
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +182,16 @@ def read_signals_of(
         progress=progress,
     )
     return _labelled(dataset, responses, excitations)
+
+
+def _ranges(
+    trials: Dataset, letter: Literal["y", "u"]
+) -> list[tuple[Signal, FloatArray, FloatArray]]:
+    """Each response or excitation with its least and its greatest value in each trial."""
+    columns = [trial.y if letter == "y" else trial.u for trial in trials]
+    lows = np.array([values.min(axis=0) for values in columns])
+    highs = np.array([values.max(axis=0) for values in columns])
+    return list(zip(signals_of(trials.trajectories[0], letter), lows.T, highs.T, strict=True))
 
 
 def by_use(labelled: Dataset, config: Config) -> Trials:

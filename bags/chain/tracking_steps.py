@@ -168,6 +168,13 @@ def design_tracking_funnel(
     return made
 
 
+def widest_start(made: TrackingDesign, runs: Dataset) -> float:
+    """How far out of the inlet's boundary, 1, the runs started at most."""
+    first = [trial.y[0] - made.policy.x[0] for trial in runs]
+    radius = float(made.funnel.inlet[0])
+    return max(made.funnel.norm(0, x_bar) / radius for x_bar in first)
+
+
 def replay_run(proved: Proved[SampledDesign], bag: Path) -> list[Reading]:
     """Every sample of one bag held against the funnel, message by message as they are live.
 

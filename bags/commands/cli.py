@@ -50,6 +50,13 @@ BagsArgument = Annotated[
     typer.Argument(help="Bags: rosbag2 folders, .mcap files, folders of bags, URLs (s3://...)."),
 ]
 ConfigOption = Annotated[Path, typer.Option(help="The robot's YAML configuration.")]
+ResponseOption = Annotated[
+    list[str] | None, typer.Option(help="topic:field of a continuous funnel's state; repeat.")
+]
+CommandOption = Annotated[
+    list[str] | None, typer.Option(help="topic:field of a continuous funnel's input; repeat.")
+]
+PeriodOption = Annotated[float, typer.Option(help="Seconds between a continuous funnel's samples.")]
 OutOption = Annotated[
     Path, typer.Option("--out", help="Folder for the results; made if it is not there.")
 ]
@@ -407,15 +414,9 @@ def monitor(
     plot: Annotated[
         Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
     ] = None,
-    response: Annotated[
-        list[str] | None, typer.Option(help="topic:field of a continuous funnel's state; repeat.")
-    ] = None,
-    command: Annotated[
-        list[str] | None, typer.Option(help="topic:field of a continuous funnel's input; repeat.")
-    ] = None,
-    period: Annotated[
-        float, typer.Option(help="Seconds between samples of a continuous funnel.")
-    ] = 0.0,
+    response: ResponseOption = None,
+    command: CommandOption = None,
+    period: PeriodOption = 0.0,
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
@@ -437,7 +438,7 @@ def monitor(
             "give --replay; a live robot is watched by the node funnel_monitor"
         )
     settings = load_config(config) if config is not None else None
-    wiring = Wiring.parse(response or [], command or [], period) if response or command else None
+    wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
     folders = expand_bags(bags)
     if settings is not None:
@@ -555,6 +556,9 @@ def view(
     rate: Annotated[
         float, typer.Option(help="For a recording: speed, 1 as recorded.", min=0.01, max=100.0)
     ] = 1.0,
+    response: ResponseOption = None,
+    command: CommandOption = None,
+    period: PeriodOption = 0.0,
 ) -> None:
     """Show tube, signals, margin, assumption and events, live or of a recording, until Ctrl-C."""
     from bags.commands.viewing import view_live, view_recording
@@ -568,10 +572,12 @@ def view(
     from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
+    from bags.designs.design import Wiring
     from bags.viewing.replay import Recording
 
     centre = show.centre_of(load_config(config) if config is not None else None)
-    recording = Recording(documents.load_proved(funnel), bag, centre=centre)
+    wiring = Wiring.parse_if_any(response or [], command or [], period)
+    recording = Recording(documents.load_proved(funnel, wiring=wiring), bag, centre=centre)
     view_recording(recording, rate, page=page, host=host, port=port)
 
 

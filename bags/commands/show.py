@@ -82,6 +82,7 @@ def notes(result: Identified) -> list[str]:
         lines += str(scores).splitlines()
     if result.trials.skipped:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
+    lines += result.trials.apart
     if result.trials.absent:
         lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")
     if result.fit.chosen.proof is None:

@@ -64,6 +64,13 @@ def funnel(bags: list[Path], design: Path, config: Path) -> None:
         f"the largest of {len(a.measured_on)} runs; the monitor watches it",
         soft_wrap=True,
     )
+    widest = tracking_steps.widest_start(made, tracking_steps.read_states(runs, settings))
+    if widest < 1.0:
+        out.print(
+            f"warning: the runs started within {widest:.2g} of the inlet that is claimed: what "
+            "disturbs farther out was not measured; record runs that start there",
+            soft_wrap=True,
+        )
     _wrote(design, documents.FUNNEL, documents.FUNNEL_PROOF, picture=documents.FUNNEL_PLOT)
 
 

@@ -14,9 +14,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from bags.designs.design import AnyDesign, Wiring, read_design
 from nlsid_core import designs, files, proofs
@@ -28,7 +28,7 @@ from nlsid_core.kernel.files import read_regular
 FORMAT: Final = "nlsid/bundle"
 PROOF: Final = "proof"  # the role of the file that names the others
 MAX_BYTES: Final = 16 * 2**20  # of a bundle; real ones have about 1 MB
-MAX_ROLES: Final = 8
+MAX_ROLES: Final = 401  # of a composition of 100 stages
 MAX_MEMORY: Final = 4 * 2**30  # bytes of address space to decide in
 MAX_TIME: Final = 600.0  # s to decide in
 NICE: Final = 10  # the loop that runs meanwhile comes first
@@ -42,19 +42,21 @@ class Bundle:
 
     @classmethod
     def load(cls, funnel: Path | str) -> "Bundle":
-        """The files of the proof beside `funnel`.
+        """The files of the proof beside `funnel`; of a composition's proof, those of its stages.
 
         Raises CertificateMismatch if the proof is about another funnel, DocumentError if it is no
         proof or the files are too large to be published; OS errors for the proof pass through.
         """
         funnel = Path(funnel)
         folder = funnel.parent
-        proof = (folder / designs.PROOF).read_bytes()
-        contents = {PROOF: proof}
-        for role, name in _names(proof).items():
-            with contextlib.suppress(OSError):  # the kernel says which is missing
-                contents[role] = read_regular(folder / name)
-        if contents.get("funnel") != funnel.read_bytes():
+        composed = funnel.name == designs.COMPOSITION
+        proof = (funnel if composed else folder / designs.PROOF).read_bytes()
+        contents = {PROOF: proof, **_beside(folder, proof)}
+        for stage in list(contents) if composed else []:
+            if stage != PROOF:
+                inner = _beside(folder, contents[stage])
+                contents |= {f"{stage}.{role}": content for role, content in inner.items()}
+        if not composed and contents.get("funnel") != funnel.read_bytes():
             raise CertificateMismatch(f"{designs.PROOF} beside {funnel} is not about this funnel")
         bundle = cls(contents)
         _refuse_size(bundle.text())
@@ -80,8 +82,26 @@ class Bundle:
 
     @property
     def digest(self) -> str:
-        """Of the funnel's file, which names the model and the policy that it was made for."""
-        return files.digest(self.contents.get("funnel", b""))
+        """Of the funnel's file, which names the model and the policy that it was made for; of a
+        composition's proof, which names its stages.
+        """
+        return files.digest(self.contents.get(PROOF if self._stages else "funnel", b""))
+
+    @property
+    def _stages(self) -> list[str]:
+        """The roles of a composition's stages, in their order; none of a funnel."""
+        known = (f"stage{i}" for i in range(1, len(self.contents)))
+        return [role for role in known if role in self.contents]
+
+    def _files(self) -> dict[str, bytes]:
+        """The bytes by the names that the proof, or a stage's, calls them."""
+        found = {}
+        for role in [PROOF, *self._stages]:
+            inner = "" if role == PROOF else f"{role}."
+            for part, name in _names(self.contents[role]).items():
+                if inner + part in self.contents:
+                    found[name] = self.contents[inner + part]
+        return found
 
     def decided(self) -> Verdict:
         """The kernel's verdict about these files and no others.
@@ -90,11 +110,9 @@ class Bundle:
         """
         if PROOF not in self.contents:
             raise CertificateRejected("there is no proof in the bundle")
-        proof = self.contents[PROOF]
-        about = {name: self.contents[r] for r, name in _names(proof).items() if r in self.contents}
-        verdict = proofs.decide(proof, about)
+        verdict = proofs.decide(self.contents[PROOF], self._files())
         found = {role: files.digest(content) for role, content in self.contents.items()}
-        if found != verdict.digests or "funnel" not in found:
+        if found != verdict.digests or not ("funnel" in found or self._stages):
             raise CertificateMismatch(
                 f"the proof is about {', '.join(sorted(verdict.digests))}; with a funnel come "
                 f"{', '.join(sorted(found))}"
@@ -106,13 +124,20 @@ class Bundle:
 
         Raises DocumentError or CertificateMismatch if they are not a design.
         """
-        documents = {
-            "model" if role == "vector_field" else role: files.parse_document(content, source=role)
-            for role, content in self.contents.items()
-            if role != PROOF
-        }
-        proof = files.parse_document(self.contents.get(PROOF, b"{}"), source=PROOF)
-        return read_design(documents, wiring=wiring, claim=proof.get("claim"))
+        if not self._stages:
+            return _design({r: c for r, c in self.contents.items() if r != PROOF},
+                           self.contents.get(PROOF, b"{}"), wiring)  # fmt: skip
+        stages = []
+        for stage in self._stages:
+            parts = {
+                role.removeprefix(f"{stage}."): content
+                for role, content in self.contents.items()
+                if role.startswith(f"{stage}.")
+            }
+            stages.append(_design(parts, self.contents[stage], wiring))
+        first: Any = stages[0]
+        made: AnyDesign = replace(first, later=tuple(stages[1:]), composition=self.digest)
+        return made
 
 
 class Check:
@@ -161,6 +186,24 @@ def decide(text: str) -> Json:
     except (NlsidError, MemoryError) as refusal:
         return {"refused": str(refusal) or "it takes too much memory to decide"}
     return {"proved": str(verdict), "digest": bundle.digest}
+
+
+def _design(parts: Mapping[str, bytes], proof: bytes, wiring: Wiring | None) -> AnyDesign:
+    documents = {
+        "model" if role == "vector_field" else role: files.parse_document(content, source=role)
+        for role, content in parts.items()
+    }
+    claim = files.parse_document(proof, source=PROOF).get("claim")
+    return read_design(documents, wiring=wiring, claim=claim)
+
+
+def _beside(folder: Path, proof: bytes) -> dict[str, bytes]:
+    """The files by role that a proof in `folder` is about; the kernel says which is missing."""
+    found = {}
+    for role, name in _names(proof).items():
+        with contextlib.suppress(OSError):
+            found[role] = read_regular(folder / name)
+    return found
 
 
 def _names(proof: bytes) -> dict[str, str]:

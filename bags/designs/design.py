@@ -1,6 +1,6 @@
 """What a robot runs and is held against: a model, a policy and a funnel that belong together."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Generic, TypeAlias, TypeGuard, TypeVar
@@ -36,7 +36,7 @@ from nlsid_core.running.monitor import Dynamics, Monitor, refuse_mismatch
 
 M = TypeVar("M", bound=Dynamics)
 P = TypeVar("P", bound=AnyPolicy | None)
-F = TypeVar("F", bound=AnyFunnel)
+F = TypeVar("F", bound=AnyFunnel | None)
 CONTINUOUSLY = Held()
 
 
@@ -56,13 +56,21 @@ class Wiring:
         """Read each `topic:field.path[index]`; BagError if a vector is not on one topic."""
         return cls(SignalVector.parse(response), SignalVector.parse(command), period)
 
+    @classmethod
+    def parse_if_any(
+        cls, response: Sequence[str], command: Sequence[str], period: float
+    ) -> "Wiring | None":
+        """`parse`, None if neither was said."""
+        return cls.parse(response, command, period) if response or command else None
+
 
 @dataclass(frozen=True, eq=False)
 class WiredDesign(Generic[M, P, F]):
     """The parts of a design of any kind, and where their signals are.
 
     wiring: of a continuous funnel, None until somebody says it. held: how the proof of a continuous
-    funnel lets its policy be applied.
+    funnel lets its policy be applied. later: of a composition, the stages that follow this one;
+    composition: the digest of its proof. funnel: None of a policy that is not proved.
     """
 
     model: M
@@ -70,6 +78,13 @@ class WiredDesign(Generic[M, P, F]):
     funnel: F
     wiring: Wiring | None = None
     held: Held = CONTINUOUSLY
+    later: "tuple[WiredDesign[M, P, F], ...]" = ()
+    composition: str = ""
+
+    @property
+    def stages(self) -> "tuple[WiredDesign[M, P, F], ...]":
+        """This one, and those of a composition that follow."""
+        return self, *self.later
 
     @property
     def name(self) -> str:
@@ -126,13 +141,24 @@ class WiredDesign(Generic[M, P, F]):
 
     @property
     def digest(self) -> str:
-        """Of the funnel's document: how an announcement names it."""
-        return files.digest(self.funnel.document())
+        """Of the funnel's document, or of the composition's proof: how an announcement names it.
+
+        Without a funnel of the policy's.
+        """
+        named: Any = self.funnel if self.funnel is not None else self.policy
+        return self.composition or files.digest(named.document())
 
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
+        if self.later:
+            parts: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+            held = [stage.held for stage in self.stages]
+            return Monitor.of_stages(parts, period=self.period, held=held)
         period = self.period if isinstance(self.model, VectorField) else None
-        return Monitor(self.model, self.policy, self.funnel, centre=centre, period=period,
+        funnel: AnyFunnel | None = self.funnel
+        if funnel is None:
+            raise DocumentError("nothing is proved of this policy: no funnel to hold a robot to")
+        return Monitor(self.model, self.policy, funnel, centre=centre, period=period,
                        held=self.held)  # fmt: skip
 
     def controller(self, limits: Limits, settling: float) -> Controller:
@@ -140,6 +166,13 @@ class WiredDesign(Generic[M, P, F]):
         period = self.period if isinstance(self.model, VectorField) else None
         if self.policy is None:
             raise DocumentError("this tube is around a model's simulation only: no policy to run")
+        if self.funnel is None:
+            return Controller.unproved(self.model, self.policy, limits=limits, period=period)
+        if self.later:
+            parts: list[Any] = [(s.model, s.policy, s.funnel) for s in self.stages]
+            return Controller.of_stages(
+                parts, limits=limits, settling=settling, period=self.period, held=self.held
+            )
         return Controller(
             self.model,
             self.policy,

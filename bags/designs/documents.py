@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast, get_args
 
 from bags.designs.bundle import Bundle
-from bags.designs.design import AnyDesign, SampledDesign, WiredTube, Wiring
+from bags.designs.design import AnyDesign, SampledDesign, WiredDesign, WiredTube, Wiring
 from nlsid_core import designs, files
 from nlsid_core.documents import load
 from nlsid_core.errors import DocumentError
@@ -13,6 +13,9 @@ from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, StableModel
+from nlsid_core.policies.continuous import ContinuousPolicy
+from nlsid_core.policies.protocol import AnyPolicy, read_policy
+from nlsid_core.running.monitor import refuse_mismatch
 
 MODEL, VECTOR_FIELD = designs.MODEL, designs.VECTOR_FIELD
 POLICY, FUNNEL, FUNNEL_PROOF = designs.POLICY, designs.FUNNEL, designs.PROOF
@@ -65,6 +68,21 @@ def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[Any
     bundle = Bundle.load(path)
     verdict = bundle.decided()
     return Proved(bundle.design(wiring), verdict)
+
+
+def load_unproved(
+    folder: Path | str, *, wiring: Wiring | None = None
+) -> WiredDesign[Any, AnyPolicy, None]:
+    """policy.json in `folder` with its model or vector field: nothing is proved of it.
+
+    Raises DocumentError if they are none, CertificateMismatch if they do not belong together.
+    """
+    folder = Path(folder)
+    policy = read_policy(files.load_document(folder / POLICY))
+    continuous = isinstance(policy, ContinuousPolicy)
+    model: Any = load(folder / (VECTOR_FIELD if continuous else MODEL))
+    refuse_mismatch(model, policy, None)
+    return WiredDesign(model, policy, None, wiring)
 
 
 def load_proved_funnel(path: Path | str) -> Proved[WiredTube]:

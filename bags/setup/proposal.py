@@ -25,8 +25,9 @@ from bags.setup.candidates import Found, slope_window
 from bags.signals.columns import read_columns
 from bags.signals.expressions import factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
-from nlsid_core.data.trajectory import Dataset
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
 from nlsid_core.progress import silent
@@ -52,7 +53,6 @@ SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 SHOWN: Final = 4  # of the classes that were tried
 OTHERS: Final = 3  # commands that are named besides
-STALE: Final = 5.0  # periods without a response that are one too many
 
 
 @dataclass(frozen=True)
@@ -138,6 +138,9 @@ def propose(
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
+    proposal.walls += trials.apart
+    if _say_motions(proposal, trials.every):
+        trials = _tried(proposal, bags, definitions)
     if linear:
         _say_lags(proposal, trials.train, found)
     else:
@@ -182,7 +185,7 @@ def _name(text: str) -> str:
     steps = [
         step for step in fields.split(".") if step not in ("twist", "pose", "data", "transform")
     ]
-    words = " ".join(steps[-2:]) if steps else topic
+    words = " ".join(steps[-2:])
     words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
     rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
     return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
@@ -384,9 +387,6 @@ def _say_grid(proposal: Proposal, read: _Read) -> None:
                 "before"
             )
     proposal.content["grid"] = grid
-    stale = max(0.1, _up(STALE * grid["period"]))
-    proposal.content["monitor"] = {"stale_after": stale}
-    why["stale_after"] = f"{STALE:g} periods, at least 0.1 s"
     if read.repeated:
         walls.append(
             f"{read.repeated} stamps of the response repeat the one before, which identification "
@@ -409,6 +409,30 @@ def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
             "one bag: a tube is designed on one trial and its level measured on another; record "
             "more, or cut it: nlsid bag split BAG --out PART --every 5"
         )
+
+
+def _say_motions(proposal: Proposal, trials: Dataset) -> bool:
+    """Spread repeated motions over training, calibration and test; whether there are any.
+
+    Bags by name often come motion after motion, or in turn: every fifth may be of one motion only.
+    """
+    motions: list[list[Trajectory]] = []
+    for trial in trials:
+        known = next((m for m in motions if same_excitation(m[0].u[:, 0], trial.u[:, 0])), None)
+        if known is None:
+            motions.append([trial])
+        else:
+            known.append(trial)
+    repeats = min(map(len, motions))
+    if proposal.content["split"].get("share") or repeats < TEST_EVERY:
+        return False
+    names = [trial.name for motion in motions for trial in motion]
+    tests, scales = names[TEST_EVERY - 1 :: TEST_EVERY], names[TEST_EVERY // 2 :: TEST_EVERY]
+    proposal.content["split"] = {"test": sorted(tests), "calibration": sorted(scales)}
+    what = f"{len(motions)} motions, each recorded {repeats} times or more"
+    proposal.why["test"] = f"{what}: every {TEST_EVERY}th of each"
+    proposal.why["calibration"] = f"{what}: another {TEST_EVERY}th sets the tube's level"
+    return True
 
 
 def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]) -> Trials:

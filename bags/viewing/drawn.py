@@ -1,5 +1,7 @@
 """What of a design is drawn beside the signals: their names, and how wide the tube is."""
 
+from typing import Any
+
 import numpy as np
 
 from bags.designs.design import AnyDesign
@@ -22,8 +24,11 @@ class HalfWidths:
     def __init__(self, design: AnyDesign) -> None:
         self._period, funnel = design.period, design.funnel
         if isinstance(funnel, ContinuousFunnel):
-            steps = np.arange(round((funnel.tf - funnel.t0) / self._period) + 1) * self._period
-            rows = [funnel.widths(t) for t in np.minimum(funnel.t0 + steps, funnel.tf)]
+            stages: list[Any] = [stage.funnel for stage in design.stages]
+            last = stages[-1].tf
+            steps = np.arange(round((last - funnel.t0) / self._period) + 1) * self._period
+            on = ((t, sum(t >= s.tf for s in stages[:-1])) for t in (funnel.t0 + steps).tolist())
+            rows = [stages[i].widths(min(t, last)) for t, i in on]
         elif isinstance(funnel, SampledFunnel):
             rows = list(funnel.half_widths)
         else:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
+from nlsid_core.designs import COMPOSITION
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 
 KIND, STAGE_KIND = "funnel_composition", "continuous_funnel"
 ROLES = ("vector_field", "policy", "funnel")
-COMPOSITION_PROOF = "composition.proof.json"
 LARGEST = 1e6  # overlap factor past which the search for it stops
 
 
@@ -48,8 +48,8 @@ def compose_funnels(paths: Sequence[Path | str], folder: Path | str) -> Path:
     folder = Path(folder)
     for name, content in contents.items():
         files.write_atomically(folder / name, content)
-    files.write_document(folder / COMPOSITION_PROOF, document)
-    return folder / COMPOSITION_PROOF
+    files.write_document(folder / COMPOSITION, document)
+    return folder / COMPOSITION
 
 
 @dataclass(frozen=True, eq=False)

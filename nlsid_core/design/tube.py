@@ -545,7 +545,10 @@ def _best(
             "no proved tube serves both the played inputs and the policy; try a larger input weight"
         )
     if refused:
-        raise Infeasible(f"no proved tube: {refused}")
+        raise Infeasible(
+            "the solver's tubes are too inaccurate for the exact decision; try another "
+            f"reaction_time, or a model with fewer lags. The last one: {refused}"
+        )
     raise Infeasible(
         "no storage function bounds the output by the innovations: the increments are too "
         "different over the model's range; give a smaller range of inputs or a smaller box"

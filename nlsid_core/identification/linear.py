@@ -107,8 +107,8 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
     first = dataset.trajectories[0]
     if first.y.shape[1] != 1 or first.u.shape[1] != 1:
         raise ShapeError(
-            f"a LinearClass has one output and one input; there are {first.y.shape[1]} and "
-            f"{first.u.shape[1]}; StateAffineClass is for several"
+            f"a linear model has one output and one input; there are {first.y.shape[1]} and "
+            f"{first.u.shape[1]}; state_affine and linear_states are for several"
         )
     short = [trial for trial in dataset if len(trial) <= lags]
     if short:

@@ -320,12 +320,13 @@ class ContinuousComparison:
         policies: Sequence[ContinuousPolicy],
         funnels: Sequence[ContinuousFunnel],
         period: float,
-        held: Held,
+        held: Sequence[Held],
     ) -> None:
         if not period > 0.0:
             raise DataError(f"the samples of a continuous funnel need a period: {period} s")
-        held.refuse(period)
-        self._held = held
+        for each in held:
+            each.refuse(period)
+        self._held = tuple(held)
         for before, after in pairwise(funnels):
             if before.tf != after.t0 or before.n != after.n:
                 raise CertificateMismatch("the stages do not follow each other")
@@ -334,15 +335,21 @@ class ContinuousComparison:
         self._policies, self._funnels = tuple(policies), tuple(funnels)
         self.period, self.n, self.m = period, fields[0].n, fields[0].m
         self.last = [funnels[-1].tf]
-        pushed = any(len(field.uncertain) for field in fields)
-        self.assuming = [held.assuming(period) + (", and w stays in its box" if pushed else "")]
-        self._measures = not pushed and held.hold > 0.0
+        pushed = [len(field.uncertain) > 0 for field in fields]
+        self._said = [
+            (f"stage {i} of {len(held)}: " if len(held) > 1 else "")
+            + each.assuming(period)
+            + (", and w stays in its box" if more else "")
+            for i, (each, more) in enumerate(zip(held, pushed, strict=True), start=1)
+        ]
+        self._measures = not pushed[0] and held[0].hold > 0.0
         self.over = [f"{funnels[-1].tf - funnels[0].t0:g} s"]
         self.restart()
 
     def restart(self) -> None:
         """A new run."""
         self._before, self._proved = np.nan, False
+        self.assuming = self._said[:1]
 
     def read(self, y: Any, u: Any) -> tuple[Any, Any, tuple[float, ...]]:
         """The state (n,) and the input (m,), None if there is none."""
@@ -363,7 +370,8 @@ class ContinuousComparison:
     def compare(self, when: float, t: float, y: FloatArray, u: FloatArray | None) -> Compared:
         """The state at `when` s against the set of the stage that is on."""
         stage = sum(when >= funnel.tf for funnel in self._funnels[:-1])
-        funnel, policy = self._funnels[stage], self._policies[stage]
+        funnel, policy, held = self._funnels[stage], self._policies[stage], self._held[stage]
+        self.assuming = [self._said[stage]]
         nominal = funnel.nominal(when)
         x_bar = y - nominal
         worst = int(np.argmax(np.abs(x_bar) / funnel.widths(when)))
@@ -371,9 +379,9 @@ class ContinuousComparison:
         if u is not None and when < self.last[0]:
             broken = not_the_policys(t, u, policy(when, y), [f"u{i}" for i in range(self.m)])
         starts = bool(np.isnan(self._before))
-        age, hold = 0.0 if starts else t - self._before, self._held.hold
+        age, hold = 0.0 if starts else t - self._before, held.hold
         self._before = t
-        size = funnel.size(when, x_bar) + self._held.reach(funnel.shape(when))
+        size = funnel.size(when, x_bar) + held.reach(funnel.shape(when))
         # With a hold the proof is about starts inside: what came in later has inputs from outside.
         self._proved = self._proved or (size <= 1.0 and (starts or not hold))
         if not self._proved:

@@ -120,13 +120,24 @@ class Controller:
         limits: Limits,
         settling: float,
         period: float,
+        held: Held | None = None,
     ) -> "Controller":
-        """The policies of a composition, one stage after another.
+        """The policies of a composition, one stage after another; `stage` is which.
 
-        None has a hold: what is held into the next stage is covered by no proof.
+        held: of the first stage, its errors. None has a hold: what is held into the next stage is
+        covered by no proof.
         """
         controller = cls.__new__(cls)
-        controller._follow(list(stages), limits, settling, period, None)
+        controller._follow(list(stages), limits, settling, period, held)
+        return controller
+
+    @classmethod
+    def unproved(
+        cls, model: Dynamics, policy: AnyPolicy, *, limits: Limits, period: float | None = None
+    ) -> "Controller":
+        """A policy of which nothing is proved, to be commissioned: it runs from any state."""
+        controller = cls.__new__(cls)
+        controller._follow([(model, policy, None)], limits, 0.0, period, None)
         return controller
 
     def _follow(
@@ -151,17 +162,18 @@ class Controller:
                 raise DataError(f"the samples of a continuous funnel need a period: {period} s")
             self._held = held or Held()
             self._held.refuse(period)
-            self.period, self._origin = period, float(funnel.t0)
-            self._end = stages[-1][2].last - (1.0 - TOLERANCE) * period  # an input is held so long
+            self.period, self._origin = period, float(policy.t[0])
+            self._end = stages[-1][1].last - (1.0 - TOLERANCE) * period  # an input is held so long
         else:
             self.period, self._origin = float(model.period), 0.0
-            self._end = min(policy.last, funnel.last)
+            self._end = policy.last if funnel is None else min(policy.last, funnel.last)
         self._observer = _observer(model, policy)
         self.lead = (1.0 - TOLERANCE) * self.period * self._observer.ahead
         for _, planned, _ in stages:
             limits.refuse(np.size(planned.planned[0]))
             self._refuse_cut(planned.planned)
         self.ended = ""
+        self.stage = 1  # of a composition, counted from 1
         self.k = -1
         self.u: Any = limits.clip(policy.planned[0])  # the input in force at the next sample
         if self._observer.ahead:
@@ -194,6 +206,11 @@ class Controller:
         self._answer(self._when(t), x)
         return self.u
 
+    @property
+    def stages(self) -> int:
+        """How many stages there are: 1 but for a composition."""
+        return len(self._stages)
+
     def _when(self, t: float) -> float:
         """The moment of the next input, as the funnels count."""
         if self._continuous:
@@ -202,7 +219,8 @@ class Controller:
 
     def _stage(self, when: float) -> tuple[Any, Any, Any]:
         """The stage that is on: of a composition the first that has not ended."""
-        return next((s for s in self._stages[:-1] if when < s[2].last), self._stages[-1])
+        self.stage = 1 + sum(when >= stage[1].last for stage in self._stages[:-1])
+        return self._stages[self.stage - 1]
 
     def _settle(self, t: float, y: Any) -> None:
         """Wait for a state from which the funnel may start."""
@@ -213,10 +231,12 @@ class Controller:
             return
         x = self._observer.begin([y for y, _ in self._recent], [u for _, u in self._recent])
         _, policy, funnel = self._stages[0]
-        nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
-        size = funnel.start_size(x - nominal)
-        if self._continuous:
-            size += self._held.reach(funnel.shape(self._origin))
+        size = 0.0
+        if funnel is not None:
+            nominal = funnel.nominal(self._origin) if self._continuous else policy.x[0]
+            size = funnel.start_size(x - nominal)
+            if self._continuous:
+                size += self._held.reach(funnel.shape(self._origin))
         if size <= 1.0:
             self.k = 1 - self._observer.ahead
             self._answer(self._origin, x)

@@ -5,6 +5,17 @@ import math
 TOLERANCE = 0.25  # of a period: a stamp this far off the grid is still that sample
 
 
+def early(t: float, last: float, period: float) -> str:
+    """What is wrong with a sample at t that came before it was due, after one at `last` (all s)."""
+    if t > last:
+        return (
+            f"the sample at t = {t:g} s is {t - last:.3g} s after the one before; the model is one "
+            f"of samples {period:g} s apart (another rate than the model's is resampled by "
+            "grid.resample)"
+        )
+    return f"the sample at t = {t:g} s came a second time, or time went back"
+
+
 class Grid:
     """Stamps of a run whose sample k is due at start + k·period (s); `k`: the next one's number.
 
@@ -37,7 +48,7 @@ class Grid:
 
     def _fault(self, t: float) -> str:
         if t <= self._last:
-            return f"time went back by {self._last - t:g} s at t = {t:g} s"
+            return early(t, self._last, self.period)
         place = (t - self.start) / self.period
         seen = round(place)
         if abs(place - seen) > TOLERANCE:
@@ -46,5 +57,5 @@ class Grid:
                 f"from when the next one, sample {self.k}, is due; {TOLERANCE:g} are allowed"
             )
         if seen < self.k:
-            return f"sample {seen} of the run came a second time, at t = {t:g} s"
+            return early(t, self._last, self.period)
         return f"sample {self.k} of the run is missing: sample {seen} is next, at t = {t:g} s"

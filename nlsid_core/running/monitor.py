@@ -68,7 +68,7 @@ class Monitor:
         period: float | None = None,
         held: Held | None = None,
     ) -> None:
-        self._hold([model], [policy], [funnel], centre, period, held)
+        self._hold([model], [policy], [funnel], centre, period, [held or Held()])
 
     @classmethod
     def of_several(
@@ -95,10 +95,12 @@ class Monitor:
         stages: Sequence[tuple[VectorField, AnyPolicy, AnyFunnel]],
         *,
         period: float,
+        held: Sequence[Held] = (),
     ) -> "Monitor":
-        """The continuous funnels of a composition, one stage after another.
+        """The continuous funnels of a composition, one stage after another; readings say which.
 
-        None has a hold: what is held into the next stage is covered by no proof.
+        held: of each stage, its errors (none if empty). None has a hold: what is held into the
+        next stage is covered by no proof.
         """
         if not stages:
             raise DataError("no stage to hold the state against")
@@ -106,7 +108,7 @@ class Monitor:
         fields: list[Dynamics] = [field for field, _, _ in stages]
         policies: list[AnyPolicy | None] = [policy for _, policy, _ in stages]
         funnels = [funnel for _, _, funnel in stages]
-        monitor._hold(fields, policies, funnels, Centre.PROFILE, period)
+        monitor._hold(fields, policies, funnels, Centre.PROFILE, period, list(held))
         return monitor
 
     def _hold(
@@ -116,7 +118,7 @@ class Monitor:
         funnels: list[AnyFunnel],
         centre: Centre,
         period: float | None,
-        held: Held | None = None,
+        held: Sequence[Held] = (),
     ) -> None:
         for parts in zip(models, policies, funnels, strict=True):
             refuse_mismatch(*parts)
@@ -249,12 +251,16 @@ class Monitor:
         return said
 
 
-def refuse_mismatch(model: Dynamics, policy: AnyPolicy | None, funnel: AnyFunnel) -> None:
+def refuse_mismatch(model: Dynamics, policy: AnyPolicy | None, funnel: AnyFunnel | None) -> None:
     """CertificateMismatch if the funnel was not made for this policy, or either for this model."""
     digest = files.digest(model.document())
+    if policy is not None and policy.made_for != digest:
+        raise CertificateMismatch("the policy was made for another model")
+    if funnel is None:
+        return
     made_for, its_policy = funnel.made_for
-    if made_for != digest or (policy is not None and policy.made_for != digest):
-        raise CertificateMismatch("policy or funnel was made for another model")
+    if made_for != digest:
+        raise CertificateMismatch("the funnel was made for another model")
     if its_policy is not None and policy is None:
         raise CertificateMismatch("the funnel is about a policy")
     if policy is not None and its_policy != files.digest(policy.document()):
@@ -266,7 +272,7 @@ def _comparison(
     policies: list[Any],
     funnels: list[Any],
     period: float | None,
-    held: Held | None,
+    held: Sequence[Held],
 ) -> Comparison:
     """The arithmetic for funnels of this kind."""
     kinds = {type(funnel) for funnel in funnels}
@@ -275,7 +281,8 @@ def _comparison(
     if kinds == {SampledFunnel} and len(funnels) == 1:
         return SampledComparison(models[0], policies[0], funnels[0])
     if kinds == {ContinuousFunnel}:
-        return ContinuousComparison(models, policies, funnels, period or math.nan, held or Held())
+        held = held or [Held()] * len(funnels)
+        return ContinuousComparison(models, policies, funnels, period or math.nan, held)
     raise DataError("several funnels at once are held against tubes of one model only")
 
 

@@ -22,7 +22,7 @@ from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
-from nlsid_core.running.grid import TOLERANCE
+from nlsid_core.running.grid import TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status
 from nlsid_core.running.stepping import Stepper
 
@@ -49,7 +49,8 @@ class TubeRun:
         self._funnels = tuple(funnels)
         tubes = [tube for funnel in funnels for tube in funnel.tubes]
         self._tubes = tubes
-        self._owner = [i for i, funnel in enumerate(funnels) for _ in funnel.tubes]
+        places = iter(range(len(tubes)))
+        self._rows = [[next(places) for _ in funnel.tubes] for funnel in funnels]
         p, n = len(self._stepper.y), self._stepper.order
         if any(tube.L.shape != (n, p) for tube in tubes):
             raise DataError("the funnel is not one of this model")
@@ -69,6 +70,7 @@ class TubeRun:
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
         }
         self._responses = [funnel.response for funnel in funnels]
+        self._assumed = [r.half_widths.tolist() if r else [] for r in self._responses]
         for i, response in enumerate(self._responses):
             if response is not None and len(response.half_widths) != p:
                 raise DataError("the funnel's response is not one of this model")
@@ -89,7 +91,7 @@ class TubeRun:
 
     def restart(self) -> None:
         """A new run."""
-        self._due = math.nan
+        self._due = self._last = math.nan
         self._begin()
 
     def _begin(self, why: str = "") -> None:
@@ -109,10 +111,10 @@ class TubeRun:
 
         NaN, or None for u, is a sample without a measurement.
         """
-        measured = np.atleast_1d(np.array(y, dtype=np.float64))  # copies: the caller may go on
         if u is None:
             u = np.full(len(self._stepper.u), np.nan)
-        applied = np.atleast_1d(np.array(u, dtype=np.float64))  # with its own
+        measured = np.array(y, dtype=np.float64, ndmin=1)  # copies: the caller may go on with its
+        applied = np.array(u, dtype=np.float64, ndmin=1)  # own
         fault = self._take(t)
         if fault:
             return self._unknown(t, measured, fault)
@@ -143,15 +145,16 @@ class TubeRun:
             return f"stamp is {t}"
         lost = round(late)
         if lost < 0:
-            return f"the sample at t = {t:g} s came a second time, or time went back"
+            return early(t, self._last, self.period)
         if abs(late - lost) > TOLERANCE:
-            self._due = t + self.period
+            self._due, self._last = t + self.period, t
             off = (
                 f"the sample at t = {t:g} s is {late - lost:+.2g} periods of {self.period:g} s off "
                 f"the grid; {TOLERANCE:g} are allowed"
             )
             self._begin(off)
             return f"{off}; a new run starts"
+        self._last = t
         self._due += (lost + 1) * self.period + FOLLOW * (late - lost) * self.period
         if lost:
             missing = "1 sample is" if lost == 1 else f"{lost} samples are"
@@ -161,6 +164,8 @@ class TubeRun:
     def _fault(self, t: float, y: FloatArray, u: FloatArray) -> str:
         if y.shape != (len(self._names),) or u.shape != (len(self._stepper.u),):
             return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
+        if all(map(math.isfinite, (*y.tolist(), *u.tolist()))):
+            return ""
         for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
             for value, signal in zip(values.tolist(), signals, strict=True):
                 if not math.isfinite(value):
@@ -228,8 +233,11 @@ class TubeRun:
             refused = f"{refused}, at t = {t:g} s"
             self._begin(refused)
             return self._unknown(t, y, f"{refused}; a new run starts")
+        self._follow_command(u)
         e = y - outputs[:-1]
         simulated = outputs[-1]
+        deviation = y - simulated
+        level, widths = self._followed() if self._follow else (self._level, self._widths)
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
             if self._single_R is not None:
                 used = self._single_R * (e[:, 0] * e[:, 0])
@@ -238,15 +246,13 @@ class TubeRun:
                 used = np.einsum("ti,tij,tj->t", e, self._R, e) * self._up
                 after[:-1] += np.einsum("tnp,tp->tn", self._L, e)
             self._spent = self._rho * self._spent + used
-        self._x, self._k = after, self._k + 1
-        self._follow_command(u)
-        deviation = y - simulated
-        level, widths = self._followed() if self._follow else (self._level, self._widths)
-        with np.errstate(over="ignore", invalid="ignore"):
             sizes = np.abs(deviation) / widths
-            spent = self._spent / level
+            spent = (self._spent / level).tolist()
+        self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
-        if not (followed and np.isfinite(self._spent).all() and np.isfinite(after).all()):
+        nominal = tuple(simulated.tolist())
+        finite = all(map(math.isfinite, (*self._spent.tolist(), *nominal)))
+        if not (followed and finite and np.isfinite(after).all()):
             what = "the model's state" if followed else "the level that follows the commands"
             reason = f"{what} is not finite at t = {t:g} s"
             self._begin(reason)
@@ -257,13 +263,10 @@ class TubeRun:
                 )  # fmt: skip
                 return [away] * len(self._funnels)
             return self._unknown(t, y, reason)
-        measured, nominal = tuple(y.tolist()), tuple(simulated.tolist())
+        measured = tuple(y.tolist())
         away, innovations = deviation.tolist(), e.tolist()
-        judged = _Judged(t, sizes, spent.tolist(), level, widths, nominal, measured, away)
-        return [
-            self._reading(i, judged, innovations[self._owner.index(i)])
-            for i in range(len(self._funnels))
-        ]
+        judged = _Judged(t, sizes.tolist(), spent, level, widths, nominal, measured, away)
+        return [self._reading(i, judged, innovations[rows[0]]) for i, rows in enumerate(self._rows)]
 
     def _followed(self) -> tuple[FloatArray, FloatArray]:
         """Levels (tubes,) and half-widths (tubes, p) at this sample."""
@@ -273,12 +276,10 @@ class TubeRun:
 
     def _response(self, i: int, away: list[float]) -> tuple[float, str]:
         """The most of what is assumed of funnel i's output error that is used, and of which."""
-        response = self._responses[i]
-        if response is None:
-            return 0.0, ""
         used, worst = 0.0, 0
         g = self._g.get(len(self._tubes) + i)
-        for j, (error, width) in enumerate(zip(away, response.half_widths.tolist(), strict=True)):
+        for j, width in enumerate(self._assumed[i]):  # none without a response
+            error = away[j]
             bound = width * (1.0 if g is None else math.sqrt(max(g[j], TINY))) * (1.0 - ROUNDING)
             part = abs(error) / bound
             if not part <= used:
@@ -311,19 +312,15 @@ class TubeRun:
         """
         t, sizes, spent, level, widths, nominal, measured, away = judged
         alarm = self._alarm(i, innovation)
-        lasting = [
-            j for j, owner in enumerate(self._owner)
-            if owner == i and (self._samples[j] is None or self._k <= (self._samples[j] or 0))
-        ]  # fmt: skip
+        samples, k = self._samples, self._k
+        lasting = [j for j in self._rows[i] if samples[j] is None or k <= (samples[j] or 0)]
         if not lasting:
-            tube = self._tubes[self._owner.index(i)]
             return Reading(
-                t, Status.UNKNOWN, measured=measured,
-                reason=f"the proof covers {tube.samples} samples; they are over", alarm=alarm,
+                t, Status.UNKNOWN, measured=measured, alarm=alarm,
+                reason=f"the proof covers {samples[self._rows[i][0]]} samples; they are over",
             )  # fmt: skip
-        rows = sizes[lasting]
-        place = int(rows.argmax())
-        size = float(rows.flat[place])
+        row = max((sizes[j] for j in lasting), key=max)
+        size = max(row)
         margin = 1.0 - size
         most = max(lasting, key=spent.__getitem__)
         response, exceeded = self._response(i, away)
@@ -343,7 +340,7 @@ class TubeRun:
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
         return Reading(
             t, status, margin, max(spent[most], response), self._exit(i, t, margin),
-            self._names[place % rows.shape[1]], nominal, measured,
+            self._names[row.index(size)], nominal, measured,
             Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i],
             away + innovation, alarm,
             tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
@@ -363,13 +360,13 @@ class TubeRun:
 
 
 class _Judged(NamedTuple):
-    """One sample against all tubes. sizes, widths: (tubes, p); spent, level: of each tube.
+    """One sample against all tubes. sizes, widths: of each tube's outputs; spent, level: of it.
 
     away: the output error.
     """
 
     t: float
-    sizes: FloatArray
+    sizes: list[list[float]]
     spent: list[float]
     level: FloatArray
     widths: FloatArray

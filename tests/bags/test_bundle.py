@@ -107,7 +107,10 @@ def deep(document: Json) -> str:
         (lambda d: json.dumps(d | {"version": 1}), "this nlsid reads version"),
         (lambda d: json.dumps(d | {"files": []}), "'files' should be dict"),
         (lambda d: json.dumps(d | {"files": {"proof": 1}}), "texts by role"),
-        (lambda d: json.dumps(d | {"files": dict.fromkeys(map(str, range(9)), "")}), "at most 8"),
+        (
+            lambda d: json.dumps(d | {"files": dict.fromkeys(map(str, range(402)), "")}),
+            "at most 401",
+        ),
         (lambda _: "[" * 100_000, "not a valid document"),
         (lambda _: "", "not a valid document"),
         (lambda _: " " * (bundles.MAX_BYTES + 1), "one has at most"),

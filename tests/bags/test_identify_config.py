@@ -158,10 +158,13 @@ def test_every_wrong_key_is_said_at_once_with_the_nearest_and_its_unit(tmp_path:
     ("sections", "reason"),
     [
         ({"grid": {"period": 0.2, "max_gap": 0.1}}, r"grid\.max_gap: 0\.1 s is shorter"),
-        ({"grid": {"period": 0.2, "max_gap": 0.3}}, r"monitor\.stale_after: 0\.1 s is not longer"),
+        (
+            {"monitor": {"stale_after": 0.1}, "grid": {"period": 0.2, "max_gap": 0.3}},
+            r"monitor\.stale_after: 0\.1 s is not longer",
+        ),
         ({"funnel": {"horizon": 0.001, "policy": "none"}}, r"funnel\.horizon: .* not one sample"),
         ({"split": {"test": ["a"], "validation": ["a"]}}, "'a' is named for test and for"),
-        ({"inputs": 2}, "identification.model: a LinearClass has one response and one excitation"),
+        ({"inputs": 2}, "identification.model: linear has one response and one excitation"),
         ({"identification": {"model": "monotone", "lags": 2},
           "funnel": {"horizon": 1.0, "profile": [[0, 0], [1, 1]]}}, "a plan is tracked by"),
         ({"identification": {"model": "state_affine", "lags": 2, "input_range": [[0, 1], [0, 2]]}},

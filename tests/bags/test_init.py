@@ -387,3 +387,59 @@ def test_the_slope_that_is_proposed_fits_the_rate_of_a_slow_position(tmp_path: P
                  "-y", "/level:position[name=joint_0]")  # fmt: skip
     assert "looking into 1 bag\n" in said
     assert "take |derivative(2.5 s) of it" in " ".join(said.split())
+
+
+def heater(folder: Path, *, trials: int, kelvin: int = -1, motions: int = 0) -> Path:
+    """Trials of a slow heater, one sample a second, on topics without stamps.
+
+    kelvin: the trial that is recorded in K and not in degC. motions: how many powers there are,
+    taken in turn (0: another one each time).
+    """
+    kind = "std_msgs/msg/Float64"
+    number = standard_types().types[kind]
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        powers = np.random.default_rng(trial % motions + 90 if motions else trial + 90)
+        power = temperature = 0.0
+        with BagWriter(folder / f"run_{trial:02d}") as writer:
+            for k in range(150):
+                power = float(powers.uniform(0.0, 1.0)) if k % 15 == 0 else power
+                temperature += 0.1 * (40.0 * power - temperature)
+                read = 20.0 + temperature + 0.05 * float(rng.standard_normal())
+                read += 273.15 if trial == kelvin else 0.0
+                stamp = START_NS + k * 1_000_000_000
+                for topic, value in (("/power", power), ("/temperature", read)):
+                    data = bytes(standard_types().serialize_cdr(number(value), kind))
+                    writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    return folder
+
+
+SLOW = ("-u", "/power:data", "-y", "/temperature:data")
+
+
+def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Path) -> None:
+    bags, config = heater(tmp_path / "bags", trials=5), tmp_path / "robot.yaml"
+    said = nlsid("init", bags, "--out", config, *SLOW)
+    settings = load_config(config)
+    assert settings.grid.period == 1.0
+    assert settings.monitor.stale_after is None, "the nodes take it from the period"
+    signals = (*settings.signals.excitation, *settings.signals.response)
+    assert [signal.name for signal in signals] == ["power", "temperature"]
+    assert "another unit" not in said
+    assert "run_04" in whole_way(bags, config, tmp_path / "out")
+
+
+def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
+    bags = heater(tmp_path / "bags", trials=5, kelvin=2)
+    said = nlsid("init", bags, "--out", tmp_path / "robot.yaml", *SLOW)
+    assert said.count("is it in another unit") == 1
+    assert "mind: run_02: temperature is 29" in said
+
+
+def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None:
+    """Two motions in turn, ten bags: every fifth by name would test one of them twice as often."""
+    bags, config = heater(tmp_path / "bags", trials=10, motions=2), tmp_path / "robot.yaml"
+    nlsid("init", bags, "--out", config, *SLOW)
+    split = load_config(config).split
+    assert (split.calibration, split.test) == (("run_04", "run_05"), ("run_08", "run_09"))
+    whole_way(bags, config, tmp_path / "out")

@@ -7,13 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bags.chain.joint_bags import JOINTS, _make
 from bags.designs.design import WiredDesign, Wiring
-from bags.monitoring.announcement import Run
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import Watch
-from bags.recordings.message_types import standard_types
-from bags.recordings.writer import BagWriter
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
@@ -22,7 +18,7 @@ from nlsid_core.running.controller import Controller, Limits
 from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
-from tests.continuous_stage import stage
+from tests.continuous_stage import stage, write_run
 
 HELD = 0.02  # s
 LIMITS = Limits(lowest=-20.0, highest=20.0, stop_rate=1.0)
@@ -167,20 +163,25 @@ def test_stages_are_held_one_after_another_and_each_has_its_own_size() -> None:
     """At 0.8 s of the first stage 0.15 m is outside, at the second's start it is inside."""
     first, second = stage(), stage(1.0, 0.3)
     monitor = Monitor.of_stages([first, second], period=0.2)
-    said = []
+    said, stages = [], []
     for k in range(11):
         t = 0.2 * k
         x = np.array([t + (0.15 if 3 < k < 6 else 0.0)])
         policy = first[1] if t < 1.0 - 1e-9 else second[1]
-        said.append(monitor.update(t, x, policy(t, x)).status)
+        reading = monitor.update(t, x, policy(t, x))
+        said.append(reading.status)
+        stages.append(reading.assuming.split(":")[0])
     radius = 0.2 - 0.1 * 0.8
     assert radius < 0.15 < 0.3
     outside = [k for k, status in enumerate(said) if status is Status.OUTSIDE]
     assert outside == [4]
+    assert stages == ["stage 1 of 2"] * 5 + ["stage 2 of 2"] * 6
     assert set(said) == {Status.INSIDE, Status.OUTSIDE}
     controller = Controller.of_stages([first, second], limits=LIMITS, settling=1.0, period=HELD)
+    assert (controller.stage, controller.stages) == (1, 2)
     states, said = driven(controller, Monitor.of_stages([first, second], period=HELD), 0.1)
     assert controller.ended == "the proof is over"
+    assert controller.stage == 2
     assert len(states) == round(2.0 / HELD) + 1
     assert set(said) == {Status.INSIDE}
     with pytest.raises(CertificateMismatch, match="do not follow"):
@@ -212,6 +213,23 @@ def test_a_robot_outside_of_the_start_is_waited_for_and_then_given_up() -> None:
     for k in range(10):
         controller.update(k * HELD, np.array([0.5]))
     assert "not at the start of the plan after 0.1 s" in controller.ended
+
+
+def test_a_policy_of_which_nothing_is_proved_runs_from_anywhere_within_the_limits() -> None:
+    field, policy, _ = stage()
+    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    x, samples = np.array([3.0]), 0
+    while not controller.ended:
+        x = x + HELD * controller.update(samples * HELD, x)
+        samples += 1
+    assert (controller.ended, samples) == ("the proof is over", round(1.0 / HELD) + 1)
+    assert x[0] == pytest.approx(1.0, abs=0.1)
+    controller = Controller.unproved(field, policy, limits=LIMITS, period=HELD)
+    controller.update(0.0, np.array([-9.0]))
+    assert "is not proved: it is beyond" in controller.ended
+    other = VectorField.from_function(lambda x, u: [u[0] - x[0]], 1, 1)
+    with pytest.raises(CertificateMismatch, match="policy was made for another model"):
+        Controller.unproved(other, policy, limits=LIMITS, period=HELD)
 
 
 def test_a_period_is_asked_for_and_parts_have_to_fit() -> None:
@@ -256,22 +274,8 @@ def test_a_recorded_run_is_replayed_from_its_announced_start_bit_for_bit(tmp_pat
         u = controller.update(len(samples) * HELD, x)
         samples.append((x, u))
         x = x + HELD * u
-    start_ns, period_ns, empty = 10**12, round(HELD * 1e9), np.zeros(0)
-    with BagWriter(tmp_path / "bag") as writer:
-
-        def write(topic: str, kind: str, stamp_ns: int, content: object) -> None:
-            data = bytes(standard_types().serialize_cdr(content, kind, little_endian=True))
-            writer.write(topic, kind, data, log_time_ns=stamp_ns, publish_time_ns=stamp_ns)
-
-        text = files.encode(Run(start_ns, design.digest).document()).decode()
-        string = "std_msgs/msg/String"
-        write("/controller/run", string, start_ns, _make(string, text))
-        for k, (state, effort) in enumerate([(samples[0][0], np.ones(1)), *samples]):
-            stamp_ns = start_ns + (k - 1) * period_ns
-            stamp = _make("builtin_interfaces/msg/Time", stamp_ns // 10**9, stamp_ns % 10**9)
-            header = _make("std_msgs/msg/Header", stamp, "")
-            write("/joints", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], state, empty, empty))
-            write("/effort", JOINTS, stamp_ns, _make(JOINTS, header, ["j"], empty, empty, effort))
+    period_ns = round(HELD * 1e9)
+    write_run(tmp_path / "bag", design, samples)
     replayed = [entry.reading for entry in replay_messages(design, tmp_path / "bag")]
     assert replayed[0].reason == "waiting for the controller to announce its start"
     monitor = Monitor(field, policy, funnel, period=HELD)

@@ -18,7 +18,7 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.design import Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
-from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial
+from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
 
 KNOTS = 9
 
@@ -179,6 +179,16 @@ def test_the_same_problem_unspoiled_is_designed(tmp_path: Path) -> None:
     read = FunnelProblem.load(tmp_path / "problem.json")
     assert read.document() == fair()
     assert np.min(read.design().found.proved.margins) > 0
+
+
+def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -> None:
+    problem = {key: fair()[key] for key in ("format", "version", "vector_field", "nominal", "goal")}
+    files.write_document(tmp_path / "problem.json", problem | {"hold": 0.01, "error": [0.001, 0.0]})
+    found = FunnelProblem.load(tmp_path / "problem.json").design()
+    assert (found.claim["hold"], found.claim["error"]) == (0.01, [0.001, 0.0])
+    files.write_document(tmp_path / "problem.json", problem | {"hold": "longest"})
+    with pytest.raises(OptionError, match="hold is 'longest'"):
+        FunnelProblem.load(tmp_path / "problem.json").design()
 
 
 # -- where Python takes what a file cannot hold ------------------------------------------------

@@ -18,7 +18,8 @@ from nlsid_core.models import BlockCascade
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stepping import Stepper
-from tests.core.kernel.tube_claims import MODELS, dataset, design
+from tests import implicit_models
+from tests.core.kernel.tube_claims import MODELS, dataset, design, recorded
 
 EVERY = pytest.mark.parametrize("name", MODELS)
 
@@ -277,6 +278,14 @@ def test_options_that_make_no_sense_are_refused(options: dict[str, Any]) -> None
     model = MODELS["linear"]()
     with pytest.raises(OptionError):
         OutputTube(model, Dataset(dataset(model, 0, 2).trajectories), **options)
+
+
+@pytest.mark.slow
+def test_two_slow_coupled_outputs_have_a_tube() -> None:
+    """With the multipliers as unknowns the solver makes them 10^4 times too large to be decided."""
+    model = recorded(implicit_models.linear(np.array([[0.93, 0.02], [0.04, 0.95]])), (0, 1))
+    made = design_output_tube(model, dataset(model, 0, 3, 300), dataset(model, 100, 3, 300))
+    assert (made.funnel.half_widths < 2.0).all()
 
 
 @pytest.mark.parametrize("room", [1.0, 1e-3, 1e-6])

@@ -12,34 +12,32 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from bags.designs.bundle import Bundle
-from bags.designs.documents import FUNNEL
-from nlsid_core.design import ContinuousTracking
-from nlsid_core.design import design as design_of
-from nlsid_core.dynamics import Nominal
-from nlsid_core.running.monitor import Monitor
+from bags.designs.design import Wiring
+from bags.designs.documents import load_proved
+from nlsid_core.designs import COMPOSITION, FUNNEL
+from nlsid_core.running.comparison import Centre
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.continuous_stage import stage
+from tests.continuous_stage import composed
 from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
 
 pytestmark = ros_test
 PERIOD_NS = 50_000_000
-WIRING = {"response": "/joints:position[0]", "command": "/effort:effort[0]", "period": 0.05}
+RESPONSE, COMMAND = "/joints:position[0]", "/effort:effort[0]"
+WIRING = {"response": RESPONSE, "command": COMMAND, "period": 0.05}
 
 
+@pytest.mark.parametrize("stages", [1, 2])
 def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    stages: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    """Two stages: a composition, of which controller and monitor say which stage is on."""
     use_domain_of_this_run(monkeypatch)
-    field, policy, _ = stage()
-    nominal = Nominal(policy.x, policy.u)
-    design = design_of(ContinuousTracking(field, nominal, goal=np.array([[25.0]]), policy=policy))
-    policy, funnel = design.policy, design.funnel
-    design.save(tmp_path)
+    path, samples = composed(tmp_path) / COMPOSITION, 20 * stages
+    if stages == 1:
+        path = tmp_path / "from 0" / FUNNEL
     commands: dict[int, float] = {}
     margins: dict[int, float] = {}
     said: dict[str, list[str]] = {}
@@ -61,8 +59,7 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
 
     with ExitStack() as stack:
         node, spin_until = stack.enter_context(node_here("test_robot"))
-        latched = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
-        latched.publish(String(data=Bundle.load(tmp_path / FUNNEL).text()))
+        stack.enter_context(process("nlsid_ros.funnel_publisher", funnel=str(path)))
         states = node.create_publisher(JointState, "/joints", qos.STREAM)
         node.create_subscription(JointState, "/effort", hear_command, qos.STREAM)
         node.create_subscription(JointState, "/funnel_monitor/margin", hear_margin, qos.STREAM)
@@ -84,21 +81,22 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
         spin_until(answer.done)
         assert answer.result().success
         first_ns, x, run = time.time_ns(), 0.1, []
-        for k in range(-1, 21):  # the controller's run starts with the second state it hears
+        for k in range(-1, samples + 1):  # the run starts with the second state that is heard
             stamp_ns = first_ns + (k + 1) * PERIOD_NS
             message = JointState(name=["cart"], position=[x])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
             states.publish(message)
-            if k == 20:
+            if k == samples:
                 break
             spin_until(lambda s=stamp_ns: s in commands)  # type: ignore[misc]
             if k >= 0:
                 run.append((x, commands[stamp_ns]))
                 x = x + PERIOD_NS * 1e-9 * commands[stamp_ns]
         spin_until(lambda: has_said("tracking_controller", "idle; stopped: the proof is over"))
-        judged = [first_ns + (k + 1) * PERIOD_NS for k in range(20)]
+        judged = [first_ns + (k + 1) * PERIOD_NS for k in range(samples)]
         spin_until(lambda: set(judged) <= margins.keys())
-    monitor = Monitor(field, policy, funnel, period=0.05)
+    wiring = Wiring.parse([RESPONSE], [COMMAND], 0.05)
+    monitor = load_proved(path, wiring=wiring).design.monitor(Centre.PROFILE)
     readings = [
         monitor.update(k * PERIOD_NS / 1e9, np.array([x]), np.array([u]))
         for k, (x, u) in enumerate(run)
@@ -107,4 +105,8 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
     assert all(margin > 0.3 for margin in (margins[stamp] for stamp in judged))
     assert not any(math.isnan(margins[stamp]) for stamp in judged)
     held = "the policy is applied continuously; here each input is held for 0.05 s"
-    assert set(assuming) == {held}
+    if stages == 1:
+        assert set(assuming) == {held}
+    else:
+        assert set(assuming) == {f"stage {i} of 2: {held}" for i in (1, 2)}
+        assert [has_said("tracking_controller", f"tracking, stage {i} of 2") for i in (1, 2)]

@@ -133,7 +133,7 @@ def test_in_simulated_time_a_slow_simulation_is_not_a_silent_robot(robot: Robot)
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"stale_after": 0.0}, "parameter stale_after (s without a response, or"),
+        ({"stale_after": -0.1}, "parameter stale_after (s without a response, or"),
         ({"stale_after": "soon"}, "parameter stale_after"),
         ({"nominal": "profil"}, "profil"),
     ],

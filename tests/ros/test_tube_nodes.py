@@ -1,7 +1,8 @@
 """A tube around the model's own simulation over DDS: what ends a run, and what begins the next."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,13 +20,14 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
+from nlsid_core.arrays import FloatArray
 from nlsid_core.design import OutputTube, design
 from nlsid_core.models import Signal
 from nlsid_core.progress import silent
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests import implicit_models
-from tests.core.kernel.tube_claims import dataset
+from tests.core.kernel.tube_claims import MODELS, dataset
 from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
 from tests.ros.robot import MONITOR, PERIOD_NS, Robot
 
@@ -83,10 +85,14 @@ def test_an_unknown_command_ends_the_run_and_a_new_one_begins_by_itself(robot: R
     assert math.isnan(margins[stamp_ns(bad + 1)]), "a new run takes samples to begin"
 
 
-def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """A tube that is proved for commands up to 1.5 N, and one command of 1.6 N."""
+@contextmanager
+def sprung(
+    monkeypatch: pytest.MonkeyPatch, folder: Path
+) -> Iterator[tuple[Robot, Callable[[FloatArray, FloatArray], FloatArray]]]:
+    """A robot on a cubic spring, watched by a tube that is proved for commands up to 1.5 N.
+
+    The second sends outputs (N,) and commands (N,) sample by sample and returns the margins (N,).
+    """
     model = replace(
         implicit_models.cubic_spring(),
         y=(Signal("speed", "m/s", "/odom:twist.twist.linear.x"),),
@@ -95,35 +101,60 @@ def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
     )
     box = ((-1.5, 1.5), (-1.0, 1.5))
     made = design(OutputTube(model, dataset(model, 0), dataset(model, 100), box=box))
-    made.save(tmp_path)
-    trial, far = dataset(model, 300, 1, 100).trajectories[0], 50
+    made.save(folder)
     margins: dict[int, float] = {}
 
     def hear(message: JointState) -> None:
         margins[stamp_ns_of(message)] = message.position[message.name.index("margin")]
+
+    def send(y: FloatArray, u: FloatArray) -> FloatArray:
+        stamps = [10**18 + round(k * model.period * 1e9) for k in range(len(y))]
+        for k, stamp in enumerate(stamps):
+            command, state = TwistStamped(), Odometry()
+            for message in (command, state):
+                message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+            command.twist.linear.x, state.twist.twist.linear.x = float(u[k]), float(y[k])
+            robot.command.publish(command)
+            robot.odom.publish(state)
+            spin_until(lambda stamp=stamp: stamp in margins)  # type: ignore[misc]
+        return np.array([margins[stamp] for stamp in stamps])
 
     use_domain_of_this_run(monkeypatch)
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, stale_after=5.0, allow_old_stamps=True) as monitor,
     ):
-        robot = Robot(node, spin_until, tmp_path)
+        robot = Robot(node, spin_until, folder)
         node.create_subscription(JointState, "/funnel_monitor/margin", hear, qos.STREAM)
         robot.ready()
-        stamps = [10**18 + round(t * 1e9) for t in trial.t]
-        for k, stamp in enumerate(stamps):
-            command, state = TwistStamped(), Odometry()
-            for message in (command, state):
-                message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-            command.twist.linear.x = 1.6 if k == far else float(trial.u[k, 0])
-            state.twist.twist.linear.x = float(trial.y[k, 0])
-            robot.command.publish(command)
-            robot.odom.publish(state)
-            spin_until(lambda stamp=stamp: stamp in margins)  # type: ignore[misc]
-        spin_until(lambda: robot.has_said("outside the box in which the tube is proved"))
+        yield robot, send
         stop(monitor)
-    inside = [margins[stamp] >= 0.0 for stamp in stamps]
-    assert all(inside[20:far])
-    assert not any(inside[far : far + 2])
-    assert np.isnan(margins[stamps[far]])
-    assert all(inside[far + 10 :]), "a new run begins inside the box"
+
+
+def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    far = 50
+    trial = dataset(MODELS["implicit_box"](), 300, 1, 100).trajectories[0]
+    u = trial.u[:, 0].copy()
+    u[far] = 1.6
+    with sprung(monkeypatch, tmp_path) as (robot, send):
+        margins = send(trial.y[:, 0], u)
+        robot.spin_until(lambda: robot.has_said("outside the box in which the tube is proved"))
+    assert (margins[20:far] >= 0.0).all()
+    assert not (margins[far : far + 2] >= 0.0).any()
+    assert np.isnan(margins[far])
+    assert (margins[far + 10 :] >= 0.0).all(), "a new run begins inside the box"
+
+
+def test_innovations_that_add_up_on_one_side_warn_while_the_tube_is_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    trial = dataset(MODELS["implicit_box"](), 300, 1, 100).trajectories[0]
+    y = trial.y[:, 0].copy()
+    y[40:] += 0.1  # m/s: within what is assumed
+    with sprung(monkeypatch, tmp_path) as (robot, send):
+        margins = send(y, trial.u[:, 0])
+        robot.spin_until(lambda: robot.has_said("cusum alarm"))
+    assert (margins[20:] >= 0.0).all(), "it changes no verdict"
+    assert not robot.has_said("above the level")

@@ -130,7 +130,7 @@ def decided(
     claim = {"kind": KIND, "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()}}
     if setting.hold is not None:
         claim |= setting.hold.claim()
-        proof |= setting.rate_proof(funnel)
+        proof |= setting.rate_proof(funnel, proved.pieces.basis)
     found = ContinuousSearch(goal, proved, setting.first_guess(), tuple(history), seconds)
     try:
         design = Design.proved(

@@ -80,9 +80,14 @@ class Hold:
 
     def refuse(self, field: VectorField, policy: ContinuousPolicy) -> None:
         """Raise DataError for dynamics and policies that no hold is searched for."""
+        if not field.m:
+            raise DataError("there is no input to hold and none that a wrong state could change")
         inputs = slice(1 + field.n, 1 + field.n + field.m)
         if any((p.exponents[:, inputs] > 1).any() for e in field.pieces for p in e):
-            raise DataError("a hold needs dynamics that are affine in each input")
+            raise DataError(
+                "a hold needs dynamics that are affine in each input: make an input that is not a "
+                "state, which follows its command with a lag"
+            )
         if self.period and field.degree > MAX_DEGREE:
             raise DataError(
                 f"a hold is searched for dynamics of degree up to {MAX_DEGREE}, not "
@@ -151,7 +156,7 @@ def fastest(
     parts, h = [Part(k, 0, 0) for k in range(len(rates))], np.diff(funnel.t)
     for _ in range(MAX_ROUNDS if hold.period else 0):
         steps.widths, before = hold.widths(policy, rates), rates.copy()
-        for batch in _batches(steps, policy, parts):
+        for batch in _batches(steps, policy, parts, proof_basis(steps.program)):
             k = batch.pieces.interval
             for end in (0, 1):
                 shown, _ = _shown(steps, policy, funnel, batch, end)
@@ -162,14 +167,18 @@ def fastest(
 
 
 def prove_rates(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray
-) -> list[Json]:
-    """The rate pieces of a proof; Infeasible if a rate is not shown on some part of time."""
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray,
+    basis: IntArray,
+) -> list[Json]:  # fmt: skip
+    """The rate pieces of a proof with this basis (k, n), in its order.
+
+    Raises Infeasible if a rate is not shown on some part of time.
+    """
     waiting = [Part(k, 0, 0) for k in range(len(rates))]
     found: list[Json] = []
     while waiting:
         written: dict[Part, list[Json | None]] = {}
-        for batch in _batches(steps, policy, waiting):
+        for batch in _batches(steps, policy, waiting, basis):
             batch = _witnessed(steps, policy, funnel, batch, rates)
             c = batch.polynomial(steps, policy, funnel, rates)
             rows = rate_documents(funnel, batch.pieces, c)
@@ -194,7 +203,9 @@ def prove_rates(
     return found
 
 
-def _batches(steps: LSteps, policy: ContinuousPolicy, parts: list[Part]) -> Iterator[_Rates]:
+def _batches(
+    steps: LSteps, policy: ContinuousPolicy, parts: list[Part], basis: IntArray
+) -> Iterator[_Rates]:
     """Every rate on these parts of time, one span of the equations after the other."""
     field, n = steps.field, steps.program.n
     pushing = _pushing(field)
@@ -212,7 +223,7 @@ def _batches(steps: LSteps, policy: ContinuousPolicy, parts: list[Part]) -> Iter
         if entry not in limited or not steps.modes[mode][limited.index(entry)]
     ]
     vertex, entry, sign, mode = np.array(cases).reshape(-1, 4).T
-    basis, limits = proof_basis(steps.program), len(steps.limits)
+    limits = len(steps.limits)
     halves = np.ptp(field.uncertain, axis=1) / 2
     spans = {part: field.span(float(policy.t[part.interval])) for part in parts}
     for span in sorted(set(spans.values())):

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.expansion import Expansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
@@ -77,13 +77,16 @@ class Setting:
         rho = self.rho_final * np.exp(-DECAY * (t[-1] - t) / (t[-1] - t[0]))
         return ContinuousFunnel(self.policy.x, self.P, rho, self.policy.vector_field, "")
 
-    def rate_proof(self, funnel: ContinuousFunnel) -> Json:
-        """The members of a proof about how fast the input changes in the funnel."""
+    def rate_proof(self, funnel: ContinuousFunnel, basis: IntArray) -> Json:
+        """The members of a proof about how fast the input changes in the funnel.
+
+        basis: (k, n) of the proof's pieces.
+        """
         if self.hold is None or not self.hold.period or self.rates is None:
             return {}
         return {
             "rates": self.rates.tolist(),
-            "rate_pieces": prove_rates(self.steps, self.policy, funnel, self.rates),
+            "rate_pieces": prove_rates(self.steps, self.policy, funnel, self.rates, basis),
             "sides": affine(funnel.n).tolist(),
         }
 

@@ -95,6 +95,49 @@ def simulate_boundary(
     return Soundness(starts, violations, largest)
 
 
+def simulate_held(
+    dynamics: Dynamics,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    *,
+    hold: float,
+    error: FloatArray,
+    starts: int,
+    rng: np.random.Generator,
+    knot: int = 0,
+    largest_step: float = 0.01,
+) -> Soundness:
+    """`simulate_boundary` by a computer: samples at most `hold` s apart, measured wrong.
+
+    Samples come after a random time of a half to all of `hold`; each state is off by a random
+    corner of |e_a| ≤ error_a (n,), and the input stays until the next sample.
+    """
+    X = _boundary(funnel, knot, starts, rng, 1.0)
+    low, high = dynamics.uncertain.T
+    worst, t = np.zeros(starts), float(funnel.t[knot])
+    while t < funnel.tf:
+        U = policy(t, X + error * rng.choice([-1.0, 1.0], size=X.shape))
+        apart = min(hold * rng.uniform(0.5, 1.0), funnel.tf - t)
+        for _ in range(count := 1 + int(apart / largest_step)):
+            w = low + (high - low) * rng.integers(0, 2, size=(starts, len(low)))
+            h, span = apart / count, dynamics.span(t)
+            X = _stepped(lambda s, Y: dynamics(s, Y, U, w, span=span), t, X, h)  # noqa: B023
+            t = min(t + h, funnel.tf)
+            worst = np.maximum(worst, funnel.value(t, X))
+    return Soundness(starts, int((worst > 1 + TOLERANCE).sum()), float(np.max(worst)))
+
+
+def _stepped(
+    rate: Callable[[float, FloatArray], FloatArray], t: float, X: FloatArray, h: float
+) -> FloatArray:
+    """X (N, n) h s later: one step of Runge-Kutta of order four."""
+    a = rate(t, X)
+    b = rate(t + h / 2, X + h / 2 * a)
+    c = rate(t + h / 2, X + h / 2 * b)
+    d = rate(t + h, X + h * c)
+    return X + h / 6 * (a + 2 * b + 2 * c + d)
+
+
 def smallest_escape(
     dynamics: Dynamics,
     policy: ContinuousPolicy,
@@ -134,7 +177,7 @@ def follow(
     adversary: bool = False,
 ) -> tuple[FloatArray, FloatArray]:
     """States at the end of interval k from X (N, n) at its start, and the largest V on the way."""
-    t, h = funnel.t[k], (funnel.t[k + 1] - funnel.t[k]) / substeps
+    t, length = funnel.t[k], funnel.t[k + 1] - funnel.t[k]
     span = dynamics.span(float(t))
     x, u, K = (part.control[k] for part in (policy.x, policy.u, policy.K))
     low, high = dynamics.uncertain.T
@@ -142,21 +185,17 @@ def follow(
 
     def rate(s: float, states: FloatArray, w: FloatArray) -> FloatArray:
         inputs = policy.clipped(bernstein(u, s) - (states - bernstein(x, s)) @ bernstein(K, s).T)
-        when = float(t + s * (funnel.t[k + 1] - t))
+        when = float(t + s * length)
         return dynamics(when, states, inputs, w, span=span)
 
     for j in range(substeps):
-        s, half, end = j / substeps, (j + 0.5) / substeps, (j + 1) / substeps
+        s, end = j / substeps, (j + 1) / substeps
         if adversary:
             P = (1 - s) * funnel.P[k] + s * funnel.P[k + 1]
             w = _worst(partial(rate, s, X), (X - bernstein(x, s)) @ P, low, high)
         else:
             w = low + (high - low) * rng.integers(0, 2, size=(len(X), len(low)))
-        a = rate(s, X, w)
-        b = rate(half, X + h / 2 * a, w)
-        c = rate(half, X + h / 2 * b, w)
-        d = rate(end, X + h * c, w)
-        X = X + h / 6 * (a + 2 * b + 2 * c + d)
+        X = _stepped(lambda s, Y: length * rate(s, Y, w), s, X, 1 / substeps)  # noqa: B023
         P = (1 - end) * funnel.P[k] + end * funnel.P[k + 1]
         rho = (1 - end) * funnel.rho[k] + end * funnel.rho[k + 1]
         x_bar = X - bernstein(x, end)
