@@ -5,8 +5,8 @@ python -m benchmarks.nonlinear --data DIR [--json] [NAME ...]
 DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. One ladder of classes
 and methods serves every set, those for one input and output where a set has one of each. What is
 best is chosen, among the models with a proof, by the simulation error over training and validation
-data, each simulated by a model of the other, which no choice of the search has seen; it is fitted
-again to both together, then simulated once over the test data.
+data together, each third simulated by a model of the others, which no choice of the search has
+seen; it is fitted again to all of them, then simulated once over the test data.
 Trials are as the owners divide them; where they name no validation data it is the end, or every
 third, of the training data. Comparators are chosen in the same way. On sets of more than
 `SAMPLES` training samples the choice is made on that many, and fitted to all.
@@ -58,6 +58,7 @@ from nlsid_core.identification.prediction import simulate_trials
 
 SAMPLES = 10_000
 STEPS = 15  # of an iterated search
+FOLDS = 3
 ORDERS = (2, 4)
 PERCENT = "%"
 Simulator = Callable[[Dataset], list[FloatArray]]
@@ -250,6 +251,7 @@ def best_of(
 ) -> Best | None:  # fmt: skip
     """The candidate with the least cross-validated error, fitted again and tested."""
     train, validation, test = data
+    both = Dataset((*train.trajectories, *validation.trajectories))
     found: list[tuple[float, Any, Method]] = []
     for model_class, method in candidates:
         started = time.process_time()
@@ -260,7 +262,7 @@ def best_of(
             model = fitted(few, None, model_class, method, proved=proved).model
             return lambda trials: simulate_trials(model, trials.trajectories)
 
-        error = crossed(case, simulator, train, validation)
+        error = crossed(case, simulator, both)
         if error is None:
             continue
         found.append((error, model_class, method))
@@ -268,7 +270,6 @@ def best_of(
         print(
             f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {describe(model_class)}", flush=True
         )
-    both = Dataset((*train.trajectories, *validation.trajectories))
     for error, model_class, method in sorted(found, key=lambda entry: entry[0]):
         knots = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
         made, chosen_by = (train, validation) if knots else (both, None)
@@ -284,21 +285,38 @@ def best_of(
 
 
 def crossed(
-    case: PublicSet, simulator: Callable[[Dataset], Simulator], *halves: Dataset
+    case: PublicSet, simulator: Callable[[Dataset], Simulator], data: Dataset
 ) -> float | None:
-    """The error over both halves, each simulated by a model of the other's first SAMPLES samples.
+    """The error over all folds, each simulated by a model of the others' first SAMPLES samples.
 
-    None if one of them makes no model.
+    None if some of them make no model.
     """
+    parts = folds(data)
     outputs: list[FloatArray] = []
-    for judged, other in zip(halves, halves[::-1], strict=True):
+    for k, judged in enumerate(parts):
+        others = Dataset(tuple(trial for part in parts[:k] + parts[k + 1 :] for trial in part))
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                outputs += simulator(shortened(other))(judged)
+                outputs += simulator(shortened(others))(judged)
         except (NlsidError, ValueError, np.linalg.LinAlgError) as reason:
             print(f"    no model: {str(reason)[:100]}", flush=True)
             return None
-    return case.score(outputs, Dataset((*halves[0], *halves[1])), skipped=case.skipped)
+    whole = Dataset(tuple(trial for part in parts for trial in part))
+    return case.score(outputs, whole, skipped=case.skipped)
+
+
+def folds(data: Dataset) -> list[Dataset]:
+    """As many equal parts of the samples in their order, cut within a trial where one ends."""
+    ends = np.linspace(0, sum(map(len, data)), FOLDS + 1).round().astype(int)
+    parts: list[list[Trajectory]] = [[] for _ in range(FOLDS)]
+    first = 0
+    for trial in data:
+        for part, start, end in zip(parts, ends, ends[1:], strict=False):
+            rows = slice(max(start - first, 0), min(end - first, len(trial)))
+            if rows.start < rows.stop:
+                part.append(trial.rows(rows, f"{trial.name}[{rows.start}:{rows.stop}]"))
+        first += len(trial)
+    return [Dataset(tuple(part)) for part in parts]
 
 
 def fitted(
@@ -330,16 +348,16 @@ def subspace(case: PublicSet, data: tuple[Dataset, ...]) -> Best | None:
         model = n4sid(few, order)
         return lambda trials: [model.simulate(trial) for trial in trials]
 
+    both = Dataset((*train.trajectories, *validation.trajectories))
     found = []
     for order in ORDERS:
-        error = crossed(case, partial(simulator, order=order), train, validation)
+        error = crossed(case, partial(simulator, order=order), both)
         if error is not None:
             found.append((error, order))
     if not found:
         return None
     error, order = min(found)
-    both = shortened(Dataset((*train, *validation)))
-    outputs = simulator(both, order)(test)
+    outputs = simulator(shortened(both), order)(test)
     return Best(f"order {order}", error, case.score(outputs, test, skipped=case.skipped))
 
 
