@@ -97,7 +97,7 @@ def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
     nlsid("init", f1tenth()[0].parent, "--yes", "--out", tmp_path / "robot.yaml")
     lines = (tmp_path / "robot.yaml").read_text().splitlines()
     keys = [k for k, line in enumerate(lines) if re.match(r" *[a-z_]+:", line)]
-    assert len(keys) > 15
+    assert len(keys) >= 15
     assert not [lines[k] for k in keys if not lines[k - 1].lstrip().startswith("#")]
     assert max(map(len, lines)) < 160
 
