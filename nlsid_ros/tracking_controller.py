@@ -88,7 +88,10 @@ class TrackingController(ManagedNode):
         self._start_at_once = bool(
             declare(self, "start_at_once", False, "begin a run as soon as there is a design")
         )
-        what = "s without a response, or from its stamp to this node's clock: stop"
+        what = (
+            "s without a response, or from its stamp to this node's clock: stop; "
+            "0: 4 periods, at least 0.1"
+        )
         number("stale_after", 0.0, what, between=(0.0, 60.0))
         number("settling", 5.0, "s to wait for a state in the inlet", between=(0.0, 600.0))
         limit = partial(declare, self, tunable=True, several=True)

@@ -334,4 +334,4 @@ def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     )  # fmt: skip
     assert done.returncode == 2
     assert "'plants:=true' is not one of the arguments of closed_loop.launch.xml" in done.stderr
-    assert "stale_after:=0.1" in done.stderr
+    assert "stale_after:=0.0" in done.stderr
