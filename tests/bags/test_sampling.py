@@ -434,7 +434,7 @@ def test_a_command_that_is_unknown_is_not_mended_by_another_of_its_stamp() -> No
         [unknown] = sampler.feed(0, 50 * MS, 2.0)
         assert math.isnan(unknown.u[0])
         assert unknown.missing == f"{U}|hold(0.1 s): not a finite number"
-        sampler.feed(1, 60 * MS, 4.0)
+        sampler.feed(1, 70 * MS, 4.0)
         assert sampler.feed(0, 70 * MS, 2.0) == [Sample(70 * MS, (2.0,), (4.0,))]
 
 
