@@ -10,7 +10,7 @@ import pytest
 from nlsid_core import proofs
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel import Rejected, increments, sampled_funnel, terms, tube
-from nlsid_core.kernel.files import MAX_STATED
+from nlsid_core.kernel.files import MAX_STATED, Terms
 from nlsid_core.kernel.levels import WORDS
 from nlsid_core.kernel.polynomials import CALL, Ring, Work
 from tests.core.kernel.sampled_claims import Scalar
@@ -133,7 +133,7 @@ def test_ends_of_a_box_whose_matrix_does_not_fit_in_memory_are_refused_before_it
 
 def test_derivatives_are_counted_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     """16 equations of 19 000 terms in 35 variables: five million lists, 4 GB of a 3 MB model."""
-    ps = [[((1, 2), Fraction(1)), ((0, 1), Fraction(2))]] * 3
+    ps: list[Terms] = [[((1, 2), Fraction(1)), ((0, 1), Fraction(2))]] * 3
     for missing in (0, 1):
         ring = Ring(2, 64, Work(CALL * 2 * 6 - missing))
         listed: list[int] = []
