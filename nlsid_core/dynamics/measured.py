@@ -41,7 +41,7 @@ class MeasuredPush:
         At most 1/(trials + 1) for a state, if trials can be exchanged; so much for each state.
         """
         trials, n = self.largest.shape
-        return min(n / (trials + 1), 1.0)
+        return float(min(n / (trials + 1), 1.0))
 
     def __str__(self) -> str:
         return (
