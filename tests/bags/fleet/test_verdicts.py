@@ -1,5 +1,6 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
+import math
 import re
 import time
 from collections import Counter
@@ -24,6 +25,7 @@ from bags.monitoring.replay import replay_bag
 from bags.samples import f1tenth
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
+from nlsid_core.running.reading import Reading
 from tests.bags.fleet.storage import drive, web_server
 
 CONFIG = Path("config/f1tenth.yaml")
@@ -59,8 +61,16 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
             alone.verdict, alone.worst.margin, alone.span,
         )  # fmt: skip
         assert row.spent == max(r.assumption for r in alone.judged)
+        most = max(range(len(alone.readings)), key=lambda k: _spent(alone.readings[k]))
+        when = datetime.fromtimestamp(alone.stamps_ns[most] // 10**9, UTC)
+        assert row.spent_when == when.isoformat()
         start = datetime.fromtimestamp(alone.stamps_ns[0] // 10**9, UTC)
         assert row.start == start.isoformat()
+
+
+def _spent(reading: Reading) -> float:
+    """What is judged by the assumption; nothing else comes first."""
+    return reading.assumption if math.isfinite(reading.assumption) else -1.0
 
 
 def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
@@ -134,6 +144,8 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     done = CliRunner().invoke(app, ["fleet", "monitor", pattern, *given])
     assert done.exit_code == 1, done.output
     assert "robot_2/cut: " in done.output
+    worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
+    assert f"nlsid view {worst} --page --funnel {design}" in done.output
     assert "is not an MCAP file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
