@@ -203,7 +203,8 @@ def _say_verdicts(found: FleetVerdict) -> None:
     for row in found.worst:
         table.add_row(
             row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
-            row.spent_when[:19], row.verdict, row.bad_from[:19] or "-", "-" if row.margin is None else f"{row.margin:.3f}",
+            row.spent_when[:19], row.verdict, row.bad_from[:19] or "-",
+            "-" if row.margin is None else f"{row.margin:.3f}",
         )  # fmt: skip
     console.print(table)
     for line in found.ranks:
