@@ -21,6 +21,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from examples import pendulum, planar_quadrotor, satellite_funnel, torque_limited_pendulum
+from examples import satellite as tumbler
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design
 from nlsid_ros import qos
@@ -51,7 +52,8 @@ def satellite() -> FunnelDesign:
 
 def tumbling(x: FloatArray, u: FloatArray) -> FloatArray:
     """ẋ (N, 6) of the satellite."""
-    return np.array([satellite_funnel.dynamics(a, b) for a, b in zip(x, u, strict=True)], float)
+    rates = [tumbler.dynamics(a, b) for a, b in zip(x, u, strict=True)]
+    return np.array(rates, dtype=np.float64)
 
 
 SHIPPED = {

@@ -224,7 +224,7 @@ def _held(
     A smaller copy has its own expansion, which leaves out less and has room for what is held.
     """
     steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
-    widths = np.zeros((len(P) - 1, field.m))
+    widths: FloatArray = np.zeros((len(P) - 1, field.m))
     for scale in SCALES:
         if expansion is not None and scale < 1:
             rho = scale * free
