@@ -105,23 +105,27 @@ def sweep_expanded(
 ) -> Swept:
     """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
 
-    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the time and why.
+    margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the earliest time that
+    was reached, and why it was not passed at first.
     """
     K = len(P)
     rho, caps = np.full(K, rho_final), np.full(K, np.inf)
     ends: dict[int, Ends] = {}
     k, back = K - 2, 0
+    farthest, refusal = K, Infeasible("")
     while k >= 0:
         pair = (section_at(steps, policy, P, k, 0.0), section_at(steps, policy, P, k, 1.0))
         step = _Interval(expansion, steps, policy, P, k, pair, float(rho[k + 1]), margin)
         ratio = rho[k + 1] / rho[k + 2] if k + 2 < K else 1.0
         try:
             rho[k], ends[k] = step.largest(ratio, ends.get(k + 1), float(caps[k]))
-        except Infeasible:
+        except Infeasible as found:
             # What ρ_{k+1} leaves at the end of this interval may be too much for its feedback.
+            if k < farthest:
+                farthest, refusal = k, found
             back += 1
             if back > MAX_BACK:
-                raise
+                raise refusal from None
             caps[k + 1] = BACK * rho[k + 1]
             if k == K - 2:
                 rho[-1] = caps[-1]
