@@ -34,7 +34,7 @@ class OutputTube:
     tube that rests on the innovations' energy over so long (None: none). box: (low, high) of every
     output, then every input, for implicit models whose increments are known on a box only (None:
     the range of the training trials and a tenth of it on both sides). level: "constant", or
-    "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
+    "commands" for one that follows them; "auto" does if that is a fifth narrower over
     `train`.
 
     profile: of a linear model, (s, output) corners of a plan that a policy tracks, for `horizon` s,

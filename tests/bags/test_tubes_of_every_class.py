@@ -1,7 +1,6 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
