@@ -15,7 +15,7 @@ from itertools import pairwise, product
 from math import comb, prod
 
 from . import text
-from .exact import Matrix, combined, definite, transposed
+from .exact import MAX_ORDER, Matrix, combined, definite, transposed
 from .exact import product as times
 from .files import MAX_STATED, Node, Rejected
 from .implicit_models import MEMBERS, ImplicitModel, read_implicit_model
@@ -529,6 +529,8 @@ def _between(G: list[Terms], box: Box, node: Node) -> list[Matrix]:
         raise Rejected(f"{node.where}: ends are for one output whose lags have constant factors")
     if any(sum(e) > 2 for e, _ in q):
         raise Rejected(f"{node.where}: ends are for a leading coefficient of degree 2 at most")
+    if len(box) >= MAX_ORDER:
+        raise Rejected(f"{node.where}: ends are for at most {MAX_ORDER - 1} entries of the box")
     parts = node.members("low high low_weights high_weights")
     ends = parts["low"].number(), parts["high"].number()
     for name, sign, end in (("low", 1, ends[0]), ("high", -1, ends[1])):

@@ -17,6 +17,7 @@ from .signals import Signal
 
 MAX_TERMS = 200
 MAX_FACTORS = 4
+WORDS = ("E", "e", "g", "i", "x", "sum", "change")  # of a formula: names that are these are quoted
 
 
 @dataclass(frozen=True)
@@ -99,5 +100,5 @@ def _square(term: Term, u: tuple[Signal, ...]) -> str:
 
 def _plain(word: str, operators: str) -> str:
     """A name or unit in a formula: quoted if it could be read as a part of it."""
-    own = not word.startswith('"') and any(sign in operators for sign in word)
+    own = not word.startswith('"') and (word in WORDS or any(sign in operators for sign in word))
     return json.dumps(word) if own else word

@@ -25,6 +25,7 @@ from .trials import LONGEST, Recorded, read_trials, shared
 CHAINS = ("tube", "inlet")
 MAX_SAMPLES = 10**6  # times the cube of the states
 STEP = 5_000  # of the work that a claim may take: what a step costs at the least
+ENTRY = 10  # what one of a matrix of curvature costs
 MAX_SIGNALS = 16
 MAX_MONOMIALS = 1000  # of all degrees up to the model's, in one step's variables
 
@@ -271,7 +272,9 @@ def prove_curvature(
 ) -> None:
     """Raise Rejected unless gammas bound the parts of p of degree least, least + 1, and so on."""
     sizes: dict[int, Matrix] = {}
-    for key in set().union(*(q.terms for q in p)):
+    keys = set().union(*(q.terms for q in p))
+    ring.work.spend(ENTRY * len(keys) * len(p) ** 2)
+    for key in keys:
         e = ring.exponents(key)
         c, m = [Fraction(q.terms.get(key, 0), q.denominator) for q in p], sum(e)
         outer = [[a * b for b in c] for a in c]

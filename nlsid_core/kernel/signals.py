@@ -11,11 +11,12 @@ from .files import Node, Rejected
 
 MAX_SIGNALS = 50
 
-_NAME = re.compile(r"(?!e[-+0-9])[A-Za-z_/%°µ][A-Za-z0-9_./*^()\[\]%°µ·²³⁻¹+-]*", re.ASCII)
+# No `speed/1000` and no `speed*1000`: they would be read as other quantities.
+_NAME = re.compile(r"(?!e[-+0-9])[A-Za-z_/%°µ](?:(?<![/-])[0-9.]|[A-Za-z_/()\[\]%°µ-])*", re.ASCII)
 
-# Digits in exponents only: "0.2 m/1000" and "0.2 /1000" would be other numbers.
+# Digits in exponents only: "0.2 m/1000" would be another number, and so would "0.2 sqrt(g)" be.
 _UNIT = re.compile(
-    r"(?![eE][-+^0-9])(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
+    r"(?![eE][-+^0-9]|.*sqrt)(1/)?[A-Za-z_%°µ](?:\^-?[0-9]|[A-Za-z_/.*()%°µ·²³⁻¹])*", re.ASCII
 )
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from . import text
 from .files import Node, Rejected, Terms
-from .polynomials import Polynomial, Ring
+from .polynomials import CALL, Polynomial, Ring
 
 MAX_SHOWN = 2000  # characters of a polynomial in a sentence
 MAX_VARIABLES = 100
@@ -43,6 +43,7 @@ def along(
 ) -> list[Polynomial]:
     """Σ_j ∂p/∂(variable j) direction[j] of each p, with `at` in the variables' place."""
     size = len(direction)
+    ring.work.spend(CALL * size * sum(map(len, ps)))
     found = ring.substituted([derivative(p, j) for p in ps for j in range(size)], at)
     return [ring.dot(found[i : i + size], direction) for i in range(0, size * len(ps), size)]
 

@@ -90,7 +90,8 @@ def test_a_tube_is_not_about_trajectories_that_start_elsewhere() -> None:
 @pytest.mark.parametrize(
     "text",
     ["speed stays within 0.001 m of every trajectory for 9000 samples, margin 0.9; x",
-     "e-9", "e9", "5", "", 'a"b', "m, u", "אב", "x̸", "ｍ", "=", "<= 3", "1/2"],
+     "e-9", "e9", "5", "", 'a"b', "m, u", "אב", "x̸", "ｍ", "=", "<= 3", "1/2", "m/1000", "m*1000",
+     "m/.5", "m-2", "m+1"],
 )  # fmt: skip
 def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
     verdict = decided("tube", tube(name=text), {})
@@ -102,11 +103,15 @@ def test_a_name_cannot_speak_for_the_kernel(text: str) -> None:
 
 
 def test_usual_names_and_units_are_as_they_are() -> None:
-    for usual in ("speed", "pose.x[0]", "/cmd_vel/x", "%", "°", "e"):
+    for usual in ("speed", "pose.x[0]", "/cmd_vel/x", "%", "°", "e", "joint-a", "twist.linear.x"):
         assert name_label(usual) == usual
+    for formula in ("speed^2", "speed²", "speed·2"):
+        assert name_label(formula) == json.dumps(formula)
 
 
-@pytest.mark.parametrize("unit", ["/1000", "m/1000", "*1e3", "E3", "e^3", "x10", "·10³ m", "m 2"])
+@pytest.mark.parametrize(
+    "unit", ["/1000", "m/1000", "*1e3", "E3", "e^3", "x10", "sqrt(g)", "·10³ m", "m 2"]
+)
 def test_a_unit_cannot_change_the_number_before_it(unit: str) -> None:
     """`0.0000009537 /1000` would be a thousandth of what is proved."""
     said = decided("tube", tube(unit=unit), {}).statement
