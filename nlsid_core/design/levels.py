@@ -23,7 +23,7 @@ PROGRAMS = 4  # reweighted ones
 FLOORS = (0.001, 0.01, 0.03, 0.1, 0.3)  # of the largest E: the least constant part of a level
 PAIRS_UP_TO = 4  # inputs of which products of two are tried
 WORTH = 0.8  # of a constant level's mean half-width: a rule that gains less is mostly chance
-FOLDS = 3  # of the design's trials: two give a level, the third tells what it is worth
+FEWEST = 4  # trials of a design: of fewer, a half is one trial and tells nothing of the others
 ADDED = 200  # samples that a round takes into a program, worst first
 ROUNDS = 20
 NEGLIGIBLE = 1e-6  # of the largest summand: a weight that is left out
@@ -56,23 +56,27 @@ def candidates(inputs: Sequence[FloatArray]) -> tuple[Term, ...]:
 def followed(
     energies: Sequence[FloatArray], inputs: Sequence[FloatArray], *, always: bool = False
 ) -> CommandLevel | None:
-    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`).
+    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`) or
+    there are too few trials (`FEWEST`) to tell.
 
     inputs: (settling + N, n_u) of each trial, from its run's start. What is narrower, and how small
-    the constant part may be, is decided by the mean half-width on trials that did not give the
-    weights (`_tried`). √g is 1 on average over the trials. always: not None.
+    the constant part may be, is decided by the mean half-width where each half of the trials is
+    scaled with what the other half gave. √g is 1 on average over the trials. always: not None.
     """
+    if len(energies) < FEWEST and not always:
+        return None
     terms = candidates(inputs)
     G = [_columns(terms, u)[len(u) - len(E) :] for u, E in zip(inputs, energies, strict=True)]
-    folds = _folds(list(zip(energies, G, strict=True)))
+    halves = _halves(list(zip(energies, G, strict=True)))
     rows, parts = [], []
     for r in range(energies[0].shape[1]):
-        tried = {floor: _tried(folds, r, floor) for floor in (1.0, *FLOORS)}
+        tried = {floor: _tried(halves, r, floor) for floor in (1.0, *FLOORS)}
         floor = min(FLOORS if always else tried, key=tried.__getitem__)
         weights = _weights(np.concatenate([E[:, r] for E in energies]), np.concatenate(G), floor)
         if weights is None:
             weights, floor = np.eye(len(terms))[0], 1.0
-        rows.append(_unit(weights, np.concatenate(G)))
+        g = np.concatenate(G) @ weights
+        rows.append(weights / float(np.mean(np.sqrt(g))) ** 2)
         parts.append(tried[floor] / tried[1.0])
     if float(np.mean(parts)) > WORTH and not always:
         return None
@@ -99,38 +103,29 @@ def _columns(terms: Sequence[Term], u: FloatArray) -> FloatArray:
 Block = tuple[FloatArray, FloatArray]  # E (N, rows) and G (N, terms)
 
 
-def _folds(blocks: list[Block]) -> list[Block]:
-    """Every FOLDS-th trial, or of a single one equal parts in time."""
+def _halves(blocks: list[Block]) -> tuple[Block, Block]:
+    """Every second trial, or of a single one its halves in time."""
     if len(blocks) == 1:
-        parts = (np.array_split(values, FOLDS) for values in blocks[0])
-        blocks = list(zip(*parts, strict=True))
-    return [_joined(blocks[k::FOLDS]) for k in range(min(FOLDS, len(blocks)))]
+        E, G = blocks[0]
+        blocks = [(E[: len(E) // 2], G[: len(E) // 2]), (E[len(E) // 2 :], G[len(E) // 2 :])]
+    first, second = (
+        (np.concatenate([E for E, _ in part]), np.concatenate([G for _, G in part]))
+        for part in (blocks[::2], blocks[1::2])
+    )
+    return first, second
 
 
-def _joined(blocks: Sequence[Block]) -> Block:
-    E, G = (np.concatenate(values) for values in zip(*blocks, strict=True))
-    return E, G
-
-
-def _tried(folds: list[Block], row: int, floor: float) -> float:
-    """Mean half-width, over the folds, of one that is scaled with what the others gave; floor 1:
-    constant.
-    """
+def _tried(halves: tuple[Block, Block], row: int, floor: float) -> float:
+    """Mean half-width of one half with the other's weights, over both ways; floor 1: constant."""
     found = []
-    for k, (E, G) in enumerate(folds):
-        others = _joined([*folds[:k], *folds[k + 1 :]])
-        weights = _weights(others[0][:, row], others[1], floor)
+    for (E, G), (E_next, G_next) in (halves, halves[::-1]):
+        weights = _weights(E[:, row], G, floor)
         if weights is None:
             return float("inf")
-        g = G @ weights
-        scale = max(float((E[:, row] / g).max()), float(np.finfo(float).tiny))
+        g = G_next @ weights
+        scale = float((E_next[:, row] / g).max())
         found.append(float(np.mean(np.sqrt(scale * g))))
     return float(np.mean(found))
-
-
-def _unit(weights: FloatArray, G: FloatArray) -> FloatArray:
-    """The weights times a number, so that √g is 1 on average."""
-    return np.asarray(weights / float(np.mean(np.sqrt(G @ weights))) ** 2)
 
 
 def _weights(E: FloatArray, G: FloatArray, floor: float) -> FloatArray | None:
