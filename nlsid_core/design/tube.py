@@ -41,7 +41,7 @@ from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
 
 cp: Any = cvxpy  # its functions are not seen by type checkers
-NOISE_RATIOS = np.logspace(-7, 4, 23)  # process over measurement noise, of a Kalman gain
+NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
 FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
 CLOSE = 1.25  # times the narrowest forecast: of these the tube that is narrowest for ever is taken
