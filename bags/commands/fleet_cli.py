@@ -6,6 +6,7 @@ A command imports what it runs when it is called.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,11 +15,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from nlsid_core.progress import part
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from bags.chain.config import Config
     from bags.fleet.monitor import FleetVerdict
+    from bags.fleet.trials import FleetTrials
+    from bags.fleet.workers import Workers
+    from nlsid_core.progress import Progress
 
 LISTED = 20  # bags that are left out, by name
 ROWS = 30  # of a table on the screen
@@ -38,10 +44,11 @@ ManifestOption = Annotated[
     typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
 ]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Processes that read; 0: this one.")
+    int,
+    typer.Option("--workers", min=0, help="Processes that read, or share a sweep; 0: this one."),
 ]
 SchedulerOption = Annotated[
-    str, typer.Option("--scheduler", help="Of a Dask cluster that reads: tcp://HOST:PORT.")
+    str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
 ]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
@@ -148,6 +155,13 @@ def monitor(
     if table is not None:
         write_parquet(found.rows, table)
     _say_verdicts(found)
+    if found.worst:
+        worst = named[found.worst[0].bag]
+        centre = f" --config {config}" if config else ""
+        console.print(
+            f"look at the first: nlsid view {worst} --page --funnel {funnel}{centre}",
+            soft_wrap=True, markup=False, highlight=False,
+        )  # fmt: skip
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows}
@@ -165,7 +179,8 @@ def _say_verdicts(found: FleetVerdict) -> None:
         f"{len(found.rows)} bags: " + ", ".join(f"{n} {what}" for what, n in counts.most_common())
     )
     for key, title in (("robot", "robots"), ("day", "days")):
-        table = Table(title=f"{title}, those with the most trouble first", title_justify="left")
+        console.print(f"{title}, those with the most trouble first:")
+        table = Table()
         for column in (key, "bags", *counts):
             table.add_column(column, overflow="fold")
         groups = found.by(key)
@@ -181,13 +196,15 @@ def _say_verdicts(found: FleetVerdict) -> None:
         label = f"{10 * k:3d} to {10 * k + 10:3d} %" if k < 10 else "   over 100 %"
         if most:
             console.print(f"{label:>14} {count:6d} {'#' * round(40 * count / most)}")
-    table = Table(title="the ten that spent the most", title_justify="left")
-    for column in ("bag", "spent", "at", "verdict", "bad from", "margin"):
+    console.print("the ten that spent the most, and when:")
+    table = Table()
+    for column in ("bag", "spent", "at", "time (UTC)", "verdict", "bad from", "margin"):
         table.add_column(column, overflow="fold")
     for row in found.worst:
         table.add_row(
-            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s", row.verdict,
-            row.bad_from or "-", "-" if row.margin is None else f"{row.margin:.3f}",
+            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
+            row.spent_when[:19], row.verdict, row.bad_from[:19] or "-",
+            "-" if row.margin is None else f"{row.margin:.3f}",
         )  # fmt: skip
     console.print(table)
     for line in found.ranks:
@@ -199,33 +216,70 @@ def _say_verdicts(found: FleetVerdict) -> None:
 
 
 def identify(
+    out: Console, bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading
+) -> None:
+    """Read by workers, identify at home, say what was left out and why."""
+    from bags.chain.steps import identify_trials
+    from bags.commands import show
+    from bags.commands.progress import progress_bar
+
+    with progress_bar("identifying") as progress:
+        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.5))
+        identified = identify_trials(found.trials, config, out_dir, progress=progress)
+    show.say_identified(out, identified)
+    _say_read(out, found)
+
+
+def select(
     out: Console,
     bags: Sequence[Path],
     config: Config,
     out_dir: Path,
-    *,
-    workers: int,
-    scheduler: str,
-    strict: bool,
-    patience: float,
+    reading: Reading,
+    options: Mapping[str, Sequence[object]] | None,
 ) -> None:
-    """Read by workers, identify at home, say what was left out and why."""
+    """Read by workers, which then try the combinations; say what was left out and why."""
+    from bags.chain.choosing import sections_to_try, select_trials
     from bags.commands import show
     from bags.commands.progress import progress_bar
-    from bags.fleet.bags import named_bags
-    from bags.fleet.trials import identify_fleet
-    from bags.fleet.workers import Workers
 
-    named = named_bags(bags, patience=patience)
-    with progress_bar("identifying") as progress:
-        found = identify_fleet(
-            named, config, out_dir,
-            workers=Workers(workers, scheduler), strict=strict, progress=progress,
-        )  # fmt: skip
-    show.say_identified(out, found.identified)
-    kept = sum(answer.kept for answer in found.answers)
-    read = len(named) - kept - len(found.left_out)
-    out.print(f"{len(named)} bags: {read} read, {kept} known from before", soft_wrap=True)
+    sections_to_try(config, options)
+    with progress_bar("selecting") as progress:
+        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.3))
+        with reading.workers.sharing() as executor:
+            result = select_trials(
+                found.trials, config, out_dir,
+                options=options, executor=executor, progress=progress,
+            )  # fmt: skip
+    show.say_selected(out, result)
+    _say_read(out, found)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Who reads the bags, and how patiently."""
+
+    workers: Workers
+    strict: bool
+    patience: float
+
+
+def _read(
+    bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading, progress: Progress
+) -> FleetTrials:
+    from bags.fleet.bags import named_bags
+    from bags.fleet.trials import read_fleet
+
+    return read_fleet(
+        named_bags(bags, patience=reading.patience), config, out_dir,
+        workers=reading.workers, strict=reading.strict, progress=progress,
+    )  # fmt: skip
+
+
+def _say_read(out: Console, found: FleetTrials) -> None:
+    count, kept = len(found.answers), sum(answer.kept for answer in found.answers)
+    read = sum(not answer.kept and not answer.reason for answer in found.answers)
+    out.print(f"{count} bags: {read} read, {kept} known from before", soft_wrap=True)
     say_left_out(out, found.left_out)
 
 
