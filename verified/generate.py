@@ -138,8 +138,8 @@ class Increments:
         planned = type(about) is dict and "policy" in about and not stable
         roles = "model" if stable else "model policy funnel" if planned else "model funnel"
         (self.model, *others), digests = _bound(about, folder, roles, self.files)
-        if self.model.get("kind") in ("block_cascade", "cell_network"):
-            raise NotCovered(f"models of kind {self.model['kind']} are not covered")
+        if self.model.get("kind") == "block_cascade":
+            raise NotCovered("models of kind block_cascade are not covered")
         strict.held(self.files)
         if any(entry["model"] != digests["model"] for entry in others):
             raise Refused("a file names another model")
@@ -330,6 +330,14 @@ class Writer:
             return self.affine(p, n, model["y_scale"], ranges, beside(model["G"], p))
         if kind == "implicit":
             return self.implicit(model)
+        if kind == "cell_network":
+            maps = to.listed(
+                to.listed(map(self.ends, zip(f["knots"], f["values"], strict=True)))
+                for f in model["maps"]
+            )
+            size = len(model["maps"]) + len(model["start"])
+            known = ([row[:size] for row in model[key]] for key in ("into", "next", "output"))
+            return to.chosen("Cells", 3, maps, *map(self.matrix, known))
         raise NotCovered(f"models of kind {kind} are not covered")
 
     def affine(
@@ -443,7 +451,7 @@ class Writer:
             "Field", *sizes, box, self.nums(field["breaks"]), to.listed(valid), to.listed(spans)
         )
 
-    def ends(self, row: list[Any]) -> str:
+    def ends(self, row: Iterable[Any]) -> str:
         """A row [low, high]."""
         low, high = row
         return self.to.pair(self.num(low), self.num(high))

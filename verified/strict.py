@@ -16,6 +16,7 @@ from typing import Any
 DIGEST = re.compile(r"sha256:[0-9a-f]{64}\Z")
 TRIAL = re.compile(r"(sha256:[0-9a-f]{64})(?:\[([0-9]{1,12}):([0-9]{1,12})\])?\Z")
 DEGREES = 63
+PHASES = 8
 TEXT, STATES, SIGNALS, POWER, SPLITS = 200, 120, 50, 20, 40
 IMPLICIT_STATES, IMPLICIT_INPUTS = 30, 60
 MONOMIALS, TRIALS, TUBES, TERMS, FACTORS = 20_000, 10**5, 8, 200, 4
@@ -168,7 +169,7 @@ def model(document: dict[str, Any]) -> Sizes:
     """A model of a kind that the theorems speak of."""
     kinds = {
         "difference_equation": _difference, "state_affine": _affine,
-        "monotone_equation": _monotone, "implicit": _implicit,
+        "monotone_equation": _monotone, "cell_network": _cells, "implicit": _implicit,
     }  # fmt: skip
     head(document, "model", kinds)
     need(real(document.get("period"), "period") > 0, "the period should be > 0")
@@ -231,6 +232,24 @@ def _monotone(model: dict[str, Any]) -> Sizes:
     for key in ("c", "y_offset"):
         real(model[key], key)
     return Sizes(n, 1, 1, inputs, 0)
+
+
+def _cells(model: dict[str, Any]) -> Sizes:
+    _recorded(model, "maps into next output start start_samples", "equation")
+    p, inputs = len(signals(model["y"], "y")), len(signals(model["u"], "u", 0))
+    maps = listed(model["maps"], "maps", 1, PHASES)
+    for f in maps:
+        members(f, "a map", "knots values")
+        knots = reals(f["knots"], "knots", 2, MOST)
+        increasing(knots, "knots")
+        reals(f["values"], "values", len(knots))
+    m, n = len(maps), len(reals(model["start"], "start", 1, STATES))
+    whole(model["start_samples"], "start_samples", 1, MOST)
+    for j, row in enumerate(matrix(model["into"], "into", m, m + n + inputs + 1)):
+        need(not any(row[j:m]), "into: a map should use earlier ones only")
+    matrix(model["next"], "next", n, m + n + inputs + 1)
+    matrix(model["output"], "output", p, m + n + inputs + 1)
+    return Sizes(n, m, p, inputs, 0)
 
 
 def _implicit(model: dict[str, Any]) -> Sizes:

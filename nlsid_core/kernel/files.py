@@ -119,7 +119,7 @@ class Node:
             numbers: list[int] = entries
         else:
             rationals = [entry.rational() for entry in self.items(least, most)]
-            if any(number.denominator != 1 for number in rationals):
+            if any(type(e) is not int and (type(e) is not str or "/" in e) for e in entries):
                 raise Rejected(f"{self.where} should hold whole numbers only")
             numbers = [number.numerator for number in rationals]
         if not least <= len(numbers) <= most:
