@@ -310,11 +310,8 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
                    for row, whole in zip(stated, like[name], strict=True)]
             for name, stated in zip(("into", "next", "output"), known, strict=True)
         }  # fmt: skip
-        return rows | {
-            "maps": [
-                dict(zip(("knots", "values"), zip(*f, strict=True), strict=True)) for f in maps
-            ]
-        }
+        points = [{"knots": [k for k, _ in f], "values": [v for _, v in f]} for f in maps]
+        return {"maps": points, **rows}
     p, n, scale, ends, rows = terms
     if like["kind"] == "implicit":
         ((_, E),) = rows

@@ -167,7 +167,8 @@ def test_both_kernels_refuse_a_forgery(
 
 MODELS = (
     "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
-    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
+    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
+    "stability/linear", "stability/network",
     "stability/moving_lags", "stability/split", "stability/two_outputs",
 )  # fmt: skip
 
@@ -271,6 +272,8 @@ ASSUMED = "funnel.json tubes 0 assumption"
         ("lasting_split", at("model.json y_scale 0", -1.0), "should be > 0"),
         ("lasting_two_outputs", at("model.json y 1 name", "y0"), "two signals of one name"),
         ("lasting_two_outputs", at("claim.proof.json proof multipliers 0 N", []), "3 to 3 entries"),
+        ("lasting_network", at("model.json into 0 0", 1.0), "a map should use earlier ones only"),
+        ("lasting_network", at("model.json maps 0 knots 0", 5.0), "should increase"),
         ("lasting_implicit_ray", at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
          "a box of a model that needs none"),
         ("engaged", at("policy.json u 0 0", 7.0), "outside the model's range"),
