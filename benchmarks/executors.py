@@ -1,4 +1,4 @@
-"""Which way a stream takes through rclpy: its executor, the EventsExecutor, or our lane.
+"""Which way a stream takes through rclpy: its executor, or the EventsExecutor in its two ways.
 
 python -m benchmarks.executors [--seconds 10] [--json]
 
@@ -19,19 +19,19 @@ from contextlib import suppress
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate
 from nlsid_ros import qos
-from nlsid_ros.lane import Lane
 from nlsid_ros.messages import stamp_ns_of
 
 RATE = 1000  # Hz
 SAMPLE, ANSWER = "/benchmark/sample", "/benchmark/answer"
 PATIENCE = 20.0  # s for a relay to come up, and to end
-WAYS = ("rclpy.spin", "events.spin", "events.spin_once", "lane")
+WAYS = ("rclpy.spin", "events.spin", "events.spin_once")
 
 
 def relay(way: str) -> None:
@@ -45,17 +45,8 @@ def relay(way: str) -> None:
         answer.header.stamp = message.header.stamp
         answers.publish(answer)
 
-    topic = SAMPLE
-    if way == "lane":
-        Lane(node, stays=True).subscribe(JointState, topic, on_sample, qos.STREAM)
-    else:
-        node.create_subscription(JointState, topic, on_sample, qos.STREAM)
-    if way.startswith("events"):
-        from rclpy.experimental.events_executor import EventsExecutor
-
-        executor = EventsExecutor()
-    else:
-        executor = SingleThreadedExecutor()
+    node.create_subscription(JointState, SAMPLE, on_sample, qos.STREAM)
+    executor = EventsExecutor() if way.startswith("events") else SingleThreadedExecutor()
     executor.add_node(node)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         while way == "events.spin_once":
@@ -92,8 +83,8 @@ def measure(way: str, seconds: float, domain: int) -> dict[str, float]:
     def hear(message: JointState) -> None:
         heard.append((time.time_ns() - stamp_ns_of(message)) / 1e6)
 
-    Lane(ear, stays=True).subscribe(JointState, ANSWER, hear, qos.STREAM)
-    executor = SingleThreadedExecutor()
+    ear.create_subscription(JointState, ANSWER, hear, qos.STREAM)
+    executor = EventsExecutor()
     executor.add_node(ear)
     command = [sys.executable, "-m", "benchmarks.executors"]
     relaying = subprocess.Popen([*command, "--relay", way])

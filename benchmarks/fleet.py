@@ -25,7 +25,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import cycle, islice
 from pathlib import Path
@@ -55,6 +55,7 @@ IMAGES, IMAGE_BYTES = 15, 120_000  # of one bag
 OTHERS = 7  # small topics, of ten messages each
 CHUNK = 768 * 2**10
 NOISE = 1e-3  # m/s
+MANY = 1000  # bags, at most, that one worker reads, and that are read by hand
 BLOB = "std_msgs/msg/ByteMultiArray"
 SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
 
@@ -104,7 +105,8 @@ def s3_server(folder: Path, endpoint: str = "") -> Iterator[Any]:
     if endpoint:
         os.environ["AWS_ENDPOINT_URL"] = endpoint
         client = boto3.client("s3")
-        client.create_bucket(Bucket=BUCKET)
+        if BUCKET not in {bucket["Name"] for bucket in client.list_buckets()["Buckets"]}:
+            client.create_bucket(Bucket=BUCKET)
         yield client
         return
     with socket.socket() as probe:
@@ -135,13 +137,17 @@ def s3_server(folder: Path, endpoint: str = "") -> Iterator[Any]:
 
 
 def fill(client: Any, count: int, folder: str, compression: CompressionType) -> int:
-    """Put so many bags below a folder of the bucket; returns their bytes."""
+    """Put so many bags below a folder of the bucket, but those that are there; their bytes."""
+    pages = client.get_paginator("list_objects_v2").paginate(Bucket=BUCKET, Prefix=f"{folder}/")
+    sizes = {found["Key"]: found["Size"] for page in pages for found in page.get("Contents", ())}
     size = 0
     for k, trial in enumerate(islice(cycle(f1tenth()), count)):
-        content = made_bag(trial, k, compression)
         key = f"{folder}/robot_{k % 10}/drive_{k:05d}.mcap"
-        client.put_object(Bucket=BUCKET, Key=key, Body=content)
-        size += len(content)
+        if key not in sizes:
+            content = made_bag(trial, k, compression)
+            client.put_object(Bucket=BUCKET, Key=key, Body=content)
+            sizes[key] = len(content)
+        size += sizes[key]
     return size
 
 
@@ -166,21 +172,58 @@ def digest(answers: Sequence[Answer]) -> str:
     return hashlib.sha256(b"".join(answer.content for answer in answers)).hexdigest()
 
 
-def peak_mb(pattern: str, count: int) -> float:
-    """The most memory of a process that reads so many bags by itself and keeps what they say."""
+@dataclass(frozen=True)
+class Alone:
+    """Of a process that reads bags by itself and keeps what they say: its most memory, its
+    processor time a bag, a digest of the answers, and what was fetched and sent home of all.
+    """
+
+    peak_mb: float
+    cpu_ms: float
+    digest: str = ""
+    requests: int = 0
+    fetched: int = 0
+    sent: int = 0
+
+
+def alone(reader: Callable[[Any, str], None], pattern: str) -> Alone:
+    """`reader`, `_ours` or `_theirs`, in a process of its own."""
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe()
-    reader = context.Process(target=_peak, args=(theirs, pattern, count))
-    reader.start()
-    found: float = mine.recv()
-    reader.join()
+    process = context.Process(target=reader, args=(theirs, pattern))
+    process.start()
+    found: Alone = mine.recv()
+    process.join()
     return found
 
 
-def _peak(pipe: Any, pattern: str, count: int) -> None:
-    bags = dict(islice(named_bags([Path(pattern)]).items(), count))
-    read(bags, 0)
-    pipe.send(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+def _ours(pipe: Any, pattern: str) -> None:
+    bags = named_bags([Path(pattern)])
+    read(dict(islice(bags.items(), 1)), 0)  # so that imports do not count
+    started = time.process_time()
+    answers, _ = read(bags, 0)
+    cpu = time.process_time() - started
+    pipe.send(
+        Alone(
+            resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            1e3 * cpu / len(bags),
+            digest(answers),
+            sum(answer.requests for answer in answers),
+            sum(answer.fetched for answer in answers),
+            sum(len(answer.content) for answer in answers),
+        )
+    )
+
+
+def _theirs(pipe: Any, pattern: str) -> None:
+    urls = [str(path) for path in named_bags([Path(pattern)]).values()][:MANY]
+    _by_hand(urls[0])
+    started = time.process_time()
+    for url in urls:
+        _by_hand(url)
+    cpu = time.process_time() - started
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    pipe.send(Alone(peak, 1e3 * cpu / len(urls)))
 
 
 def cpu_share(bags: Mapping[str, Path]) -> float:
@@ -302,37 +345,42 @@ def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as name, s3_server(Path(name), endpoint) as client:
         folder = Path(name)
         size = fill(client, count, "plain", CompressionType.NONE)
-        few = max(10, count // 10)
+        few = min(100, max(10, count // 10))
         zipped = fill(client, few, "zstd", CompressionType.ZSTD)
         pattern = f"s3://{BUCKET}/plain/*/drive_*.mcap"
         bags = named_bags([Path(pattern)])
         some = dict(islice(bags.items(), few))
-        here, _ = read(bags, 0)
-        rates, same = {}, True
-        for workers in (1, 2):
-            answers, rate = read(bags, workers)
-            rates[str(workers)] = round(rate, 2)
-            same = same and digest(answers) == digest(here)
+        many = dict(islice(bags.items(), MANY))
+        tenth = f"s3://{BUCKET}/plain/robot_0/drive_*.mcap"
+        fewer, here = alone(_ours, tenth), alone(_ours, pattern)
+        _, one = read(many, 1)
+        answers, two = read(bags, 2)
+        same = digest(answers) == here.digest
         compressed, _ = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0)
-        hand = by_hand(bags, 2)
-        part_of_all = f"s3://{BUCKET}/plain/robot_[0-3]/drive_*.mcap"
+        hand, hand_cpu = by_hand(many, 2), alone(_theirs, tenth).cpu_ms
+        part_of_all = f"s3://{BUCKET}/plain/robot_[0-3]/drive_000*.mcap"
         wanted = digest(read(named_bags([Path(part_of_all)]), 0)[0])
         good = killed(part_of_all, wanted, kills, folder)
-        peaks = {str(n): round(peak_mb(pattern, n), 1) for n in (few, count)}
         return {
             "bags": count,
             "megabytes": round(size / 1e6, 1),
-            "bags_per_s": rates,
-            "bytes_fetched_share": round(sum(a.fetched for a in here) / size, 4),
+            "bags_per_s": {"1": round(one, 2), "2": round(two, 2)},
+            "bytes_fetched_share": round(here.fetched / size, 4),
             "bytes_fetched_share_zstd": round(sum(a.fetched for a in compressed) / zipped, 4),
-            "requests_per_bag": round(sum(a.requests for a in here) / count, 2),
-            "bytes_sent_home_per_bag": round(sum(len(a.content) for a in here) / count),
-            "peak_mb": peaks,
+            "requests_per_bag": round(here.requests / count, 2),
+            "bytes_sent_home_per_bag": round(here.sent / count),
+            "peak_mb": {
+                str(-(-count // 10)): round(fewer.peak_mb, 1),
+                str(count): round(here.peak_mb, 1),
+            },
+            "cpu_ms_per_bag": round(here.cpu_ms, 2),
             "bit_equal": same,
             "resumed_after_kills": f"{good} of {kills}",
             "cpu_share_in_reading": round(cpu_share(some), 3),
             "by_hand_bags_per_s": round(hand, 2),
-            "ratio_to_by_hand": round(rates["2"] / hand, 2),
+            "by_hand_cpu_ms_per_bag": round(hand_cpu, 2),
+            "ratio_to_by_hand": round(two / hand, 2),
+            "cpu_ratio_to_by_hand": round(hand_cpu / here.cpu_ms, 2),
         }
 
 

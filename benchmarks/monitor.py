@@ -30,7 +30,8 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -50,7 +51,6 @@ from nlsid_core.models import DifferenceEquation, Signal
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
-from nlsid_ros.lane import Lane
 from nlsid_ros.messages import stamp_ns_of
 
 LAGS, FUNNELS, ROUNDS = 6, 10, 40
@@ -138,10 +138,9 @@ class Ear(Node):
         self.ready = False
         publisher = self.create_publisher(String, f"{SOURCE}/design", qos.DOCUMENT)
         publisher.publish(String(data=bundle_of(design).text()))
-        lane = Lane(self, stays=True)
         for topic, heard in ((MARGIN, self.margins), (ECHO, self.echoes)):
-            lane.subscribe(JointState, topic, partial(self._hear, heard), qos.STREAM)
-        lane.subscribe(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
+            self.create_subscription(JointState, topic, partial(self._hear, heard), qos.STREAM)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._status, qos.EVENTS)
 
     def _hear(self, arrivals: dict[int, int], message: JointState) -> None:
         arrivals[stamp_ns_of(message)] = time.time_ns()
@@ -202,7 +201,7 @@ def live(seconds: float, rate: int) -> dict[str, float]:
     isolate()
     rclpy.init()
     ear = Ear(timing_funnel(rate))
-    executor = SingleThreadedExecutor()
+    executor = EventsExecutor()
     executor.add_node(ear)
     with python(*node("funnel_monitor", source=SOURCE)) as monitor:
         while not ear.ready:
@@ -238,13 +237,13 @@ def live(seconds: float, rate: int) -> dict[str, float]:
     return result
 
 
-def _until_there(ear: Ear, executor: SingleThreadedExecutor) -> None:
+def _until_there(ear: Ear, executor: Executor) -> None:
     while not ear.count_publishers(ECHO):
         executor.spin_once(timeout_sec=0.1)
 
 
 def _run(
-    executor: SingleThreadedExecutor,
+    executor: Executor,
     seconds: float,
     rate: int,
     every_second: Callable[[], None] = lambda: None,

@@ -18,6 +18,7 @@ from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
@@ -30,7 +31,6 @@ from bags.recordings.repair import repair
 from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_ros import qos
-from nlsid_ros.running import ManagedNode, run
 
 TOPICS = [f"/joints_{i}" for i in range(10)]
 TYPE = "sensor_msgs/msg/JointState"
@@ -38,7 +38,7 @@ RATE = 1000  # Hz
 ASKED = {"lost": 0.0, "cpu_percent_of_a_core": 60.0, "worst_loss_s": 1.1}
 
 
-class RosbagsRecorder(ManagedNode):
+class RosbagsRecorder(Node):
     """The least a recorder with rosbags' Writer can do."""
 
     def __init__(self, path: Path) -> None:
@@ -53,7 +53,7 @@ class RosbagsRecorder(ManagedNode):
 
             self.create_subscription(JointState, topic, record, qos.STREAM, raw=True)  # type: ignore[arg-type]
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Write what was buffered."""
         self._writer.close()
 
@@ -163,7 +163,11 @@ def main() -> None:
         send(options.send, options.topics)
         return
     if options.rosbags:
-        run(lambda: RosbagsRecorder(options.rosbags), [])
+        rclpy.init()
+        recorder = RosbagsRecorder(options.rosbags)
+        with suppress(KeyboardInterrupt, ExternalShutdownException):
+            rclpy.spin(recorder)
+        recorder.close()
         return
     isolate()
     with tempfile.TemporaryDirectory() as scratch:

@@ -20,6 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -37,7 +38,6 @@ from nlsid_core.running.reading import Reading, Status
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.documents import DesignSubscription, declare_expected, declare_wiring
-from nlsid_ros.lane import Lane
 from nlsid_ros.message_classes import installed_types, message_class
 from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
@@ -116,7 +116,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals = Lane(self, stays=not self.shares)
+        self._signals: list[Subscription] = []
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
@@ -172,6 +172,8 @@ class FunnelMonitor(ManagedNode):
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
+        for subscription in self._signals:
+            self.destroy_subscription(subscription)
         self._signals.clear()
         self._watch, self._digest = watch, digest
         self._widths, self._names = HalfWidths(design), "\n".join(signal_names(design))
@@ -234,7 +236,9 @@ class FunnelMonitor(ManagedNode):
             self._kinds[topic], self._unfit = kind, ""
             callback = partial(self._on_signal, topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.subscribe(message_class(kind), name, callback, profile)
+            self._signals.append(
+                self.create_subscription(message_class(kind), name, callback, profile)
+            )
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
         """The first of the types that carries the signals; BagError about the last if none does."""

@@ -19,8 +19,7 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -29,7 +28,6 @@ from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
-UNCONFIGURED = "unconfigured"
 CONFIGURE = Transition.TRANSITION_CONFIGURE
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 Arguments = Sequence[str] | None  # of a node that shares its process: `--ros-args ...`
@@ -61,21 +59,20 @@ class ManagedNode(LifecycleNode):
 
     Whatever `start` makes (publishers, subscriptions, services, timers, clients) is destroyed on
     deactivation. With `autostart` it is configured and activated at once. With `arguments` it takes
-    those instead of the process's, and leaves the executor to others after every message.
+    those instead of the process's.
     """
 
     def __init__(self, name: str, arguments: Arguments = None) -> None:
-        shares = arguments is not None
-        super().__init__(name, cli_args=arguments, use_global_arguments=not shares)
-        self.shares = shares
+        super().__init__(name, cli_args=arguments, use_global_arguments=arguments is None)
         self.declared: list[Declared] = []
+        self._is_configured = False
         self.add_on_set_parameters_callback(self._on_parameters)
         self.autostart = bool(
             declare(self, "autostart", True, "start at once; false: wait for a lifecycle manager")
         )
         self._started_itself = False
-        self._change_state = self._service_change_state.callback
-        self._service_change_state.callback = self._on_change_state
+        manager = next(each for each in self.services if each.srv_type is ChangeState)
+        self._change_state, manager.callback = manager.callback, self._on_change_state
         self.failure: Exception | None = None
         self._running = False
         self._made_before: set[object] = set()
@@ -141,7 +138,7 @@ class ManagedNode(LifecycleNode):
             self.trigger_cleanup()
         try:
             done: ChangeState.Response = self._change_state(request, answer)
-        except rclpy_implementation.RCLError as error:
+        except RuntimeError as error:
             self.get_logger().error(f"transition refused: {error}")
             answer.success = False
             return answer
@@ -153,6 +150,7 @@ class ManagedNode(LifecycleNode):
         def configure() -> None:
             self.read_parameters()
             self.prepare()
+            self._is_configured = True
 
         return self._attempt(configure)
 
@@ -174,6 +172,7 @@ class ManagedNode(LifecycleNode):
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: inactive to unconfigured."""
+        self._is_configured = False
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -194,7 +193,7 @@ class ManagedNode(LifecycleNode):
             for each in self.declared:
                 if each.name in asked:
                     asked[each.name] = _as_meant(each, asked[each.name])
-            if self._state_machine.current_state[1] == UNCONFIGURED:
+            if not self._is_configured:
                 return SetParametersResult(successful=True)  # read when it is configured
             if fixed := {d.name for d in self.declared} & asked.keys() - values.keys():
                 raise DataError(f"{', '.join(sorted(fixed))}: read when the node is configured")
@@ -266,18 +265,20 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
-    executor = SingleThreadedExecutor()
+    """By `spin_once`, since the executor's `spin` looks at nothing of Python's until it ends."""
+    executor = EventsExecutor()
     for node in nodes:
         executor.add_node(node)
     asked = threading.Event()
 
     def wait() -> None:
         woken.recv(1)
-        executor.create_task(asked.set)
+        asked.set()
+        executor.wake()
 
     threading.Thread(target=wait, daemon=True).start()
     while not asked.is_set():
-        executor.spin_once()
+        executor.spin_once(timeout_sec=0.1)
 
 
 def _wake_on_signals() -> socket.socket:

@@ -1,21 +1,25 @@
 """Topics asked for by name or pattern, subscribed to as their publishers appear."""
 
+import inspect
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 from bags.recordings.definitions import Definition
 from bags.recordings.quality import Profile, profile_of
 from nlsid_core.errors import NlsidError
 from nlsid_ros import qos
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.polling import Polled, Received, Source
 from nlsid_ros.type_descriptions import TypeDescriptions
 
+Received = Callable[[bytes, dict[str, int]], None]
 UNASKED = {"/rosout", "/parameter_events"}  # every node has them; a pattern does not mean them
 
 
@@ -40,6 +44,44 @@ class Wanted(NamedTuple):
         return "*" in self.topic or "?" in self.topic
 
 
+@dataclass
+class Source:
+    """A topic's serialised messages with what the middleware says of each, as they came.
+
+    They wait, as many as its quality of service keeps, until there is a callback and `take`.
+    """
+
+    depth: int
+    callback: Received | None = None
+    subscription: Subscription | None = None
+    begun: bool = False
+    lost: int = 0
+    _waiting: deque[tuple[bytes, dict[str, int]]] = field(default_factory=deque)
+
+    __signature__ = inspect.signature(lambda _data, _info: None)  # rclpy asks it for how many
+
+    def __call__(self, *arrived: Any) -> None:
+        """Keep a message; rclpy 7.1.6's EventsExecutor hands both parts on as one tuple."""
+        data, info = arrived[0] if len(arrived) == 1 else arrived
+        if len(self._waiting) >= self.depth:
+            self._waiting.popleft()
+            self.lost += 1
+        self._waiting.append((data, info))
+
+    def lose(self, event: Any) -> None:
+        """The middleware lost some; what it calls lost before the first came, nobody sent us."""
+        if self.begun or self._waiting:
+            self.lost += event.total_count_change
+
+    def take(self) -> None:
+        """Call back for every message that waits."""
+        if self.callback is None:
+            return
+        while self._waiting:
+            self.begun = True
+            self.callback(*self._waiting.popleft())
+
+
 class _Undefined(NamedTuple):
     source: Source
     msgtype: str
@@ -58,10 +100,9 @@ class Listener:
 
 @dataclass
 class Subscriptions:
-    """Call `look` now and then. problems: why a topic is not recorded, or not all of it."""
+    """Call `look` and `take` now and then. problems: why a topic is not recorded as wanted."""
 
     node: Node
-    polled: Polled
     types: TypeDescriptions
     listener: Listener
     problems: dict[str, str] = field(default_factory=dict)
@@ -69,6 +110,7 @@ class Subscriptions:
     _waiting: dict[str, str] = field(default_factory=dict)
     _patterns: list[str] = field(default_factory=list)
     _undefined: dict[str, _Undefined] = field(default_factory=dict)
+    _sources: dict[str, Source] = field(default_factory=dict)
     _known: set[str] = field(default_factory=lambda: set(UNASKED))
 
     def want(self, wanted: Iterable[Wanted]) -> None:
@@ -89,6 +131,24 @@ class Subscriptions:
         for topic in list(self._undefined):
             self._define(topic)
 
+    def take(self) -> None:
+        """Hand on what has come."""
+        for topic, source in self._sources.items():
+            source.take()
+            if source.lost:
+                self.listener.lose(topic, source.lost)
+                source.lost = 0
+
+    def drop_all(self) -> None:
+        """Unsubscribe from everything."""
+        for topic in list(self._sources):
+            self._drop(topic)
+
+    def _drop(self, topic: str) -> None:
+        subscription = self._sources.pop(topic).subscription
+        if subscription is not None:
+            self.node.destroy_subscription(subscription)
+
     def _expect(self, topic: str, msgtype: str) -> None:
         self._waiting[topic] = msgtype
         self._known.add(topic)
@@ -104,12 +164,19 @@ class Subscriptions:
         except NlsidError as error:
             self._refuse(topic, error)
             return
-        source = self.polled.subscribe(
+        profile = qos.recording_of([publisher.qos_profile for publisher in publishers])
+        source = self._sources[topic] = Source(profile.depth)
+        source.subscription = self.node.create_subscription(
             kind,
             topic,
-            qos.recording_of([publisher.qos_profile for publisher in publishers]),
-            on_lost=partial(self.listener.lose, topic),
-            on_incompatible=partial(self._warn_of_unheard, topic),
+            source,
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(
+                message_lost=source.lose,
+                incompatible_qos=partial(self._warn_of_unheard, topic),
+                use_default_callbacks=False,
+            ),
+            raw=True,
         )
         self._undefined[topic] = _Undefined(
             source,
@@ -119,7 +186,6 @@ class Subscriptions:
         )
 
     def _define(self, topic: str) -> None:
-        """What has come meanwhile waits in the middleware."""
         found = self._undefined[topic]
         try:
             definition = self.types.find(found.msgtype, found.type_hash)
@@ -127,7 +193,7 @@ class Subscriptions:
                 return
             found.source.callback = self.listener.begin(topic, definition, found.offered)
         except NlsidError as error:
-            self.polled.drop(found.source)
+            self._drop(topic)
             self._refuse(topic, error)
         del self._undefined[topic]
 
@@ -135,7 +201,9 @@ class Subscriptions:
         self.problems[topic] = str(error)
         self.node.get_logger().error(f"{topic} is not recorded: {error}")
 
-    def _warn_of_unheard(self, topic: str, count: int) -> None:
+    def _warn_of_unheard(self, topic: str, event: Any) -> None:
+        """Publishers that offer less than is asked for."""
+        count = event.total_count
         self.warnings[topic] = f"{count} publishers that came later offer less and are not heard"
         self.node.get_logger().warning(
             f"{topic}: {self.warnings[topic]}; start the recorder after them"

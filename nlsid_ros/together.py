@@ -1,8 +1,8 @@
 """Several nodes in one process, on one executor of one thread: `nlsid live ... --one-process`.
 
 Each has its own parameters and remappings, and none keeps the others waiting: proofs are decided
-and models identified in processes of their own, and a monitor's lane does not stay. They end
-together, the controller first, which brings the robot to rest.
+and models identified in processes of their own. They end together, the controller first, which
+brings the robot to rest.
 
 python -m nlsid_ros.together '[["funnel_monitor", "--ros-args", "-p", "stale_after:=0.2"], ...]'
 """

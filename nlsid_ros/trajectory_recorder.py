@@ -2,9 +2,9 @@
 
 Subscribes to each topic once a publisher shows its type and quality of service, and writes the
 messages undecoded: log time is the arrival (of /clock, in simulated time), publish time the header
-stamp. What a killed recorder
-loses is what came after the last chunk, at most `chunk_period` and one POLL. Counts of received and
-lost messages, rate, jitter and gaps go to /diagnostics every second and into the bag's metadata.
+stamp. What a killed recorder loses is what came after the last chunk, at most `chunk_period` and
+one WRITE. Counts of received and lost messages, rate, jitter and gaps go to /diagnostics every
+second and into the bag's metadata.
 `~/start` and `~/stop` begin and end a bag, `~/pause` and `~/resume` leave out a part of one,
 `~/snapshot` saves the last seconds in a bag of their own.
 """
@@ -37,14 +37,13 @@ from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
 from nlsid_ros.message_classes import message_class
-from nlsid_ros.polling import Polled, Received
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
-from nlsid_ros.subscribing import Listener, Subscriptions, Wanted
+from nlsid_ros.subscribing import Listener, Received, Subscriptions, Wanted
 from nlsid_ros.type_descriptions import TypeDescriptions
 
 NAME = "trajectory_recorder"
 DISCOVERY = 0.05  # s: how often the graph is asked for publishers of topics not subscribed yet
-POLL = 0.05  # s between taking what has arrived; waking rclpy costs as much as 100 messages
+WRITE = 0.05  # s between writing what has arrived
 REPORT = 1.0  # s between diagnostics
 EXPERIMENT = "experiment"  # the custom datum that holds what an excitation said it did
 
@@ -141,10 +140,8 @@ class TrajectoryRecorder(ManagedNode):
         if self._at_once:
             self._begin()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
-        self._polled = Polled(self)
         self._topics = Subscriptions(
             self,
-            self._polled,
             TypeDescriptions(self, self._definitions),
             Listener(expect=self._expect, begin=self._begin_topic, lose=self._lose),
         )
@@ -152,7 +149,7 @@ class TrajectoryRecorder(ManagedNode):
         if self._said_by:
             self.create_subscription(String, self._said_by, self._on_experiment, qos.DOCUMENT)
         wall = Clock(clock_type=ClockType.STEADY_TIME)  # also while simulated time stands still
-        self.create_timer(POLL, self._take, clock=wall)
+        self.create_timer(WRITE, self._take, clock=wall)
         self.create_timer(DISCOVERY, self._topics.look, clock=wall)
         self.create_timer(self._period, self._keep_up, clock=wall)
         self.create_timer(REPORT, self._report, clock=wall)
@@ -168,19 +165,19 @@ class TrajectoryRecorder(ManagedNode):
 
     def stop(self) -> None:
         """Take what has arrived, write what came of each topic into the bag, and close it."""
-        self._polled.take()
-        self._polled.drop_all()
+        self._topics.take()
+        self._topics.drop_all()
         if self._recording is not None:
             self._recording.close()
 
     def _take(self) -> None:
-        """Take what has arrived; before there is simulated time it waits in the middleware."""
+        """Write what has arrived; before there is simulated time it waits."""
         if self._simulated:
             simulated_ns = self.get_clock().now().nanoseconds
             if not simulated_ns:
                 return
             self._clock_of_log.look(time.time_ns(), simulated_ns)
-        self._polled.take()
+        self._topics.take()
 
     def _begin(self) -> Path:
         """Open the next bag."""

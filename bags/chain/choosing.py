@@ -1,6 +1,7 @@
 """Which model to take: orders and bases tried on validation bags, methods scored on test bags."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,19 +35,42 @@ def select_bags(
     options: Mapping[str, Sequence[object]] | None = None,
     progress: Progress,
 ) -> Selected:
-    """Every combination of the options; the files of the best by validation error, and select.png.
+    """`select_trials` of bags; BagError for one that cannot be used."""
+    sections_to_try(config, options)
+    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
+    return select_trials(trials, config, out, options=options, progress=progress)
 
-    options: values by name (None: the configuration's `select`). Raises DataError (BagError for
-    bags) before anything is written, Infeasible if no combination has a model.
-    """
+
+def sections_to_try(
+    config: Config, options: Mapping[str, Sequence[object]] | None
+) -> list[IdentificationConfig]:
+    """Every combination of the options (None: the configuration's `select`); DataError if none."""
     options = config.select if options is None else options
     if not options:
         raise DataError(
             "nothing to select from: give the configuration a section `select`, such as "
             "`select: {lags: [1, 2, 3, 4]}`"
         )
-    sections = config.identification.each(options)
-    trials = read_trials(bags, config, progress=part(progress, 0.0, 0.3))
+    return config.identification.each(options)
+
+
+def select_trials(
+    trials: Trials,
+    config: Config,
+    out: Path,
+    *,
+    options: Mapping[str, Sequence[object]] | None = None,
+    executor: Executor | None = None,
+    progress: Progress,
+) -> Selected:
+    """Every combination of the options; the files of the best by validation error, and select.png.
+
+    options: values by name (None: the configuration's `select`). executor: shares them; the files
+    are the same to the last bit. Raises DataError before anything is written, Infeasible if no
+    combination has a model.
+    """
+    tried = config.select if options is None else options
+    sections = sections_to_try(config, tried)
     if trials.validation is None:
         raise DataError(
             "a selection needs validation trials: name bags in split.validation that are neither "
@@ -62,6 +86,7 @@ def select_bags(
         transient=base.transient,
         max_rate=base.max_rate,
         allow_unproved=base.allow_unproved,
+        executor=executor,
         progress=part(progress, 0.3, 0.9),
     )
     if selection.refitted:
@@ -70,7 +95,7 @@ def select_bags(
     identified = write_identified(selection.fit, trials, config, out, progress=progress)
     if report_available():
         picture = out / documents.SELECTION_PLOT
-        write_atomically(picture, draw_selection(selection, options))
+        write_atomically(picture, draw_selection(selection, tried or {}))
         identified = Identified(identified.fit, trials, (*identified.files, picture))
     return Selected(selection, identified)
 

@@ -1,6 +1,7 @@
 """Funnel problems in files: dynamics, nominal, goal and weights as one JSON document."""
 
 import dataclasses
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -101,8 +102,10 @@ class FunnelProblem:
             _array(document, "error", (field.n,), source),
         )
 
-    def design(self, progress: Progress = silent) -> FunnelDesign:
-        """Solve it; OptionError, DataError and Infeasible as `nlsid_core.design.design`."""
+    def design(
+        self, progress: Progress = silent, *, executor: Executor | None = None
+    ) -> FunnelDesign:
+        """Solve it, its L-steps shared by an executor; raises as `nlsid_core.design.design`."""
         problem = ContinuousTracking(
             self.field,
             self.nominal,
@@ -116,7 +119,7 @@ class FunnelProblem:
             hold=self.hold,
             error=self.error,
         )
-        return design(problem, progress=progress)
+        return design(problem, executor=executor, progress=progress)
 
 
 def _array(

@@ -3,11 +3,13 @@
 A command imports what it runs when it is called: `nlsid check` needs no NumPy, `--help` nothing.
 """
 
+from __future__ import annotations
+
 import importlib.util
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -27,6 +29,9 @@ from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
 from nlsid_core import second as second_kernel
 from nlsid_core.errors import DataError, NlsidError
+
+if TYPE_CHECKING:
+    from bags.fleet.workers import Workers
 
 # The matrices of a search are small: threads for them wait for each other, ten times as long.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -153,15 +158,14 @@ def identify(
     from bags.chain.config import load_config
     from bags.chain.steps import identify_bags
     from bags.commands import fleet_cli, show
+    from bags.fleet.workers import Workers
     from bags.recordings.folders import expand_bags
     from bags.recordings.remote import is_url
 
     settings = load_config(config)
     if workers or scheduler or strict or any(map(is_url, bags)):
-        fleet_cli.identify(
-            out, bags, settings, out_dir,
-            workers=workers, scheduler=scheduler, strict=strict, patience=patience,
-        )  # fmt: skip
+        reading = fleet_cli.Reading(Workers(workers, scheduler), strict, patience)
+        fleet_cli.identify(out, bags, settings, out_dir, reading)
         return
     folders = expand_bags(bags)
     with progress_bar("identifying") as progress:
@@ -174,26 +178,37 @@ LagsOption = Annotated[list[int] | None, typer.Option(help="Numbers of lags to t
 
 @app.command()
 def select(
-    bags: BagsArgument, config: ConfigOption, out_dir: OutOption, lags: LagsOption = None
+    bags: BagsArgument,
+    config: ConfigOption,
+    out_dir: OutOption,
+    lags: LagsOption = None,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
+    strict: StrictOption = False,
+    patience: PatienceOption = 60.0,
 ) -> None:
     """Choose orders and bases by the error on validation bags, and write the best model.
 
-    What is tried: the configuration's `select`, or --lags.
+    What is tried: the configuration's `select`, or --lags. Workers read the bags as for `identify`,
+    and then try what is to be tried beside each other.
     """
     from bags.chain.choosing import select_bags
     from bags.chain.config import load_config
-    from bags.commands import show
+    from bags.commands import fleet_cli, show
+    from bags.fleet.workers import Workers
     from bags.recordings.folders import expand_bags
+    from bags.recordings.remote import is_url
 
     settings = load_config(config)
-    folders = expand_bags(bags)
     options = {"lags": lags} if lags else None
+    if workers or scheduler or strict or any(map(is_url, bags)):
+        reading = fleet_cli.Reading(Workers(workers, scheduler), strict, patience)
+        fleet_cli.select(out, bags, settings, out_dir, reading, options)
+        return
+    folders = expand_bags(bags)
     with progress_bar("selecting") as progress:
         result = select_bags(folders, settings, out_dir, options=options, progress=progress)
-    out.print(show.selection_table(result.selection))
-    if result.selection.refitted:
-        out.print("the chosen class, fitted to training and validation trials together:")
-    show.say_identified(out, result.identified)
+    show.say_selected(out, result)
 
 
 @app.command()
@@ -247,17 +262,21 @@ def funnel(
             min=0.0, help="Status 1 if a half-width is more than this part of its output's range."
         ),
     ] = None,
+    workers: WorkersOption = 0,
+    scheduler: SchedulerOption = "",
 ) -> None:
     """Design a proved funnel: funnel.json, funnel.proof.json, and policy.json if it has a policy.
 
     Around the simulation of an identified model of any class, and a plan of a linear one (--model,
     --config with a profile), or a trajectory of given dynamics (--problem). Of an identified model
-    it says what it catches: faults put into the test trials, through the monitor.
+    it says what it catches: faults put into the test trials, through the monitor. --workers and
+    --scheduler share the L-steps of a --problem of shape P.
     """
     from bags.chain.config import load_config
     from bags.chain.steps import design_funnel_files, what_a_funnel_catches
     from bags.commands import show
     from bags.designs import documents
+    from bags.fleet.workers import Workers
     from bags.pictures.report import write_catching
 
     if problem is not None:
@@ -265,8 +284,10 @@ def funnel(
             raise typer.BadParameter(
                 "--problem stands alone; it takes no --model, no --config and no --require"
             )
-        _funnel_around_trajectory(problem, out_dir)
+        _funnel_around_trajectory(problem, out_dir, Workers(workers, scheduler))
         return
+    if workers or scheduler:
+        raise typer.BadParameter("--workers and --scheduler share the search of a --problem")
     if model is None or config is None:
         raise typer.BadParameter("give --model and --config, or --problem")
     settings = load_config(config)
@@ -597,13 +618,14 @@ def demo(
         raise typer.Exit(1)
 
 
-def _funnel_around_trajectory(problem: Path, out_dir: Path) -> None:
+def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) -> None:
     from bags.chain.problems import FunnelProblem
     from bags.designs import documents
     from bags.pictures.report import report_available
 
-    with progress_bar("designing") as progress:
-        design = FunnelProblem.load(problem).design(progress)
+    given = FunnelProblem.load(problem)
+    with progress_bar("designing") as progress, workers.sharing() as executor:
+        design = given.design(progress, executor=executor)
     for path in design.save(out_dir):
         out.print(f"wrote {path}", soft_wrap=True)
     if report_available():

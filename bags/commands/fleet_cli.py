@@ -6,6 +6,7 @@ A command imports what it runs when it is called.
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,11 +15,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from nlsid_core.progress import part
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from bags.chain.config import Config
     from bags.fleet.monitor import FleetVerdict
+    from bags.fleet.trials import FleetTrials
+    from bags.fleet.workers import Workers
+    from nlsid_core.progress import Progress
 
 LISTED = 20  # bags that are left out, by name
 ROWS = 30  # of a table on the screen
@@ -38,10 +44,11 @@ ManifestOption = Annotated[
     typer.Option(help="A file that keeps what is read: the next run reads only what is new."),
 ]
 WorkersOption = Annotated[
-    int, typer.Option("--workers", min=0, help="Processes that read; 0: this one.")
+    int,
+    typer.Option("--workers", min=0, help="Processes that read, or share a sweep; 0: this one."),
 ]
 SchedulerOption = Annotated[
-    str, typer.Option("--scheduler", help="Of a Dask cluster that reads: tcp://HOST:PORT.")
+    str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
 ]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
@@ -199,33 +206,70 @@ def _say_verdicts(found: FleetVerdict) -> None:
 
 
 def identify(
+    out: Console, bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading
+) -> None:
+    """Read by workers, identify at home, say what was left out and why."""
+    from bags.chain.steps import identify_trials
+    from bags.commands import show
+    from bags.commands.progress import progress_bar
+
+    with progress_bar("identifying") as progress:
+        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.5))
+        identified = identify_trials(found.trials, config, out_dir, progress=progress)
+    show.say_identified(out, identified)
+    _say_read(out, found)
+
+
+def select(
     out: Console,
     bags: Sequence[Path],
     config: Config,
     out_dir: Path,
-    *,
-    workers: int,
-    scheduler: str,
-    strict: bool,
-    patience: float,
+    reading: Reading,
+    options: Mapping[str, Sequence[object]] | None,
 ) -> None:
-    """Read by workers, identify at home, say what was left out and why."""
+    """Read by workers, which then try the combinations; say what was left out and why."""
+    from bags.chain.choosing import sections_to_try, select_trials
     from bags.commands import show
     from bags.commands.progress import progress_bar
-    from bags.fleet.bags import named_bags
-    from bags.fleet.trials import identify_fleet
-    from bags.fleet.workers import Workers
 
-    named = named_bags(bags, patience=patience)
-    with progress_bar("identifying") as progress:
-        found = identify_fleet(
-            named, config, out_dir,
-            workers=Workers(workers, scheduler), strict=strict, progress=progress,
-        )  # fmt: skip
-    show.say_identified(out, found.identified)
-    kept = sum(answer.kept for answer in found.answers)
-    read = len(named) - kept - len(found.left_out)
-    out.print(f"{len(named)} bags: {read} read, {kept} known from before", soft_wrap=True)
+    sections_to_try(config, options)
+    with progress_bar("selecting") as progress:
+        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.3))
+        with reading.workers.sharing() as executor:
+            result = select_trials(
+                found.trials, config, out_dir,
+                options=options, executor=executor, progress=progress,
+            )  # fmt: skip
+    show.say_selected(out, result)
+    _say_read(out, found)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Who reads the bags, and how patiently."""
+
+    workers: Workers
+    strict: bool
+    patience: float
+
+
+def _read(
+    bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading, progress: Progress
+) -> FleetTrials:
+    from bags.fleet.bags import named_bags
+    from bags.fleet.trials import read_fleet
+
+    return read_fleet(
+        named_bags(bags, patience=reading.patience), config, out_dir,
+        workers=reading.workers, strict=reading.strict, progress=progress,
+    )  # fmt: skip
+
+
+def _say_read(out: Console, found: FleetTrials) -> None:
+    count, kept = len(found.answers), sum(answer.kept for answer in found.answers)
+    read = sum(not answer.kept and not answer.reason for answer in found.answers)
+    out.print(f"{count} bags: {read} read, {kept} known from before", soft_wrap=True)
     say_left_out(out, found.left_out)
 
 

@@ -9,7 +9,7 @@ from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
 
-from bags.chain.choosing import Compared
+from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
@@ -49,6 +49,14 @@ def say_identified(console: Console, result: Identified) -> None:
         console.print(f"wrote {file}", soft_wrap=True)
     if not report_available():
         console.print(f"no {documents.REPORT}: install matplotlib (pip install 'nlsid[report]')")
+
+
+def say_selected(console: Console, result: Selected) -> None:
+    """Everything that was tried, and what is to be known about the chosen model."""
+    console.print(selection_table(result.selection))
+    if result.selection.refitted:
+        console.print("the chosen class, fitted to training and validation trials together:")
+    say_identified(console, result.identified)
 
 
 def methods_table(fit: Fit[Model], test: Dataset) -> Table:

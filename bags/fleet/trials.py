@@ -12,7 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from bags.chain.config import Config
-from bags.chain.steps import Identified, by_use, identify_trials, read_signals_of
+from bags.chain.steps import Trials, by_use, read_signals_of
 from bags.chain.training import decoded, encoded
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
@@ -20,7 +20,7 @@ from bags.fleet.workers import Workers
 from bags.recordings.definitions import read_definitions, texts_of
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
-from nlsid_core.progress import Progress, part, silent
+from nlsid_core.progress import Progress, silent
 
 MANIFEST = "fleet.sqlite"
 
@@ -44,15 +44,15 @@ class ReadTrials:
 
 
 @dataclass(frozen=True, eq=False)
-class FleetIdentified:
-    """What was identified, every bag's answer, and those that are left out, with the reason."""
+class FleetTrials:
+    """The trials by use, every bag's answer, and those that are left out, with the reason."""
 
-    identified: Identified
+    trials: Trials
     answers: tuple[Answer, ...]
     left_out: dict[str, str]
 
 
-def identify_fleet(
+def read_fleet(
     bags: Mapping[str, Path],
     config: Config,
     out: Path,
@@ -60,15 +60,14 @@ def identify_fleet(
     workers: Workers,
     strict: bool = False,
     progress: Progress = silent,
-) -> FleetIdentified:
-    """`identify_bags` of bags by name, read by workers; what they read is kept in OUT/fleet.sqlite.
+) -> FleetTrials:
+    """`read_trials` of bags by name, by workers; what they read is kept in OUT/fleet.sqlite.
 
     A bag that cannot be read or used is left out, and so is a second copy of one recording; with
-    `strict` the first of them raises. Raises DataError if no bag is left, and as `identify_bags`.
+    `strict` the first of them raises. Raises DataError if no bag is left, or for the split.
     """
-    reading = part(progress, 0.0, 0.5)
     with Manifest(out / MANIFEST) as manifest:
-        answers = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=reading)
+        answers = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
     left_out = {answer.name: answer.reason for answer in answers if answer.reason}
     trials = usable_trials(answers, left_out)
     if strict and left_out:
@@ -77,10 +76,7 @@ def identify_fleet(
     if not trials:
         some = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
         raise DataError(f"none of {len(bags)} bags can be used: {some}")
-    found = by_use(Dataset(tuple(trials)), config)
-    return FleetIdentified(
-        identify_trials(found, config, out, progress=progress), tuple(answers), left_out
-    )
+    return FleetTrials(by_use(Dataset(tuple(trials)), config), tuple(answers), left_out)
 
 
 def usable_trials(answers: list[Answer], left_out: dict[str, str]) -> list[Trajectory]:

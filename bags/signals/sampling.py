@@ -297,6 +297,8 @@ class _Kept:
         self.first_ns: int | None = None
 
     def add(self, stamp_ns: int, value: float) -> None:
+        if self.stamps[-1:] == [stamp_ns] and not math.isfinite(self.values[-1]):
+            return  # another value does not tell which of the two was acted on
         if self.lag_ns:
             if stamp_ns < self.newest_ns:
                 return  # what it made of later values is given already

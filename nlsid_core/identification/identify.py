@@ -4,9 +4,10 @@
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Generic
 
 import numpy as np
@@ -106,35 +107,24 @@ def select(
     No class sees `validation` before it is judged by it. A class that does not fit the data or
     (unless `allow_unproved`) has no proof counts as infinitely bad. The chosen class is identified
     once more on both datasets together, or, where it makes choices by validation trials, on `train`
-    with these. Options are those of `identify`. Raises Infeasible if
+    with these. executor: tries the classes beside each other; what it finds is the same to the last
+    bit, in the order of `classes`. The other options are those of `identify`. Raises Infeasible if
     no class has a model.
     """
+    fitted = partial(
+        identify,
+        method=method,
+        comparators=(),
+        test=test,
+        transient=transient,
+        max_rate=max_rate,
+        allow_unproved=allow_unproved,
+    )
+    one = partial(_tried, fitted, train, validation)
     tried: list[Tried[M]] = []
-
-    def fitted(data: Dataset, model_class: ModelClass[M], judged: Dataset | None) -> Fit[M]:
-        return identify(
-            data,
-            model_class,
-            method=method,
-            comparators=(),
-            validation=judged,
-            test=test,
-            transient=transient,
-            max_rate=max_rate,
-            allow_unproved=allow_unproved,
-            executor=executor,
-        )
-
-    for number, model_class in enumerate(classes):
-        progress(describe(model_class), number / (len(classes) + 1))
-        try:
-            fit = fitted(train, model_class, None)
-        except (DataError, SolverError) as refusal:
-            tried.append(Tried(model_class, None, str(refusal)))
-        else:
-            judged = {fit.method.name: fit.chosen.error_percent(validation)}
-            errors = {"train": fit.errors["train"], "validation": judged, **fit.errors}
-            tried.append(Tried(model_class, replace(fit, errors=errors)))
+    for entry in map(one, classes) if executor is None else executor.map(one, classes):
+        tried.append(entry)
+        progress(describe(entry.model_class), len(tried) / (len(classes) + 1))
     if not tried:
         raise DataError("no model class to select from")
     best = min(tried, key=lambda entry: entry.error("validation"))
@@ -145,10 +135,10 @@ def select(
     refit, chooses = best.fit, OFFERS[type(best.model_class)].needs_validation
     try:
         if chooses:
-            refit = fitted(train, best.model_class, validation)
+            refit = fitted(train, best.model_class, validation=validation)
         else:
             both = Dataset((*train.trajectories, *validation.trajectories))
-            refit = fitted(both, best.model_class, None)
+            refit = fitted(both, best.model_class)
     except (DataError, SolverError) as refusal:
         log.warning("not fitted with the validation trials: %s", refusal)
     progress("done", 1.0)
@@ -167,6 +157,22 @@ class Tried(Generic[M]):
     def error(self, dataset: str) -> float:
         """The chosen method's error in %; infinite where there is no fit."""
         return float("inf") if self.fit is None else self.fit.errors[dataset][self.fit.method.name]
+
+
+def _tried(
+    fitted: Callable[[Dataset, ModelClass[M]], Fit[M]],
+    train: Dataset,
+    validation: Dataset,
+    model_class: ModelClass[M],
+) -> Tried[M]:
+    """The class fitted to `train` and judged by `validation`, or why there is no fit."""
+    try:
+        fit = fitted(train, model_class)
+    except (DataError, SolverError) as refusal:
+        return Tried(model_class, None, str(refusal))
+    judged = {fit.method.name: fit.chosen.error_percent(validation)}
+    errors = {"train": fit.errors["train"], "validation": judged, **fit.errors}
+    return Tried(model_class, replace(fit, errors=errors))
 
 
 @dataclass(frozen=True, eq=False)

@@ -424,6 +424,20 @@ def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:
     assert (sampler.late_responses, sampler.duplicate_responses) == (1, 1)
 
 
+def test_a_command_that_is_unknown_is_not_mended_by_another_of_its_stamp() -> None:
+    for at_once in ((math.nan, 1.0), (1.0, math.nan)):
+        sampler = Sampler([Y], [f"{U}|hold(0.1 s)"], period=0.05)
+        sampler.feed(1, 0, 3.0)
+        sampler.feed(0, 0, 0.0)
+        for value in at_once:
+            sampler.feed(1, 50 * MS, value)
+        [unknown] = sampler.feed(0, 50 * MS, 2.0)
+        assert math.isnan(unknown.u[0])
+        assert unknown.missing == f"{U}|hold(0.1 s): not a finite number"
+        sampler.feed(1, 70 * MS, 4.0)
+        assert sampler.feed(0, 70 * MS, 2.0) == [Sample(70 * MS, (2.0,), (4.0,))]
+
+
 def test_a_configuration_is_written_into_the_paths_unless_they_say_otherwise() -> None:
     options: dict[str, Any] = {"clock": "log", "resample": "last", "hold": 0.5, "max_gap": 0.1}
     assert sampled_path(Y, **options, response=True) == f"{Y}|clock(log)|hold(0.1 s)"

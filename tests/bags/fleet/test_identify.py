@@ -1,23 +1,25 @@
 """Many bags give what one machine's run gives, whoever reads them, and a bad one ends nothing."""
 
+import json
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
 
-from bags.chain.config import load_config
-from bags.chain.steps import identify_bags
+from bags.chain.config import Config, load_config
+from bags.chain.steps import identify_bags, identify_trials
 from bags.designs import documents
 from bags.fleet.bags import named_bags, robot_of
 from bags.fleet.check import CheckBag
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
-from bags.fleet.trials import MANIFEST, ReadTrials, identify_fleet
+from bags.fleet.trials import MANIFEST, FleetTrials, ReadTrials, read_fleet
 from bags.fleet.workers import Workers
 from bags.recordings.definitions import standard_definition
 from bags.samples import f1tenth
@@ -53,11 +55,27 @@ def fleet(folder: Path, count: int = 6) -> Path:
     return folder
 
 
-def run(bags: Path, config: Path, out: Path, workers: Workers = Workers(), strict: bool = False):  # type: ignore[no-untyped-def]  # noqa: B008
-    return identify_fleet(
-        named_bags([bags]), load_config(config), out,
-        workers=workers, strict=strict,
-    )  # fmt: skip
+def run(
+    bags: Path,
+    config: Path,
+    out: Path,
+    workers: Workers = Workers(),  # noqa: B008
+    strict: bool = False,
+) -> FleetTrials:
+    return identified(named_bags([bags]), load_config(config), out, workers, strict)
+
+
+def identified(
+    bags: Mapping[str, Path],
+    config: Config,
+    out: Path,
+    workers: Workers = Workers(),  # noqa: B008
+    strict: bool = False,
+) -> FleetTrials:
+    """What was read; the model of it is in `out`."""
+    found = read_fleet(bags, config, out, workers=workers, strict=strict)
+    identify_trials(found.trials, config, out, progress=silent)
+    return found
 
 
 def contents(out: Path) -> list[bytes]:
@@ -87,10 +105,7 @@ def test_a_fleet_of_one_folder_gives_what_identify_gives(tmp_path: Path) -> None
     config = load_config(Path("config/f1tenth.yaml"))
     bags = f1tenth()
     identify_bags(bags, config, tmp_path / "alone", progress=silent)
-    identify_fleet(
-        {path.name: path for path in bags}, config, tmp_path / "fleet",
-        workers=Workers(),
-    )  # fmt: skip
+    identified({path.name: path for path in bags}, config, tmp_path / "fleet")
     assert contents(tmp_path / "alone") == contents(tmp_path / "fleet")
 
 
@@ -102,9 +117,11 @@ def test_storage_gives_the_same_numbers_and_digests_of_its_own(
         bucket.put(file, str(file.relative_to(folder)))
     here = run(folder / "*" / "*.mcap", config, tmp_path / "here")
     there = run(Path(f"s3://{bucket.name}/*/*.mcap"), config, tmp_path / "there", Workers(1))
-    models = [str(found.identified.fit.model.document()["a"]) for found in (here, there)]
+    models = [
+        json.loads((tmp_path / out / documents.MODEL).read_text())["a"] for out in ("here", "there")
+    ]
     assert models[0] == models[1]
-    digests = [[trial.digest for trial in found.identified.train] for found in (here, there)]
+    digests = [[trial.digest for trial in found.trials.train] for found in (here, there)]
     assert not set(digests[0]) & set(digests[1])
     assert all(answer.requests for answer in there.answers)
 
@@ -133,7 +150,7 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
     assert "truncated or unfinished" in found.left_out["robot_0/cut"]
     assert "is not an MCAP file" in found.left_out["robot_0/text"]
     assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
-    assert len(found.identified.train) + len(found.identified.test) == 6
+    assert len(found.trials.train) + len(found.trials.test) == 6
     with pytest.raises(BagError, match=r"cut\.mcap"):
         run(folder / "*" / "*.mcap", config, tmp_path / "strict", strict=True)
 
@@ -249,12 +266,10 @@ def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: 
 
     with web_server(tmp_path / "web", fault) as url:
         urls = [Path(f"{url}/drive_{k}.mcap") for k in range(5)]
-        found = identify_fleet(
-            named_bags(urls, patience=2.0), load_config(config), tmp_path / "out", workers=Workers()
-        )
+        found = identified(named_bags(urls, patience=2.0), load_config(config), tmp_path / "out")
     assert set(found.left_out) == {"drive_1", "drive_2", "drive_4"}
     assert "2 s were lost with failing requests" in found.left_out["drive_1"]
     assert found.left_out["drive_2"] == "it is not there any more"
     assert "twist.twist" in found.left_out["drive_4"]
-    used = (*found.identified.train, *found.identified.test)
+    used = (*found.trials.train, *found.trials.test)
     assert sorted(trial.name for trial in used) == ["drive_0", "drive_3"]
