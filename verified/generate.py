@@ -641,7 +641,9 @@ def asked(checker: Path, terms: dict[str, Any]) -> int:
     with tempfile.NamedTemporaryFile("w", suffix=".words") as file:
         file.write(words(terms))
         file.flush()
-        return subprocess.run([checker, file.name], check=False).returncode
+        return subprocess.run(
+            [checker, file.name], check=False, stdout=subprocess.DEVNULL
+        ).returncode
 
 
 def decided(file: Path, out: Path | None = None, checker: Path | None = None) -> tuple[int, str]:
@@ -674,6 +676,8 @@ def main() -> int:
     status, said = decided(given.file, given.coq, given.ask)
     if said:
         print(said, file=sys.stderr)
+    elif given.ask is not None:
+        print("refused" if status else "accepted")
     return status
 
 
