@@ -155,6 +155,13 @@ def monitor(
     if table is not None:
         write_parquet(found.rows, table)
     _say_verdicts(found)
+    if found.worst:
+        worst = named[found.worst[0].bag]
+        centre = f" --config {config}" if config else ""
+        console.print(
+            f"look at the first: nlsid view {worst} --page --funnel {funnel}{centre}",
+            soft_wrap=True, markup=False, highlight=False,
+        )  # fmt: skip
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
     verdicts = {row.verdict for row in found.rows}
@@ -172,7 +179,8 @@ def _say_verdicts(found: FleetVerdict) -> None:
         f"{len(found.rows)} bags: " + ", ".join(f"{n} {what}" for what, n in counts.most_common())
     )
     for key, title in (("robot", "robots"), ("day", "days")):
-        table = Table(title=f"{title}, those with the most trouble first", title_justify="left")
+        console.print(f"{title}, those with the most trouble first:")
+        table = Table()
         for column in (key, "bags", *counts):
             table.add_column(column, overflow="fold")
         groups = found.by(key)
@@ -188,13 +196,15 @@ def _say_verdicts(found: FleetVerdict) -> None:
         label = f"{10 * k:3d} to {10 * k + 10:3d} %" if k < 10 else "   over 100 %"
         if most:
             console.print(f"{label:>14} {count:6d} {'#' * round(40 * count / most)}")
-    table = Table(title="the ten that spent the most", title_justify="left")
-    for column in ("bag", "spent", "at", "verdict", "bad from", "margin"):
+    console.print("the ten that spent the most, and when:")
+    table = Table()
+    for column in ("bag", "spent", "at", "time (UTC)", "verdict", "bad from", "margin"):
         table.add_column(column, overflow="fold")
     for row in found.worst:
         table.add_row(
-            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s", row.verdict,
-            row.bad_from or "-", "-" if row.margin is None else f"{row.margin:.3f}",
+            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
+            row.spent_when[:19], row.verdict, row.bad_from[:19] or "-",
+            "-" if row.margin is None else f"{row.margin:.3f}",
         )  # fmt: skip
     console.print(table)
     for line in found.ranks:

@@ -47,9 +47,9 @@ class Judged:
 
     verdict: of `Replay`, or `not read`. reason: why it is not inside. assumption: which one was
     broken first, in words. spent: the largest part of what is assumed that was used (None: not
-    measured), spent_at: s of the run. margin: the least (None: nothing judged), margin_at: s.
-    start: of the bag and bad_from: of the first bad sample, ISO 8601 in UTC. alarm: of the second
-    alarm. judged, span: s. digest: of the recording.
+    measured), at spent_at, s of the run. margin: the least (None: nothing judged), margin_at: s.
+    start: of the bag, spent_when, and bad_from: of the first bad sample, all ISO 8601 in UTC.
+    alarm: of the second alarm. judged, span: s. digest: of the recording.
     """
 
     bag: str
@@ -59,6 +59,7 @@ class Judged:
     assumption: str = ""
     spent: float | None = None
     spent_at: float = 0.0
+    spent_when: str = ""
     margin: float | None = None
     margin_at: float = 0.0
     start: str = ""
@@ -104,6 +105,7 @@ class JudgeBag:
             assumption="" if bad is None or bad.status is Status.OUTSIDE else bad.assuming,
             spent=None if most is None else most.assumption,
             spent_at=0.0 if most is None else most.t,
+            spent_when="" if most is None else iso(stamps[id(most)]),
             margin=None if worst is None else max(worst.margin, -1e300),
             margin_at=0.0 if worst is None else worst.t,
             start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",

@@ -38,7 +38,11 @@ _WILD: Final = re.compile(r"[*?\[]")
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+class StorageError(BagError):
+    """Storage did not deliver: of the bag itself nothing is known."""
+
+
+@dataclass(frozen=True, slots=True)
 class Entry:
     """What storage says of a name: bytes, whether it is a folder, and what changes with content.
 
@@ -242,12 +246,12 @@ class RemotePath(PosixPath):
             except Exception as error:  # every protocol raises its own
                 status = getattr(error, "status", None)
                 if isinstance(status, int) and 400 <= status < 500 and status not in MAY_PASS:
-                    raise BagError(f"{self}: storage refuses it: {_short(error)}") from error
+                    raise StorageError(f"{self}: storage refuses it: {_short(error)}") from error
                 if "Credentials" in type(error).__name__:
-                    raise BagError(f"{self}: {_short(error)}") from error
+                    raise StorageError(f"{self}: {_short(error)}") from error
                 self._lost += time.monotonic() - started + wait
                 if self._lost > self.patience:
-                    raise BagError(
+                    raise StorageError(
                         f"{self}: storage did not deliver; {self.patience:g} s were lost with "
                         f"failing requests: {_short(error)}"
                     ) from error
@@ -354,7 +358,7 @@ def _storage(url: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs
 
-        found: tuple[Any, str] = url_to_fs(url)
+        found: tuple[Any, str] = url_to_fs(url, use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise BagError(
             f"{url} cannot be read: {error}; bags in object storage need `pip install "

@@ -16,7 +16,7 @@ from scipy.signal import welch
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
-from bags.recordings.remote import place
+from bags.recordings.remote import StorageError, place
 from bags.signals.columns import expand_paths, read_columns
 from bags.signals.delays import Delay, delay
 from bags.signals.expressions import Expression
@@ -97,10 +97,14 @@ def check_fitness(
         findings: list[Finding] = []
         try:
             with Bag(path, unfinished=True, definitions=definitions) as bag:
+                if bag.ending is not None:
+                    findings.append(Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}"))
                 findings += _clocks(bag, [*excitations, *responses])
                 u_names, y_names = list(expanded(bag, excitations)), list(expanded(bag, responses))
             names = [*u_names, *y_names]
             read = read_signals(path, names, sort=True, definitions=definitions)
+        except StorageError:  # nothing is known of the bag
+            raise
         except BagError as error:
             findings.append(Finding(Level.BAD, "readable", str(error)))
             results.append(Fitness(path, tuple(findings)))
@@ -163,8 +167,6 @@ def _ruled(samples: Samples, rule: str) -> Samples:
 
 def _clocks(bag: Bag, signals: Sequence[str]) -> list[Finding]:
     findings = []
-    if bag.ending is not None:
-        findings.append(Finding(Level.LOOK, "whole", f"unfinished: {bag.ending}"))
     texts = [text.partition("|")[0] for text in signals]
     paths = expand_paths(bag, [SignalPath.parse(text) for text in texts])
     offsets = {}

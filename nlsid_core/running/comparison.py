@@ -217,6 +217,7 @@ class SampledComparison:
         self.assuming = [f"the disturbance's {a.form} ≤ {a.bound:.4g}"]
         self.over = [f"{len(policy) * model.period:g} s"]
         self._meter = meter_of(funnel)
+        self._up = 1.0 + float(np.max(funnel.rounding))  # no size is below its exact value
         self.restart()
 
     def restart(self) -> None:
@@ -248,7 +249,7 @@ class SampledComparison:
         self._u_before = u
         nominal = self._policy.x[k]
         x_bar = x - nominal
-        disturbance = self._meter.update(k, self._observer.d) if k else 0.0
+        disturbance = self._meter.update(k, self._observer.d) * self._up if k else 0.0
         bound = funnel.assumption.bound
         size = funnel.size(k, x_bar)
         return Compared(
@@ -292,7 +293,8 @@ class SampledComparison:
             return False
         d = len(predicted) // 2
         away = (predicted - self._policy.x[k])[d:]
-        return not float(np.linalg.norm(self._funnel.S[k][d:, d:] @ away)) <= float(roots[k])
+        size = float(np.linalg.norm(self._funnel.S[k][d:, d:] @ away)) * self._up
+        return not size <= float(roots[k])
 
     def _level(self, k: int, size: float, x_bar: FloatArray) -> Level:
         norm, inlet = self._funnel.norm(k, x_bar), float(self._funnel.inlet[k])

@@ -189,6 +189,21 @@ def test_a_robot_outside_by_thousands_of_levels_is_outside_however_steep_the_tub
     assert "started outside" in reading.reason
 
 
+def test_a_disturbance_above_its_bound_by_less_than_rounding_is_not_kept() -> None:
+    """0.1 y is the bound in float64 and above it in fractions, for every other y."""
+    model, policy, funnel = overflowing()
+    rng = np.random.default_rng(0)
+    S = 0.1
+    y = next(y for y in rng.uniform(0.9, 1.1, 100).tolist()
+             if Fraction(S) * Fraction(y) > Fraction(S * y))  # fmt: skip
+    assumed = DisturbanceAssumption("peak", S * y, 0.0, 1.5, ())
+    for bound, status in ((S * y, Status.ASSUMPTION_VIOLATED), (S * y * 1.0001, Status.INSIDE)):
+        narrow = replace(funnel, S=np.full((4, 1, 1), S), assumption=replace(assumed, bound=bound))
+        monitor = Monitor(model, policy, narrow)
+        monitor.update(0.0, [0.0], [0.0])
+        assert monitor.update(0.1, [y], policy(1, np.array([y]))).status is status
+
+
 @settings(max_examples=200, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), steepness=st.floats(0.0, 6.0), radius=st.floats(0.99, 1.01))
 def test_a_size_is_never_below_the_true_one_and_hardly_above(

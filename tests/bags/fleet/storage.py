@@ -1,7 +1,9 @@
 """A web server and an S3 server of this machine, and bags for them to serve."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread
@@ -20,6 +22,7 @@ from tests.bag_messages import (
     odometry,
 )
 
+PART = 4096  # bytes that are sent at a time
 IMAGE = "/camera"
 IMAGE_TYPE = "std_msgs/msg/ByteMultiArray"
 Fault = Callable[[str, int], int | None]  # (path, number of the request) -> status, None: serve
@@ -64,10 +67,13 @@ def drive(
 
 
 @contextmanager
-def web_server(folder: Path, fault: Fault | None = None) -> Iterator[str]:
+def web_server(
+    folder: Path, fault: Fault | None = None, *, bytes_per_s: Mapping[str, float] | None = None
+) -> Iterator[str]:
     """The files of a folder over HTTP with ranges and ETags; yields the URL.
 
     fault: what a GET is answered with instead. Status 200 to it means: half of the bytes.
+    bytes_per_s: of an answer, by path; others are sent at once.
     """
     count: dict[str, int] = {}
 
@@ -90,32 +96,38 @@ def web_server(folder: Path, fault: Fault | None = None) -> Iterator[str]:
             if not file.is_file():
                 self._send(404, b"")
                 return
-            content, span = file.read_bytes(), ""
-            size, wanted = len(content), self.headers.get("Range")
-            code = 200
-            if wanted:
+            size, span, code = file.stat().st_size, "", 200
+            start, end = 0, size
+            if wanted := self.headers.get("Range"):
                 first, _, last = wanted.removeprefix("bytes=").partition("-")
-                start, end = int(first), int(last) + 1
-                content, code = content[start:end], 206
+                start, end, code = int(first), int(last) + 1, 206
                 span = f"bytes {start}-{end - 1}/{size}"
+            with file.open("rb") as stream:
+                stream.seek(start)
+                content = stream.read(end - start) if body else b""
             if status == 200:
                 content = content[: len(content) // 2]
             tag = f'"{size}-{file.stat().st_mtime_ns}"'
-            self._send(code, content, body=body, tag=tag, span=span)
+            length = len(content) if body else size
+            self._send(code, content, length=length, tag=tag, span=span)
 
         def _send(
-            self, code: int, content: bytes, *, body: bool = True, tag: str = "", span: str = ""
+            self, code: int, content: bytes, *, length: int = 0, tag: str = "", span: str = ""
         ) -> None:
             self.send_response(code)
-            self.send_header("Content-Length", str(len(content)))
+            self.send_header("Content-Length", str(length))
             if span:
                 self.send_header("Content-Range", span)
             if tag:
                 self.send_header("ETag", tag)
                 self.send_header("Last-Modified", "Mon, 01 Jan 2024 00:00:00 GMT")
             self.end_headers()
-            if body:
-                self.wfile.write(content)
+            rate = (bytes_per_s or {}).get(self.path, math.inf)
+            with suppress(ConnectionError):  # whoever asked has lost patience
+                for start in range(0, len(content), PART):
+                    part = content[start : start + PART]
+                    time.sleep(len(part) / rate)
+                    self.wfile.write(part)
 
         def log_message(self, format: str, *args: object) -> None:
             pass

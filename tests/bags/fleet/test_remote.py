@@ -308,3 +308,22 @@ def test_commands_are_found_where_no_image_is(bucket: Bucket, tmp_path: Path) ->
     with Bag(path) as bag:
         assert sum(len(batch) for _, batch in bag.batches([CMD])) == 200
     assert path.fetched < 0.1 * local.stat().st_size
+
+
+def test_a_huge_file_without_a_summary_is_refused_before_it_is_fetched(tmp_path: Path) -> None:
+    """A gigabyte of zeros, of which the disk holds nothing; and one that says it is so long."""
+    with (tmp_path / "huge.mcap").open("wb") as stream:
+        stream.truncate(2**30)
+    whole = drive(tmp_path / "d.mcap", samples=10).read_bytes()
+    start = int.from_bytes(whole[-28:-20], "little")
+    (tmp_path / "far.mcap").write_bytes(
+        whole[:-28] + (start + 2**40).to_bytes(8, "little") + whole[-20:]
+    )
+    with web_server(tmp_path) as url:
+        for name, reason in (
+            ("huge", "1073741824 bytes and no summary"), ("far", "summary offset is damaged"),
+        ):  # fmt: skip
+            path = remote(f"{url}/{name}.mcap")
+            with pytest.raises(BagError, match=reason):
+                read_signals(path, [SPEED])
+            assert path.fetched < 2**15

@@ -1,5 +1,10 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
+import math
+import re
+import time
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import permutations
@@ -13,14 +18,15 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
-from bags.fleet.check import check_fleet, write_parquet
+from bags.fleet.check import Checked, check_fleet, write_parquet
 from bags.fleet.monitor import FleetVerdict, Judged, calibration_spent, monitor_fleet
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import replay_bag
 from bags.samples import f1tenth
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
-from tests.bags.fleet.storage import drive
+from nlsid_core.running.reading import Reading
+from tests.bags.fleet.storage import drive, web_server
 
 CONFIG = Path("config/f1tenth.yaml")
 
@@ -55,8 +61,16 @@ def test_a_fleet_is_judged_bag_by_bag_as_one_bag_is(design: Path) -> None:
             alone.verdict, alone.worst.margin, alone.span,
         )  # fmt: skip
         assert row.spent == max(r.assumption for r in alone.judged)
+        most = max(range(len(alone.readings)), key=lambda k: _spent(alone.readings[k]))
+        when = datetime.fromtimestamp(alone.stamps_ns[most] // 10**9, UTC)
+        assert row.spent_when == when.isoformat()
         start = datetime.fromtimestamp(alone.stamps_ns[0] // 10**9, UTC)
         assert row.start == start.isoformat()
+
+
+def _spent(reading: Reading) -> float:
+    """What is judged by the assumption; nothing else comes first."""
+    return reading.assumption if math.isfinite(reading.assumption) else -1.0
 
 
 def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> None:
@@ -130,6 +144,8 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     done = CliRunner().invoke(app, ["fleet", "monitor", pattern, *given])
     assert done.exit_code == 1, done.output
     assert "robot_2/cut: " in done.output
+    worst = tmp_path / "fleet" / "robot_1" / "other.mcap"
+    assert f"nlsid view {worst} --page --funnel {design}" in done.output
     assert "is not an MCAP file" in done.output
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = {row["bag"]: row for row in parquet.read_table(table).to_pylist()}
@@ -159,3 +175,49 @@ def test_the_command_check_says_what_is_bad(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, given)
     assert done.exit_code == 1
     assert "1 bad" in done.output
+
+
+@pytest.mark.parametrize("verb", ["check", "monitor"])
+def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
+    design: Path, tmp_path: Path, verb: str
+) -> None:
+    """Cut off, busy for ever, busy for a while, vanished, too slow: each with its reason."""
+    pytest.importorskip("fsspec")
+    pytest.importorskip("aiohttp")
+    web = tmp_path / "web"
+    for name in ("cut", "busy", "late", "gone", "slow", "good"):
+        drive(web / f"{name}.mcap", samples=117)
+    content = (web / "cut.mcap").read_bytes()
+    (web / "cut.mcap").write_bytes(content[: len(content) // 2])
+    asked: Counter[str] = Counter()
+
+    def fault(path: str, number: int) -> int | None:
+        asked[path] += 1
+        answers = {"/busy.mcap": 503, "/gone.mcap": 404}
+        return 503 if path == "/late.mcap" and number <= 2 else answers.get(path)
+
+    started = time.monotonic()
+    with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
+        named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=2.0)
+        found: Sequence[Checked | Judged] = (
+            check_fleet(named, load_config(CONFIG), workers=Workers())
+            if verb == "check"
+            else monitor_fleet(
+                named, design, documents.load_proved(design),
+                centre=Centre.COMMAND, definitions={}, workers=Workers(),
+            ).rows
+        )  # fmt: skip
+    rows = {row.bag: row for row in found}
+    assert [row.bag for row in found] == sorted(rows) == sorted(named)
+    said = {
+        name: f"{row.trouble} {row.findings}" if isinstance(row, Checked) else row.reason
+        for name, row in rows.items()
+    }
+    assert re.search("truncated or unfinished|unfinished: ", said["cut"])
+    assert [rows[name].verdict for name in ("busy", "slow", "gone")] == 3 * ["not read"]
+    assert "2 s were lost with failing requests" in said["busy"]
+    assert "2 s were lost with failing requests" in said["slow"]
+    assert "not there any more" in said["gone"]
+    assert rows["late"].verdict == rows["good"].verdict not in ("bad", "not read")
+    assert asked["/late.mcap"] > 2
+    assert time.monotonic() - started < 30.0, "patience is of each bag, and is kept"
