@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.first_try import Truth, lines_of, rocket, van_der_pol
+from benchmarks.first_try import Truth, dubins, lines_of, rocket, van_der_pol
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -150,6 +150,15 @@ def test_a_disturbance_that_is_too_strong_is_named() -> None:
     text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
     assert re.search(r"Because of the disturbance w: take a larger goal", text)
     assert re.search(r"the disturbance w takes .* 1/s \(\d+ %\)", text)
+
+
+@pytest.mark.slow
+def test_a_refusal_tells_of_the_place_that_was_not_passed_however_often_it_was_tried() -> None:
+    rate, problem = dubins(0.5)
+    text = refusal(rate, problem.nominal, goal=problem.goal, uncertain=problem.uncertain)
+    found = re.search(r"lets V fall by (\S+) 1/s, and the disturbance w takes (\S+) 1/s", text)
+    assert found
+    assert float(found[1]) < float(found[2]), "else nothing was in the way"
 
 
 def test_a_shape_that_cannot_be_found_keeps_what_is_proved(
