@@ -134,7 +134,7 @@ class Ear(Node):
         super().__init__("ear")
         self.margins: dict[int, int] = {}
         self.echoes: dict[int, int] = {}
-        self.error_ns = 0
+        self.error_ns, self.error = 0, ""
         self.ready = False
         publisher = self.create_publisher(String, f"{SOURCE}/design", qos.DOCUMENT)
         publisher.publish(String(data=bundle_of(design).text()))
@@ -147,9 +147,11 @@ class Ear(Node):
 
     def _status(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self.ready |= status.name == "funnel_monitor"
+            if status.name != "funnel_monitor":
+                continue
+            self.ready = True
             if status.level == DiagnosticStatus.ERROR and not self.error_ns:
-                self.error_ns = time.time_ns()
+                self.error_ns, self.error = time.time_ns(), status.message
 
 
 def send(seconds: float, rate: int) -> None:

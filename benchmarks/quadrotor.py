@@ -17,22 +17,14 @@ import numpy as np
 
 from benchmarks.machine import describe
 from examples import quadrotor
-from nlsid_core.design import design_funnel
 from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.proofs import check
 
 
 def run(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Everything the benchmark promises, by its promised keys."""
-    dynamics, nominal, S = quadrotor.problem(arguments.knots)
     started, processor = time.perf_counter(), time.process_time()
-    design = design_funnel(
-        dynamics,
-        nominal,
-        goal=S / arguments.level,
-        Q=quadrotor.Q / arguments.level,  # scaled alike, so that the LQR's gains stay
-        R=quadrotor.R / arguments.level,
-    )
+    design = quadrotor.designed(arguments.knots, arguments.level)
     seconds, used = time.perf_counter() - started, time.process_time() - processor
     *_, proof = design.save(folder)
     used_before = time.process_time()

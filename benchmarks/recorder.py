@@ -1,6 +1,6 @@
 """The recorder: messages lost and CPU used at 10 topics x 1 kHz; what kills leave behind.
 
-python -m benchmarks.recorder [--seconds 60] [--kills 50] [--json]
+python -m benchmarks.recorder [--seconds 60] [--topics 10] [--kills 50] [--json]
 
 Beside ours, in the same run: a node of the same subscriptions that writes with rosbags' Writer.
 """
@@ -32,20 +32,24 @@ from benchmarks.machine import describe, peers
 from benchmarks.processes import cpu_seconds, isolate, node, python
 from nlsid_ros import qos
 
-TOPICS = [f"/joints_{i}" for i in range(10)]
 TYPE = "sensor_msgs/msg/JointState"
 RATE = 1000  # Hz
 ASKED = {"lost": 0.0, "cpu_percent_of_a_core": 60.0, "worst_loss_s": 1.1}
 
 
+def topics(count: int) -> list[str]:
+    """Names of the topics that are sent."""
+    return [f"/joints_{i}" for i in range(count)]
+
+
 class RosbagsRecorder(Node):
     """The least a recorder with rosbags' Writer can do."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, count: int) -> None:
         super().__init__("rosbags_recorder")
         self._writer = Writer(path, version=9)
         self._writer.open()
-        for topic in TOPICS:
+        for topic in topics(count):
             connection = self._writer.add_connection(topic, TYPE, typestore=standard_types())
 
             def record(data: bytes, info: dict[str, int], to: object = connection) -> None:
@@ -62,9 +66,7 @@ def send(seconds: float, count: int) -> None:
     """Publish six joints on each of the first `count` topics at 1 kHz, stamped with the time."""
     rclpy.init()
     sender = Node("sender")
-    publishers = [
-        sender.create_publisher(JointState, topic, qos.STREAM) for topic in TOPICS[:count]
-    ]
+    publishers = [sender.create_publisher(JointState, topic, qos.STREAM) for topic in topics(count)]
     while min(p.get_subscription_count() for p in publishers) < 1:
         time.sleep(0.01)
     time.sleep(0.5)
@@ -91,17 +93,17 @@ def sending(seconds: float, count: int) -> list[str]:
     return ["benchmarks.recorder", "--send", str(seconds), "--topics", str(count)]
 
 
-def throughput(recorder: list[str], bag: Path, seconds: float) -> dict[str, float]:
+def throughput(recorder: list[str], bag: Path, seconds: float, count: int) -> dict[str, float]:
     """Messages lost, and CPU used while they came."""
     with python(*recorder) as recording:
         time.sleep(3.0)
         before = cpu_seconds(recording.pid)
-        with python(*sending(seconds, len(TOPICS))) as sender:
+        with python(*sending(seconds, count)) as sender:
             sender.wait()
         used = cpu_seconds(recording.pid) - before
     with Bag(bag) as source:
-        kept = sum(source.count(topic) for topic in TOPICS)
-    sent = round(seconds * RATE) * len(TOPICS)
+        kept = sum(source.count(topic) for topic in topics(count))
+    sent = round(seconds * RATE) * count
     return {"sent": sent, "lost": sent - kept, "cpu_percent_of_a_core": 100.0 * used / seconds}
 
 
@@ -114,7 +116,7 @@ def kills(folder: Path, count: int) -> dict[str, float]:
     with python(*sending(1e6, 1)) as sender:
         for index in range(count):
             bag = folder / f"killed_{index}"
-            parameters = {"topics": f"[{TOPICS[0]}]", "bag": bag, "repair": False}
+            parameters = {"topics": f"[{topics(1)[0]}]", "bag": bag, "repair": False}
             with python(*node("trajectory_recorder", **parameters)) as recorder:
                 file = bag / f"{bag.name}.mcap"
                 while not file.exists() or file.stat().st_size < 10_000:
@@ -156,7 +158,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--send", type=float, help=argparse.SUPPRESS)
-    parser.add_argument("--topics", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--topics", type=int, default=10, help="each at 1 kHz")
     parser.add_argument("--rosbags", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.send:
@@ -164,7 +166,7 @@ def main() -> None:
         return
     if options.rosbags:
         rclpy.init()
-        recorder = RosbagsRecorder(options.rosbags)
+        recorder = RosbagsRecorder(options.rosbags, options.topics)
         with suppress(KeyboardInterrupt, ExternalShutdownException):
             rclpy.spin(recorder)
         recorder.close()
@@ -172,12 +174,16 @@ def main() -> None:
     isolate()
     with tempfile.TemporaryDirectory() as scratch:
         ours, theirs = Path(scratch) / "ours", Path(scratch) / "theirs"
-        listed = json.dumps(TOPICS)
+        count = options.topics
+        listed = json.dumps(topics(count))
         result = throughput(
-            node("trajectory_recorder", topics=listed, bag=ours), ours, options.seconds
+            node("trajectory_recorder", topics=listed, bag=ours), ours, options.seconds, count
         )
         other = throughput(
-            ["benchmarks.recorder", "--rosbags", str(theirs)], theirs, options.seconds
+            ["benchmarks.recorder", "--rosbags", str(theirs), "--topics", str(count)],
+            theirs,
+            options.seconds,
+            count,
         )
         result |= {f"rosbags_{key}": value for key, value in other.items() if key != "sent"}
         if options.kills:

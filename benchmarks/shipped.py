@@ -10,18 +10,14 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
 from examples import cart_pole, planar_quadrotor, quadrotor, satellite_funnel
-from nlsid_core.design import design_funnel
 from nlsid_core.progress import silent
-
-QUADROTOR_LEVEL = 0.1  # of the goal, in LQR cost, as in benchmarks.quadrotor
-QUADROTOR_KNOTS = 31
 
 
 def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
     """Names and their proof files, each saved in a folder of its own."""
     designs: Mapping[str, Callable[[], Any]] = {
-        "satellite": _satellite,
-        "quadrotor": _quadrotor,
+        "satellite": satellite_funnel.designed,
+        "quadrotor": quadrotor.designed,
         "cart_pole": cart_pole.designed,
         "planar_quadrotor": planar_quadrotor.designed,
     }
@@ -32,19 +28,3 @@ def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     yield "f1tenth", [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
-
-
-def _satellite() -> Any:
-    field, nominal, weights = satellite_funnel.problem()
-    return design_funnel(field, nominal, goal=satellite_funnel.goal_matrix(), **weights)
-
-
-def _quadrotor() -> Any:
-    dynamics, nominal, S = quadrotor.problem(QUADROTOR_KNOTS)
-    return design_funnel(
-        dynamics,
-        nominal,
-        goal=S / QUADROTOR_LEVEL,
-        Q=quadrotor.Q / QUADROTOR_LEVEL,
-        R=quadrotor.R / QUADROTOR_LEVEL,
-    )

@@ -10,12 +10,13 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import integrate_nominal
+from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.dynamics import Nominal, VectorField
 
 MASS, GRAVITY = 0.5, 9.81  # kg, m/s²
 INERTIA = np.array([0.0032, 0.0032, 0.0055])  # kg m²
 FINAL_TIME, CLIMB = 3.0, 3.0
+KNOTS, LEVEL = 31, 0.1  # level: of the goal, in the hover LQR's cost
 TILT, THRUST = 0.06, 1.8  # where the expansion is bounded: |σ_i|, and |T - mg| in N
 ROUNDING_ROOM = 1.0001  # the bounds are computed in floating point
 Q = np.diag([10.0] * 3 + [4.0] * 3 + [40.0] * 3 + [2.0] * 3)
@@ -90,6 +91,12 @@ def inputs(t: float) -> FloatArray:
     lift = CLIMB / FINAL_TIME**2 * (60 * s - 180 * s**2 + 120 * s**3)
     swing = s * (1 - s) * (1 - 2 * s)
     return np.array([MASS * (GRAVITY + lift), 0.0015 * swing, -0.0015 * swing, 0.0])
+
+
+def designed(knots: int = KNOTS, level: float = LEVEL) -> FunnelDesign:
+    """The funnel into {LQR cost in hover ≤ level}; Q and R scaled alike keep the LQR's gains."""
+    field, nominal, S = problem(knots)
+    return design_funnel(field, nominal, goal=S / level, Q=Q / level, R=R / level)
 
 
 def problem(knots: int) -> tuple[VectorField, Nominal, FloatArray]:

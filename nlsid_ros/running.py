@@ -265,7 +265,10 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
-    """By `spin_once`, since the executor's `spin` looks at nothing of Python's until it ends."""
+    """What had arrived when the signal came is still handed on.
+
+    By `spin_once` with a timeout: without one the executor hears nothing.
+    """
     executor = EventsExecutor()
     for node in nodes:
         executor.add_node(node)
@@ -273,8 +276,7 @@ def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) ->
 
     def wait() -> None:
         woken.recv(1)
-        asked.set()
-        executor.wake()
+        executor.create_task(asked.set)  # goes to the end of the queue
 
     threading.Thread(target=wait, daemon=True).start()
     while not asked.is_set():
