@@ -1,30 +1,40 @@
 (* Tubes and stability of identified models: what is decided, and why outputs then stay near. *)
 From Coq Require Import ZArith Reals List Lra Lia Psatz.
-From Verified Require Import Integers Forms Claim Condition Definite Goal Funnel Tubes Increments Boxes.
+From Verified Require Import Integers Forms Claim Condition Definite Goal Funnel Tubes Increments Boxes Cells.
 Import ListNotations.
 Open Scope R_scope.
 
 (* F, H, E and the box of a model, from its numbers. *)
 Definition unknowns (m : model) : nat :=
-  match m with Linear _ => O | Affine p _ _ _ _ => p | Monotone _ _ _ _ _ => 1%nat end.
+  match m with
+  | Linear _ => O | Affine p _ _ _ _ => p | Monotone _ _ _ _ _ => 1%nat
+  | Cells maps _ _ _ => length maps
+  end.
 Definition states (m : model) : nat :=
-  match m with Linear a => length a | Affine _ n _ _ _ => n | Monotone _ _ _ a _ => length a end.
+  match m with
+  | Linear a => length a | Affine _ n _ _ _ => n | Monotone _ _ _ a _ => length a
+  | Cells _ _ next _ => length next
+  end.
 Definition outputs (m : model) : nat :=
-  match m with Affine p _ _ _ _ => p | _ => 1%nat end.
+  match m with Affine p _ _ _ _ => p | Cells _ _ _ out => length out | _ => 1%nat end.
 Definition moves (m : model) : matrix :=
   match m with
   | Linear a => zip cons a (units (pred (length a)) ++ [repeat nzero (pred (length a))])
   | Affine p n _ _ _ => firstn n (units (p + n))
   | Monotone _ _ _ a shift => (none :: repeat nzero (length a)) :: map (cons nzero) shift
+  | Cells _ _ next _ => next
   end.
 Definition seen (m : model) : matrix :=
   match m with
   | Linear a => [none :: repeat nzero (pred (length a))]
   | Affine p n scale _ _ => zip vscale scale (firstn p (units (p + n)))
   | Monotone _ _ _ a _ => [none :: repeat nzero (length a)]
+  | Cells _ _ _ out => out
   end.
 Definition box_of (m : model) : list (num * num) :=
-  match m with Affine _ _ _ range _ => range | _ => [] end.
+  match m with
+  | Affine _ _ _ range _ => range | Cells maps _ _ _ => map slope_range maps | _ => []
+  end.
 Definition steepening (m : model) : bool :=
   match m with Monotone _ _ e3 _ _ => negb (fst e3 =? 0)%Z | _ => false end.
 (* the least slope of e1 v + e2 v^2 + e3 v^3 *)
@@ -35,6 +45,8 @@ Definition vertices_of (m : model) (box : list (num * num)) : list matrix :=
   | Linear _ => [[]]
   | Affine _ _ _ _ ts => vertices_on box ts
   | Monotone e1 e2 e3 a _ => [[least e1 e2 e3 :: a]]
+  | Cells maps into next _ =>
+      corners box (firstn (length maps) (units (length maps + length next))) into
   end.
 Definition model_ok (m : model) : bool :=
   andb (andb (Nat.ltb 0 (states m)) (shaped (states m) (unknowns m + states m) (moves m)))
@@ -46,6 +58,8 @@ Definition model_ok (m : model) : bool :=
         (forallb (fun t => shaped p (p + n) (snd t)) ts)
   | Monotone e1 e2 e3 _ _ =>
       orb (0 <? fst e3)%Z (andb (fst e3 =? 0)%Z (fst e2 =? 0)%Z)
+  | Cells maps into next _ =>
+      andb (forallb map_ok maps) (shaped (length maps) (length maps + length next) into)
   end).
 
 Section Near.
@@ -124,7 +138,7 @@ Proof.
   pose proof split_zeta as Split. pose proof Hm as Hm'. unfold model_ok in Hm'.
   apply andb_prop in Hm' as [H1 H2]. apply andb_prop in H1 as [H0 H1]. apply Nat.ltb_lt in H0.
   apply andb_prop in H2 as [_ H2].
-  destruct m as [a|p n scale range ts|e1 e2 e3 a shift]; cbn [step moves states unknowns] in *.
+  destruct m as [a|p n scale range ts|e1 e2 e3 a shift|maps into next out]; cbn [step moves states unknowns] in *.
   - decompose [and] Sx; decompose [and] Sz; subst. unfold difference. cbn [app].
     destruct x as [|x0 xs]; [cbn in Lx; lia|]. destruct z as [|z0 zs]; [cbn in Lz; lia|].
     cbn [hd tl length] in *. rewrite minus_plus.
@@ -163,6 +177,10 @@ Proof.
     + cbn [map dot]. rewrite dot_zeros, val_none. ring.
     + fold (vals shift). fold (at_ shift x). fold (at_ shift z).
       rewrite minus_plus by (rewrite at_length; auto). symmetry. apply at_minus. congruence.
+  - decompose [and] Sx; decompose [and] Sz; subst z' x'.
+    change (image (map (map val) next)) with (at_ next).
+    rewrite minus_plus by (rewrite at_length; auto). symmetry. apply at_minus.
+    rewrite !app_length. congruence.
 Qed.
 Lemma difference_of_outputs : minus q y = at_ (seen m) zeta /\ length q = outputs m /\ length y = outputs m.
 Proof.
@@ -170,7 +188,7 @@ Proof.
   pose proof split_zeta as Split. pose proof Hm as Hm'. unfold model_ok in Hm'.
   apply andb_prop in Hm' as [H1 H2]. apply andb_prop in H1 as [H0 H1]. apply Nat.ltb_lt in H0.
   apply andb_prop in H2 as [_ H2].
-  destruct m as [a|p n scale range ts|e1 e2 e3 a shift]; cbn [step seen states unknowns outputs] in *.
+  destruct m as [a|p n scale range ts|e1 e2 e3 a shift|maps into next out]; cbn [step seen states unknowns outputs] in *.
   - decompose [and] Sx; decompose [and] Sz; subst. split; [|auto].
     destruct x as [|x0 xs]; [cbn in Lx; lia|]. destruct z as [|z0 zs]; [cbn in Lz; lia|].
     unfold difference, minus. cbn [app zip hd]. rewrite at_row. cbn [map dot].
@@ -194,6 +212,25 @@ Proof.
     destruct v as [|v0 [|]]; try discriminate. destruct u as [|u0 [|]]; try discriminate.
     unfold difference, minus. cbn [app zip hd]. rewrite at_row. cbn [map dot].
     rewrite dot_zeros, val_none. cbn. f_equal. ring.
+  - decompose [and] Sx; decompose [and] Sz; subst q y.
+    change (image (map (map val) out)) with (at_ out). split.
+    + rewrite minus_plus by (rewrite at_length; auto). symmetry. apply at_minus.
+      rewrite !app_length. congruence.
+    + unfold plus. split; rewrite zip_length; rewrite at_length; auto.
+Qed.
+
+(* What each map adds to the difference is a slope of it times the difference before. *)
+Lemma slopes_between maps : forall a b, forallb map_ok maps = true -> length a = length maps ->
+  length b = length maps -> exists sigma, in_box sigma (map slope_range maps) /\
+    minus (zip mapped maps a) (zip mapped maps b) = zip Rmult sigma (minus a b).
+Proof.
+  induction maps as [|f maps IH]; intros [|a0 a] [|b0 b] H La Lb; try discriminate.
+  { exists []. split; [constructor|reflexivity]. }
+  cbn [forallb] in H. apply andb_prop in H as [Hf H].
+  destruct (IH a b H ltac:(now injection La) ltac:(now injection Lb)) as [sigma [Hs E]].
+  destruct (mapped_slope f b0 a0 Hf) as [s [Hs0 E0]]. exists (s :: sigma). split.
+  - constructor; auto.
+  - unfold minus in *. cbn [zip]. now rewrite E, E0.
 Qed.
 
 Lemma weighted_minus ts i a b : length a = length b ->
@@ -226,7 +263,7 @@ Proof.
   apply andb_prop in H2 as [_ H2].
   assert (Hbox : exists w', in_box w' (box_of m) /\
     forall box, in_box w' box -> settled (steepening m) (vertices_of m box) zeta).
-  { destruct m as [a|p n scale range ts|e1 e2 e3 a shift]; cbn [step box_of steepening vertices_of] in *.
+  { destruct m as [a|p n scale range ts|e1 e2 e3 a shift|maps into next out]; cbn [step box_of steepening vertices_of] in *.
     - exists []. split; [constructor|]. intros box _ c l _ H. specialize (H [] (or_introl eq_refl)).
       cbn in H. rewrite dot_nil_r in H. lra.
     - decompose [and] Sx; decompose [and] Sz. exists w. split; auto. intros box Hw c l _ H'.
@@ -288,7 +325,30 @@ Proof.
           with (c - s * ((sigma - m0) * (nu * nu))) in H by ring.
         assert (0 <= s * ((sigma - m0) * (nu * nu))).
         { apply Rmult_le_pos; auto. apply Rmult_le_pos; [lra|]. apply Rle_0_sqr. }
-        lra. }
+        lra.
+    - cbn [states unknowns] in Lx, Lz, Lv, Lu, Lzeta.
+      apply andb_prop in H2 as [Hmaps Hinto]. apply shaped_is in Hinto as [Linto _].
+      destruct Sx as [_ [_ [_ [_ [Lw [Ev _]]]]]]. destruct Sz as [_ [_ [_ [_ [_ [Eu _]]]]]].
+      change (image (map (map val) into)) with (at_ into) in *.
+      assert (Larg : forall a, length (plus (at_ into a) w) = length maps).
+      { intros a. unfold plus. rewrite zip_length; rewrite at_length; congruence. }
+      destruct (slopes_between maps _ _ Hmaps (Larg (u ++ z)) (Larg (v ++ x))) as [sigma [Hs E]].
+      exists sigma. split; [exact Hs|]. intros box Hbox c l _ H.
+      assert (Ls : length sigma = length maps).
+      { apply Forall2_length in Hs. now rewrite map_length in Hs. }
+      assert (Lb : length sigma = length box) by (clear - Hbox; now apply Forall2_length in Hbox).
+      set (us := firstn (length maps) (units (length maps + length next))) in *.
+      assert (Eus : at_ us zeta = minus u v).
+      { unfold us. rewrite at_firstn, at_units by auto. rewrite Split.
+        rewrite firstn_app, firstn_all2 by (rewrite minus_length; lia).
+        replace (length maps - length (minus u v))%nat with O by (rewrite minus_length; lia).
+        cbn [firstn]. now rewrite app_nil_r. }
+      apply (corners_settled zeta box sigma us into c l); auto.
+      + rewrite <- Lb, Ls, <- (at_length us zeta), Eus, minus_length; congruence.
+      + congruence.
+      + rewrite <- Eu, <- Ev in E. rewrite Eus, E. f_equal.
+        rewrite minus_plus by (rewrite at_length; congruence). symmetry. apply at_minus.
+        rewrite !app_length. congruence. }
   destruct Hbox as [w' [Hw' Hs]].
   destruct (leaf_of _ t _ w' Ht Hw') as [box [Ns [Hok Hin]]].
   unfold leaf_ok in Hok. apply andb_prop in Hok as [Hlen Hok]. apply Nat.eqb_eq in Hlen.
@@ -385,14 +445,15 @@ Proof.
   { clear - Sx Sz Lx Lz Lv Lu H1 Hm.
     unfold model_ok in Hm. apply andb_prop in Hm as [A _]. apply andb_prop in A as [A _].
     apply Nat.ltb_lt in A. apply shaped_is in H1 as [H1 _].
-    destruct m as [a|p n scale range ts|e1 e2 e3 a shift]; cbn [step states unknowns moves] in *;
+    destruct m as [a|p n scale range ts|e1 e2 e3 a shift|maps into next out]; cbn [step states unknowns moves] in *;
       decompose [and] Sx; decompose [and] Sz; subst z' x'.
     - unfold plus. split; rewrite !zip_length; rewrite ?map_length, ?app_length; cbn; try lia;
         try (rewrite zip_length; rewrite ?map_length, ?app_length; cbn; destruct x, z; cbn in *; lia);
         destruct x, z; cbn in *; lia.
     - rewrite !firstn_length, !app_length. lia.
     - cbn [length] in H1. rewrite map_length in H1. rewrite !app_length. unfold plus.
-      rewrite !zip_length; unfold image; rewrite ?map_length; lia. }
+      rewrite !zip_length; unfold image; rewrite ?map_length; lia.
+    - unfold plus, image. split; rewrite zip_length; rewrite ?map_length; congruence. }
   destruct Both as [Lz1 Lx1]. change (image (vals L) e) with (at_ L e).
   rewrite minus_plus_left by (rewrite ?at_length; congruence). lra.
 Qed.

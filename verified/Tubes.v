@@ -17,13 +17,30 @@ Definition V (P : matrix) (x : list R) : R := dot x (image (map (map val) P) x).
    first n entries of [v; x], y_j = scale_j v_j + d_j; v has p entries, x n, and w is in its range.
    [Monotone e1 e2 e3 a shift]: 0 = e1 v + e2 v^2 + e3 v^3 + a'x + r_0, x+ = [v; shift x + r],
    y = v + d.
-   What depends on the inputs alone, d and r, may be anything, another at each time: it is the same
-   for two solutions. *)
+   [Cells maps into next out]: v_j = maps_j(into_j [v; x] + w_j), x+ = next [v; x] + r,
+   y = out [v; x] + d; a map is linear between its points (knot, value) and goes on beyond them.
+   What depends on the inputs alone, d and r (and w of Cells), may be anything, another at each
+   time: it is the same for two solutions. *)
 Inductive model :=
 | Linear (a : list num)
 | Affine (p n : nat) (scale : list num) (range : list (num * num))
     (terms : list (list nat * matrix))
-| Monotone (e1 e2 e3 : num) (a : list num) (shift : matrix).
+| Monotone (e1 e2 e3 : num) (a : list num) (shift : matrix)
+| Cells (maps : list (list (num * num))) (into next out : matrix).
+
+Fixpoint through (a : num * num) (rest : list (num * num)) (s : R) : R :=
+  match rest with
+  | [] => val (snd a)
+  | b :: rest' =>
+      let line := val (snd a)
+        + (val (snd b) - val (snd a)) / (val (fst b) - val (fst a)) * (s - val (fst a)) in
+      match rest' with
+      | [] => line
+      | _ => if Rle_dec s (val (fst b)) then line else through b rest' s
+      end
+  end.
+Definition mapped (f : list (num * num)) (s : R) : R :=
+  match f with [] => 0 | a :: rest => through a rest s end.
 
 Fixpoint weighted (terms : list (list nat * matrix)) (w z : list R) (row : nat) : R :=
   match terms with
@@ -47,6 +64,12 @@ Definition step (m : model) (d r x w v x' y : list R) : Prop :=
       (let u := hd 0 v in
        val e1 * u + val e2 * u ^ 2 + val e3 * u ^ 3 + dot (map val a) x + hd 0 r = 0) /\
       x' = v ++ plus (image (map (map val) shift) x) (tl r) /\ y = [hd 0 v + hd 0 d]
+  | Cells maps into next out =>
+      length v = length maps /\ length x = length next /\ length r = length next /\
+      length d = length out /\ length w = length maps /\
+      v = zip mapped maps (plus (image (map (map val) into) (v ++ x)) w) /\
+      x' = plus (image (map (map val) next) (v ++ x)) r /\
+      y = plus (image (map (map val) out) (v ++ x)) d
   end.
 
 (* The simulation x, and the observer z beside it, under the same inputs w: after the model's own

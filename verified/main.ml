@@ -56,6 +56,9 @@ let model () = match count () with
   | 2 ->
     let e1 = num () in let e2 = num () in let e3 = num () in let a = nums () in
     Monotone (e1, e2, e3, a, matrix ())
+  | 3 ->
+    let maps = listed (fun () -> listed (pair num num)) in
+    let into = matrix () in let next = matrix () in Cells (maps, into, next, matrix ())
   | _ -> failwith "a model"
 let tube () =
   let fading = num () in let gain = matrix () in let storage = matrix () in

@@ -17,7 +17,7 @@ TOKEN = re.compile(r"-?\d+|[A-Za-z_][A-Za-z_0-9]*|%[a-z0-9]+|[\[\]();,]")
 SPACE = re.compile(r'("(?:[^"\\]|\\.)*")|\s+')
 # What comes before the terms of a constructor, for the extracted checker.
 TAGS = {"None": "0", "Some": "1", "Linear": "0", "Affine": "1", "Monotone": "2", "Leaf": "0"}
-TAGS |= {"Split": "1", "false": "0", "true": "1"}
+TAGS |= {"Cells": "3", "Split": "1", "false": "0", "true": "1"}
 
 
 class Differs(Exception):  # noqa: N818 - says where a theorem and its files differ
@@ -303,6 +303,15 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
         table = {(i,) + (0,) * len(a): [c] for i, c in enumerate(e, 1)}
         table |= {_unit(1 + i, 1 + len(a)): [c] for i, c in enumerate(a)}
         return {"h": _table(table, like["h"], 1 + len(a)), **_shift(shift, len(a), like)}
+    if term.name == "Cells":
+        maps, *known = terms
+        rows = {
+            name: [row + [Fraction(c) for c in whole[len(row) :]]
+                   for row, whole in zip(stated, like[name], strict=True)]
+            for name, stated in zip(("into", "next", "output"), known, strict=True)
+        }  # fmt: skip
+        points = [{"knots": [k for k, _ in f], "values": [v for _, v in f]} for f in maps]
+        return {"maps": points, **rows}
     p, n, scale, ends, rows = terms
     if like["kind"] == "implicit":
         ((_, E),) = rows

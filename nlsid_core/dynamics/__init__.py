@@ -1,6 +1,7 @@
 """Continuous time: polynomial dynamics, motions, and functions of time in pieces."""
 
 from nlsid_core.dynamics.identified import identified_field
+from nlsid_core.dynamics.measured import MeasuredPush, measured_push
 from nlsid_core.dynamics.nominal import Nominal
 from nlsid_core.dynamics.piecewise import (
     PiecewisePolynomial,
@@ -13,6 +14,7 @@ from nlsid_core.dynamics.taylor_model import TaylorModel, solve
 from nlsid_core.dynamics.vector_field import VectorField
 
 __all__ = [
+    "MeasuredPush",
     "Nominal",
     "PiecewisePolynomial",
     "Rates",
@@ -22,6 +24,7 @@ __all__ = [
     "cubic_through",
     "identified_field",
     "linear_through",
+    "measured_push",
     "solve",
     "taylor_field",
 ]

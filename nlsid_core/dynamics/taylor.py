@@ -39,7 +39,8 @@ class Rates:
     """ẋ = function(...) of some of t, x (n,), u (m,), w, named so; w in the box `uncertain`.
 
     exact: the rates that are polynomials of degree 3 at most in (x, u); else None. uses: of every
-    other rate, the entries of z = (t, x, u, w) that it depends on.
+    other rate, the entries of z = (t, x, u, w) that it depends on. affine: every cubic is affine in
+    each input, as a hold needs it; what is left out is in its remainder.
 
     Raises NlsidError, naming what is supported, on a function that nothing here expands.
     """
@@ -50,11 +51,13 @@ class Rates:
     uncertain: FloatArray
     exact: tuple[Polynomial | None, ...]
     uses: tuple[frozenset[int], ...]
+    affine: bool = False
 
     @classmethod
     def of(
-        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None
-    ) -> "Rates":
+        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None, *,
+        affine: bool = False,
+    ) -> "Rates":  # fmt: skip
         """Look at the function once, with symbols."""
         box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
         if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
@@ -70,8 +73,11 @@ class Rates:
         blank = cls(function, n, m, box, (), ())
         symbols = [_Symbol(p.exact(), frozenset([j])) for j, p in enumerate(variables(names))]
         traced = [_Symbol.made(row) for row in blank.called(symbols)]
-        exact = tuple(row.cubic(names, 1 + n + m) for row in traced)
-        return cls(function, n, m, box, exact, tuple(row.uses for row in traced))
+        exact = [row.cubic(names, 1 + n + m) for row in traced]
+        if affine:
+            inputs = slice(1 + n, 1 + n + m)
+            exact = [None if p is None or (p.exponents[:, inputs] > 1).any() else p for p in exact]
+        return cls(function, n, m, box, tuple(exact), tuple(row.uses for row in traced), affine)
 
     @classmethod
     def numeric(cls, function: Callable[..., Any], n: int, m: int) -> "Rates":
@@ -173,7 +179,10 @@ class _Row:
 
     @classmethod
     def of(cls, row: Any, rates: Rates) -> "_Row":
-        """Products of w with anything else go to the bound, if too many corners would decide."""
+        """Products of w with anything else go to the bound, if too many corners would decide.
+
+        Of affine rates a square d_j² of an input is 1/2 ± 1/2, as |d_j| ≤ 1.
+        """
         if not isinstance(row, TaylorModel):
             return cls(((),), np.array([float(row)]), 0.0, np.full((1, 3), -1))
         first = 1 + rates.n + rates.m
@@ -181,6 +190,9 @@ class _Row:
         kept, values, bound = [], [], row.error
         for key, value in zip(row.keys.tolist(), row.coefficients.tolist(), strict=True):
             used = variables_of(key)
+            if rates.affine:
+                used, value, left = _once(used, value, range(1 + rates.n, first))
+                bound = nextafter(bound + left, inf)
             uncertain = sum(j >= first for j in used)
             if uncertain > 1 or (uncertain and len(used) > 1 and not products):
                 bound = nextafter(bound + abs(value), inf)
@@ -239,7 +251,7 @@ class Cubic:
             result[i, given + place] = row.bound
             for used, c in zip(row.monomials, row.coefficients.tolist(), strict=True):
                 if used and used[0] >= first:
-                    result[i, used[0] - first] = c / float(self.radius[used[0]])
+                    result[i, used[0] - first] += c / float(self.radius[used[0]])
         return result
 
     def nonlinear_states(self) -> tuple[int, ...]:
@@ -363,6 +375,19 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
     return VectorField(
         tuple(pieces), n, m, t[1:-1], uncertain, np.array(valid).reshape(-1, 4), EXPANSION
     )
+
+
+def _once(
+    used: tuple[int, ...], value: float, inputs: range
+) -> tuple[tuple[int, ...], float, float]:
+    """value·Π d_j with no input's d_j twice, and the most that this differs by where |d| ≤ 1."""
+    for j in used:
+        if j in inputs and used.count(j) > 1:
+            rest = list(used)
+            rest.remove(j)
+            rest.remove(j)
+            return tuple(rest), value / 2, nextafter(abs(value) / 2, inf)
+    return used, value, 0.0
 
 
 def _centred(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:

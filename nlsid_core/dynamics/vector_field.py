@@ -197,6 +197,12 @@ class VectorField:
         spans = range(len(self.pieces))
         return len(self.uncertain) > 0 and all(self.pushes(span) is not None for span in spans)
 
+    @property
+    def squares_inputs(self) -> bool:
+        """True if it is not affine in each input."""
+        inputs = slice(1 + self.n, 1 + self.n + self.m)
+        return any((p.exponents[:, inputs] > 1).any() for e in self.pieces for p in e)
+
     def pushes(self, span: int) -> FloatArray | None:
         """(n, n_w) what each w adds to ẋ, if those are constants and exact as floats; else None."""
         count = len(self.uncertain)

@@ -118,10 +118,12 @@ class Node:
         if type(entries) is list and all(type(e) is int for e in entries):
             numbers: list[int] = entries
         else:
-            rationals = [entry.rational() for entry in self.items(least, most)]
-            if any(number.denominator != 1 for number in rationals):
-                raise Rejected(f"{self.where} should hold whole numbers only")
-            numbers = [number.numerator for number in rationals]
+            numbers = []
+            for entry in self.items(least, most):
+                stated = entry.value
+                if type(stated) is not int and (type(stated) is not str or "/" in stated):
+                    raise Rejected(f"{self.where} should hold whole numbers only")
+                numbers.append(entry.rational().numerator)
         if not least <= len(numbers) <= most:
             raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
         return tuple(numbers)

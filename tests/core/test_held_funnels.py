@@ -188,8 +188,20 @@ def test_what_cannot_be_held_is_refused(options: Any, reason: str) -> None:
         design(tracking(**options))
 
 
-def test_a_hold_needs_dynamics_that_are_affine_in_the_input() -> None:
-    field = VectorField.from_function(lambda u: u**2 + u, 1, 1)
+def test_a_hold_of_inputs_that_are_not_affine_is_proved_of_a_function() -> None:
+    def squared(x: Any, u: Any) -> Any:
+        return [u[0] + u[0] ** 2 - 0.1 * x[0]]
+
+    field = VectorField.from_function(squared, 1, 1)
     nominal = integrate_nominal(field, lambda _: [0.1], t=np.linspace(0, 1, 5), start=[0.0])
-    with pytest.raises(DataError, match="affine in each input"):
-        design(ContinuousTracking(field, nominal, goal=[[1.0]], hold=0.01))
+    with pytest.raises(DataError, match="affine in each input: give them as a function"):
+        design(ContinuousTracking(field, nominal, goal=[[25.0]], hold=0.01))
+    found = design(ContinuousTracking(squared, nominal, goal=[[25.0]], hold=0.01))
+    assert found.claim["hold"] == 0.01
+    assert not found.model.squares_inputs
+    ran = simulate_held(
+        field, found.policy, found.funnel, hold=0.01, error=np.zeros(1), starts=200,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    assert ran.violations == 0
+    assert ran.max_v > 0.9

@@ -23,11 +23,12 @@ def swinging(x: Any, u: Any) -> list[Any]:
 
 
 def expanded(
-    function: Any, centre: Any, radius: Any, *, states: int, uncertain: Any = None
-) -> tuple[list[Polynomial], FloatArray]:
+    function: Any, centre: Any, radius: Any, *, states: int, uncertain: Any = None,
+    affine: bool = False,
+) -> tuple[list[Polynomial], FloatArray]:  # fmt: skip
     """Cubics in t, x, u, w on a box of (x, u), from t = 0 to 0.1, and the bounds of the rest."""
     centre, radius = np.asarray(centre, float), np.asarray(radius, float)
-    rates = Rates.of(function, states, len(centre) - states, uncertain)
+    rates = Rates.of(function, states, len(centre) - states, uncertain, affine=affine)
     found, bounds = rates.on(centre - radius, centre + radius, (0.0, 0.1)).equations()
     return list(found), bounds
 
@@ -61,6 +62,24 @@ def test_the_remainder_is_never_more_than_its_bound_and_in_small_boxes_not_much_
     assert bounds[0] == 0
     if size < 1:  # in a wide box a division's series leaves much more than it has to
         assert bounds[1] <= 20 * left[1] + rounding
+
+
+@pytest.mark.parametrize("centre", [(0.0, 9.81, 0.0), (0.4, -2.0, -0.3)])
+def test_cubics_that_are_affine_in_each_input_count_its_squares_in_the_remainder(
+    centre: tuple[float, ...],
+) -> None:
+    radius = np.array([0.2, 1.0, 0.3])
+    box = np.stack([np.array(centre) - radius, np.array(centre) + radius], axis=1)
+    for function in (
+        lambda x, u: [x[0] * u[1] ** 2 + u[1] ** 3 + u[0] * u[1]],
+        lambda x, u: [u[0] * np.sin(x[0] + u[1])],
+    ):
+        free, _ = expanded(function, centre, radius, states=1)
+        assert (free[0].exponents[:, 2:4] > 1).any(), "else nothing is left out here"
+        cubics, bounds = expanded(function, centre, radius, states=1, affine=True)
+        assert (cubics[0].exponents[:, 2:4] <= 1).all()
+        left = left_over(function, cubics, np.vstack([[0.0, 0.1], box]), 1, 2)
+        assert 0 < left[0] <= bounds[0] <= 3 * left[0]
 
 
 def test_one_over_something_that_may_be_zero_is_refused() -> None:

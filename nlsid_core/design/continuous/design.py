@@ -12,7 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
-from nlsid_core.design.continuous.expansion import sweep_expanded
+from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.held import Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
@@ -190,11 +190,12 @@ def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFun
         first = proved_for(setting, setting.rho_final, search)
         if setting.hold is None:
             return first
+        expansion = setting.expansion
         setting, free = replace(first[0], expansion=None), first[1].rho
     elif setting.hold is None:
         return _swept(setting, validity_caps(steps.field, policy, P), progress)
     else:
-        free = _free(setting, progress)
+        expansion, free = None, _free(setting, progress)
     hold = setting.hold
     assert hold is not None
     periods, span = hold.tried(), float(setting.policy.t[-1] - setting.policy.t[0])
@@ -202,7 +203,7 @@ def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFun
         raise DataError(f"the hold of {min(periods):g} s is longer than the motion of {span:g} s")
     for period in periods:
         try:
-            found = _held(setting, replace(hold, period=period), free, progress)
+            found = _held(setting, expansion, replace(hold, period=period), free, progress)
         except Infeasible:
             if period == periods[-1]:
                 raise
@@ -211,26 +212,40 @@ def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFun
     if len(periods) > 1:  # between what was proved and what was not
         with suppress(Infeasible):
             longer = replace(hold, period=period * 2**0.5)
-            found = _held(setting, longer, free, progress)
+            found = _held(setting, expansion, longer, free, progress)
     return found
 
 
 def _held(
-    setting: Setting, hold: Hold, free: FloatArray, progress: Progress
+    setting: Setting, expansion: Expansion | None, hold: Hold, free: FloatArray, progress: Progress
 ) -> tuple[Setting, ContinuousFunnel, Proved, float]:
-    """The funnel for one hold, within scaled copies of the free one."""
-    steps, policy, P = setting.steps, setting.policy, setting.P
+    """The funnel for one hold, within scaled copies of the free one.
+
+    A smaller copy has its own expansion, which leaves out less and has room for what is held.
+    """
+    steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
+    widths: FloatArray = np.zeros((len(P) - 1, field.m))
     for scale in SCALES:
+        if expansion is not None and scale < 1:
+            rho = scale * free
+            field = field_of(
+                [
+                    expansion.around(policy, P, k, (rho[k], rho[k + 1]), scale**0.5 * widths[k])
+                    for k in range(len(P) - 1)
+                ],
+                policy.t,
+            )
+            policy = replace(policy, vector_field=files.digest(field.document()))
         outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
         held = LSteps(
-            steps.field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            widths=np.zeros((len(P) - 1, steps.field.m)),
+            field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+            widths=np.zeros((len(P) - 1, field.m)),
         )  # fmt: skip
         rates, widths = fastest(held, policy, outer, hold)
         held.widths = widths
-        setting = replace(setting, steps=held, hold=hold, rates=rates)
+        setting = replace(setting, steps=held, policy=policy, hold=hold, rates=rates)
         try:
-            caps = validity_caps(steps.field, policy, P, widths)
+            caps = validity_caps(field, policy, P, widths)
             return _swept(setting, np.minimum(caps, outer.rho), progress)
         except (Infeasible, DataError) as error:
             refusal = error

@@ -64,9 +64,13 @@ class Expansion:
         return tuple(sorted(set.union(*found)))
 
     def around(
-        self, policy: ContinuousPolicy, P: FloatArray, k: int, rho: tuple[float, float]
-    ) -> Cubic:
-        """The cubics on interval k on a box that holds the funnel with these ρ at its knots."""
+        self, policy: ContinuousPolicy, P: FloatArray, k: int, rho: tuple[float, float],
+        held: FloatArray | None = None,
+    ) -> Cubic:  # fmt: skip
+        """The cubics on interval k on a box that holds the funnel with these ρ at its knots.
+
+        held: (m,) by how much more the inputs may be off.
+        """
         reach = np.zeros(self.rates.n + self.rates.m)
         for knot, level in zip((k, k + 1), rho, strict=True):
             inverse = level * np.linalg.inv(P[knot])
@@ -74,7 +78,10 @@ class Expansion:
             gains = policy.K.control[k]
             inputs = np.einsum("dij,jk,dik->di", gains, inverse, gains).max(axis=0, initial=0.0)
             reach = np.maximum(reach, np.concatenate([states, inputs]))
-        return self.on(k, ROOM * np.sqrt(reach), policy.limits)
+        reach = np.sqrt(reach)
+        if held is not None:
+            reach[self.rates.n :] += held
+        return self.on(k, ROOM * reach, policy.limits)
 
 
 @dataclass(frozen=True, eq=False)

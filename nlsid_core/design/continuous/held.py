@@ -82,11 +82,10 @@ class Hold:
         """Raise DataError for dynamics and policies that no hold is searched for."""
         if not field.m:
             raise DataError("there is no input to hold and none that a wrong state could change")
-        inputs = slice(1 + field.n, 1 + field.n + field.m)
-        if any((p.exponents[:, inputs] > 1).any() for e in field.pieces for p in e):
+        if field.squares_inputs:
             raise DataError(
-                "a hold needs dynamics that are affine in each input: make an input that is not a "
-                "state, which follows its command with a lag"
+                "a hold needs dynamics that are affine in each input: give them as a function, "
+                "then what is not affine is bounded"
             )
         if self.period and field.degree > MAX_DEGREE:
             raise DataError(

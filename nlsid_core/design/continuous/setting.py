@@ -117,14 +117,14 @@ def prepare(
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
-    field, expansion = _dynamics(dynamics, nominal, sizes, uncertain)
+    held = Hold.of(hold, error, sizes[0])
+    field, expansion = _dynamics(dynamics, nominal, sizes, uncertain, held)
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
     wanted = _wanted_goal(goal, nominal, field.n)
     weights = default_weights(field, nominal, wanted)
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
-    held = Hold.of(hold, error, field.n)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
     tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
@@ -178,19 +178,26 @@ def _dynamics(
     nominal: Nominal,
     sizes: tuple[int, int],
     uncertain: ArrayLike | None,
+    held: Hold | None,
 ) -> tuple[VectorField, Expansion | None]:
-    """The field; or, where it is no polynomial of a degree that fits, its linearisation."""
+    """The field; or, where it is no polynomial of a degree that fits, its linearisation.
+
+    A hold needs fields that are affine in each input, and cubics at most.
+    """
     if isinstance(dynamics, VectorField):
         if uncertain is not None:
             raise DataError("a vector field states its own bounds of w: leave out `uncertain`")
         return dynamics, None
     try:
         field = VectorField.from_function(dynamics, *sizes, uncertain=uncertain)
-        if field.degree <= (MAX_DEGREE if field.n <= FEW_STATES else DEGREE):
+        few = field.n <= FEW_STATES and not (held is not None and held.period)
+        affine = held is None or not field.squares_inputs
+        if field.degree <= (MAX_DEGREE if few else DEGREE) and affine:
             return field, None
     except NotPolynomial:
         pass
-    expansion = Expansion(Rates.of(dynamics, *sizes, uncertain), nominal)
+    rates = Rates.of(dynamics, *sizes, uncertain, affine=held is not None)
+    expansion = Expansion(rates, nominal)
     return expansion.linear(), expansion
 
 

@@ -1,17 +1,16 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
 import hashlib
-import importlib
 import json
 import random
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -21,9 +20,12 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.samples import f1tenth
-from nlsid_core import proofs, second
+from benchmarks.verified import generator, mutated
+from nlsid_core import files as saved
+from nlsid_core import kernel, proofs, second
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
+from tests.core.kernel import mutations
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
 
 Json = dict[str, Any]
@@ -165,18 +167,10 @@ def test_both_kernels_refuse_a_forgery(
 
 MODELS = (
     "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
-    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "stability/linear",
+    "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
+    "stability/linear", "stability/network",
     "stability/moving_lags", "stability/split", "stability/two_outputs",
 )  # fmt: skip
-
-
-def generator() -> Any:
-    """verified/generate.py, which is a program and no part of the package."""
-    sys.path.insert(0, str(VERIFIED))
-    try:
-        return importlib.import_module("generate")
-    finally:
-        sys.path.remove(str(VERIFIED))
 
 
 @pytest.mark.parametrize("name", [*MODELS, "continuous_funnel/clipped", "continuous_funnel/pushed"])
@@ -221,6 +215,123 @@ def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
     done = accepted(CORPUS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
     assert "accepted: " in done.stdout
+
+
+def put(files: Files, folder: Path) -> Path:
+    """The files of a tube or of stability, bound again; the path of the proof."""
+    digests: dict[str, str] = {}
+    for name in ("model.json", "policy.json", "funnel.json", "claim.proof.json"):
+        if name in files:
+            content = json.dumps(rebound(files[name], digests))
+            digests[name] = "sha256:" + hashlib.sha256(content.encode()).hexdigest()
+            (folder / name).write_text(content)
+    return folder / "claim.proof.json"
+
+
+def at(place: str, value: Any) -> Callable[[Files], None]:
+    """Puts a value at a place like `funnel.json tubes 0 level`."""
+
+    def forge(files: Files) -> None:
+        *owners, last = (int(key) if key.isdigit() else key for key in place.split())
+        owner: Any = files
+        for key in owners:
+            owner = owner[key]
+        owner[last] = value
+
+    return forge
+
+
+WINDOW = "sha256:" + "0" * 63
+ASSUMED = "funnel.json tubes 0 assumption"
+
+
+@pytest.mark.parametrize(
+    ("name", "forge", "said"),
+    [
+        ("lasting_linear", at("model.json y name", "a\nb"), "no short printable text"),
+        ("lasting_linear", at("model.json y units", "m"), "unknown members: 'units'"),
+        ("lasting_linear", at("model.json period", True), "should be a number"),
+        ("lasting_linear", at("model.json period", 0), "should be > 0"),
+        ("lasting_linear", at("model.json u_range", [2, 1]), "low > high"),
+        ("lasting_linear", at("funnel.json settling", 2.5), "0 to 1000000000 is allowed"),
+        ("lasting_linear", at("funnel.json box", {}), "unknown members: 'box'"),
+        ("lasting_linear", at("funnel.json tubes 0 level", 1e-6), "below what was measured"),
+        ("lasting_linear", at("funnel.json tubes 0 rho", 1.0), "exactly for an energy"),
+        ("lasting_linear", at(f"{ASSUMED} safety_factor", 0.5), "safety_factor >= 1"),
+        ("lasting_linear", at(f"{ASSUMED} samples", 3), "unknown members: 'samples'"),
+        ("lasting_linear", at(f"{ASSUMED} measured_on 0 digest", WINDOW + "0"),
+         "measured on what it was designed on"),
+        ("lasting_linear", at(f"{ASSUMED} measured_on 0 digest", WINDOW + "0[5:2]"), "window"),
+        ("lasting_linear", at(f"{ASSUMED} measured_on 0 digest", WINDOW + "A"), "no digest"),
+        ("lasting_linear", at("funnel.json cusum", {"deviation": [0], "drift": 0, "threshold": 1}),
+         "deviation > 0"),
+        ("lasting_linear", at("funnel.json tubes 0 follows", {"terms": [], "weights": [[]]}),
+         "1 to 200 entries"),
+        ("lasting_linear", at("claim.proof.json proof multipliers", []), "unknown members"),
+        ("lasting_split", at("model.json window 0", [0, 9]), "a delay of the window"),
+        ("lasting_split", at("model.json y_scale 0", -1.0), "should be > 0"),
+        ("lasting_two_outputs", at("model.json y 1 name", "y0"), "two signals of one name"),
+        ("lasting_two_outputs", at("claim.proof.json proof multipliers 0 N", []), "3 to 3 entries"),
+        ("lasting_network", at("model.json into 0 0", 1.0), "a map should use earlier ones only"),
+        ("lasting_network", at("model.json maps 0 knots 0", 5.0), "should increase"),
+        ("lasting_implicit_ray", at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
+         "a box of a model that needs none"),
+        ("engaged", at("policy.json u 0 0", 7.0), "outside the model's range"),
+        ("engaged", at("policy.json period", 0.2), "another period"),
+        ("engaged", at("policy.json L 0 0", 0.0), "L is not the policy's"),
+    ],
+)  # fmt: skip
+def test_a_file_that_the_pages_do_not_allow_is_refused(
+    name: str, forge: Callable[[Files], None], said: str, tmp_path: Path
+) -> None:
+    """By both kernels; with the file as it is, both have nothing against it."""
+    folder, generate = CORPUS / "tube" / name, generator()
+    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    assert generate.decided(put(files, tmp_path)) == (0, "")
+    forge(files)
+    proof = put(files, tmp_path)
+    status, why = generate.decided(proof)
+    assert status == 1
+    assert said in why
+    with pytest.raises(CertificateRejected):
+        proofs.check(proof)
+
+
+def test_a_number_that_is_not_written_as_a_float64_is_refused(tmp_path: Path) -> None:
+    folder, generate = CORPUS / "stability" / "linear", generator()
+    files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    proof = put(files, tmp_path)
+    claim = files["claim.proof.json"]["claim"]
+    text = proof.read_text()
+    proof.write_text(text.replace(str(claim["rate"]), str(claim["rate"]) + "00"))
+    assert generate.decided(proof)[0] == 3, "that number, but not as it is printed"
+    proof.write_text(text.replace(str(claim["rate"]), str(claim["rate"]) + "01"))
+    assert generate.decided(proof)[0] == 1
+
+
+def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> None:
+    """Of mutants of tubes and stability, without the checker that decides the numbers."""
+    generate, rng = generator(), np.random.default_rng(3)
+    cases = [case for case in mutations.corpus() if case.kind in ("tube", "stability")]
+    refused = 0
+    for k in range(120):
+        forged = mutations.mutant(cases[k % len(cases)], rng)
+        for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
+            (tmp_path / name).write_bytes(saved.encode(document))
+        if generate.decided(tmp_path / mutations.PROOF)[0] == 1:
+            refused += 1
+            with pytest.raises(kernel.Rejected):
+                kernel.check(tmp_path / mutations.PROOF)
+    assert refused > 30
+
+
+@needs_coq
+@pytest.mark.coq
+def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path) -> None:
+    found = mutated(400, tmp_path / "mutant", program.parent / "second")
+    assert found["differ"] == {}
+    for kind in ("tube", "stability", "continuous_funnel"):
+        assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 2
 
 
 def fades_faster(files: Files) -> None:
@@ -294,14 +405,7 @@ def test_both_kernels_refuse_a_forged_tube(
     folder = CORPUS / "tube" / ("engaged" if forge is feedback_stronger else "lasting_two_outputs")
     files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
     forge(files)
-    digests: dict[str, str] = {}
-    for name in ("model.json", "policy.json", "funnel.json", "claim.proof.json"):
-        if name not in files:
-            continue
-        content = json.dumps(rebound(files[name], digests))
-        digests[name] = "sha256:" + hashlib.sha256(content.encode()).hexdigest()
-        (tmp_path / name).write_text(content)
-    proof = tmp_path / "claim.proof.json"
+    proof = put(files, tmp_path)
     with pytest.raises(CertificateRejected):
         proofs.check(proof)
     assert second.opinion(proof, program).verdict == "refused"
