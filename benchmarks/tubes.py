@@ -1,6 +1,6 @@
 """Tubes around the simulation of identified models: how wide, how fast, and what they catch.
 
-python -m benchmarks.tubes [--data DIR] [--case NAME]... [--json]
+python -m benchmarks.tubes [--data DIR] [--case NAME]... [--lasting SAMPLES] [--json]
 
 DIR holds f1tenth, exchanger, wh2009, schunk_arm, emps and kuka_kr300; without it the shipped
 F1TENTH recordings are measured. Some trials identify a model and design its tube, others scale it,
@@ -33,6 +33,7 @@ from bags.chain.steps import read_trials
 from bags.monitoring.catching import what_it_catches
 from bags.samples import f1tenth
 from benchmarks.machine import describe
+from benchmarks.processes import resident_mb
 from benchmarks.recorded import heat_exchanger, wiener_hammerstein
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import recording
@@ -311,11 +312,37 @@ def measure(case: Case) -> dict[str, float | int]:
     return keys
 
 
+def lasting(samples: int) -> dict[str, float]:
+    """One monitor over so many samples: µs of a sample in the first and the last tenth (the least
+    over trials), and by how much the process grew between them.
+    """
+    case = f1tenth_case(LinearClass(4))
+    model = identify(case.train, case.model_class).model
+    made = design_output_tube(model, case.train, case.calibration)
+    monitor, k = Monitor(model, None, made.funnel), 0
+    tenths: list[list[float]] = [[] for _ in range(10)]
+    grown = [0.0] * 10
+    while k < samples:
+        for trial in case.judged:
+            started, tenth = time.process_time(), min(10 * k // samples, 9)
+            for y, u in zip(trial.y, trial.u, strict=True):
+                monitor.update(k * model.period, y, u)
+                k += 1
+            tenths[tenth].append((time.process_time() - started) / len(trial))
+            grown[tenth] = resident_mb(os.getpid())
+    first, last = (1e6 * min(tenths[i]) for i in (0, 9))
+    return {"lasting_samples": k, "lasting_first_us": first, "lasting_last_us": last,
+            "lasting_grown_mb": grown[9] - grown[0]}  # fmt: skip
+
+
 def main() -> None:
     """Print the table, and with --json one JSON object as the last line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, help="folder of the recordings that do not ship")
     parser.add_argument("--case", action="append", help="one of the cases; repeat for several")
+    parser.add_argument(
+        "--lasting", type=int, help="samples of one run, e.g. 10000000: nothing else"
+    )
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
     arguments = parser.parse_args()
     cases: dict[str, Callable[[], Case]] = dict(SHIPPED)
@@ -323,6 +350,10 @@ def main() -> None:
         cases |= {name: partial(made, arguments.data) for name, made in RECORDED.items()}
     print(f"tubes around the simulation of identified models, {describe()}\n")
     keys: dict[str, float | int | str] = {}
+    if arguments.lasting:
+        cases, arguments.case = {}, None
+        keys |= lasting(arguments.lasting)
+        print("\n".join(f"  {key:34s}{value:12.4g}" for key, value in keys.items()))
     for name in arguments.case or cases:
         print(name, flush=True)
         try:

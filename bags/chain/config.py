@@ -139,7 +139,7 @@ class FunnelConfig(Section):
         Key(
             "whether the tube is wider while commands move it (`commands`) or as wide always "
             "(`constant`, which fixed tolerances need); `auto`: `commands` where that is a fifth "
-            "narrower on average over the training trials; without `profile`",
+            "narrower on average over four training trials or more; without `profile`",
             example="constant",
         ),
     ] = "auto"

@@ -23,6 +23,7 @@ PROGRAMS = 4  # reweighted ones
 FLOORS = (0.001, 0.01, 0.03, 0.1, 0.3)  # of the largest E: the least constant part of a level
 PAIRS_UP_TO = 4  # inputs of which products of two are tried
 WORTH = 0.8  # of a constant level's mean half-width: a rule that gains less is mostly chance
+FEWEST = 4  # trials of a design: of fewer, a half is one trial and tells nothing of the others
 ADDED = 200  # samples that a round takes into a program, worst first
 ROUNDS = 20
 NEGLIGIBLE = 1e-6  # of the largest summand: a weight that is left out
@@ -55,12 +56,15 @@ def candidates(inputs: Sequence[FloatArray]) -> tuple[Term, ...]:
 def followed(
     energies: Sequence[FloatArray], inputs: Sequence[FloatArray], *, always: bool = False
 ) -> CommandLevel | None:
-    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`).
+    """A level for the rows of E (N, rows) of each trial, or None where it gains little (`WORTH`) or
+    there are too few trials (`FEWEST`) to tell.
 
     inputs: (settling + N, n_u) of each trial, from its run's start. What is narrower, and how small
     the constant part may be, is decided by the mean half-width where each half of the trials is
     scaled with what the other half gave. √g is 1 on average over the trials. always: not None.
     """
+    if len(energies) < FEWEST and not always:
+        return None
     terms = candidates(inputs)
     G = [_columns(terms, u)[len(u) - len(E) :] for u, E in zip(inputs, energies, strict=True)]
     halves = _halves(list(zip(energies, G, strict=True)))

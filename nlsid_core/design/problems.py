@@ -35,7 +35,7 @@ class OutputTube:
     output, then every input, for implicit models whose increments are known on a box only (None:
     the range of the training trials and a tenth of it on both sides). level: "constant", or
     "commands" for one that follows them; "auto" does if that is a fifth narrower on average over
-    `train`.
+    `train` and these are four trials or more.
 
     profile: of a linear model, (s, output) corners of a plan that a policy tracks, for `horizon` s,
     else up to the last corner (None: no policy); its level is constant. inlet: allowed initial

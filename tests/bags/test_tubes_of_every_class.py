@@ -1,7 +1,6 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,21 +20,16 @@ from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
-from tests.identified_bags import PERIOD, write_config, write_coupled_bags, write_saturating_bags
+from tests.identified_bags import (
+    FUNNEL,
+    ONE,
+    PERIOD,
+    TWO,
+    write_config,
+    write_coupled_bags,
+    write_saturating_bags,
+)
 
-FUNNEL: dict[str, Any] = {"funnel": {"safety_factor": 1.5}}
-ONE: dict[str, dict[str, Any]] = {
-    "linear": {"model": "linear", "lags": 3, "iterations": 3},
-    "block_cascade": {"model": "block_cascade", "orders": [2, 1], "phases": [1],
-                      "intervals": [8], "starts": 4, "transient": 60},
-    "cells": {"model": "cells", "intervals": 4},
-    "monotone": {"model": "monotone", "lags": 2, "method": "rie"},
-    "implicit": {"model": "implicit", "lags": 2},
-}  # fmt: skip
-TWO: dict[str, dict[str, Any]] = {
-    "state_affine": {"model": "state_affine", "lags": 2, "iterations": 2, "leading_degree": 0},
-    "linear_states": {"model": "linear_states"},
-}
 RUNS = 6
 
 
@@ -49,7 +43,10 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_coupled_bags(tmp_path_factory.mktemp("two"))
 
 
-@pytest.mark.parametrize("name", [*ONE, *TWO])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n == "cells" else ()) for n in (*ONE, *TWO)],
+)
 def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     name: str, one: Path, two: Path, tmp_path: Path
 ) -> None:

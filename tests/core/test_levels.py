@@ -81,6 +81,7 @@ def test_what_moves_with_the_commands_is_followed_and_what_does_not_is_not() -> 
     assert np.mean(np.sqrt(g)) == pytest.approx(1.0, rel=0.01)
     assert np.sqrt(scale) < 0.5 * np.sqrt(E.max()), "half as wide on average as a constant"
     assert followed(*trials(12, 0, moved=0.0)) is None
+    assert followed(*trials(3, 0, moved=1.0)) is None, "too few to tell"
     forced = followed(*trials(12, 0, moved=0.0), always=True)
     assert forced is not None
     assert (forced.weights >= 0.0).all()

@@ -1,5 +1,7 @@
 """Running against tubes around a model's simulation: for ever, over gaps, several at once."""
 
+import sys
+import time
 import tracemalloc
 from dataclasses import replace
 from typing import Any
@@ -91,12 +93,28 @@ def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
     run(monitor, trial)
     tracemalloc.start()
     before = tracemalloc.get_traced_memory()[0]
-    for lap in range(1, 21):
+    for lap in range(1, 6):
         readings = run(monitor, replace(trial, t=trial.t + lap * 25.0))
         assert all(r.status is not Status.UNKNOWN for r in readings)
     grown = tracemalloc.get_traced_memory()[0] - before - 1_000_000
     tracemalloc.stop()
     assert grown < 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["linear", "following"])
+def test_a_million_samples_take_no_more_memory_or_time_at_the_end(name: str) -> None:
+    monitor, trial = monitor_of(name), trial_of(name, 1000)
+    rows = list(zip(trial.t.tolist(), trial.y, trial.u, strict=True))
+    seconds, blocks = np.zeros(1000), np.zeros(1000)
+    for lap in range(1000):
+        started = time.process_time()
+        for t, y, u in rows:
+            assert monitor.update(t + lap * 25.0, y, u).status is not Status.UNKNOWN or lap == 0
+        seconds[lap] = time.process_time() - started
+        blocks[lap] = sys.getallocatedblocks()
+    assert blocks[-1] - blocks[10] < 200
+    assert seconds[-100:].min() < 1.2 * seconds[:100].min()
 
 
 def with_a_gap(kind: str) -> tuple[Monitor, dict[int, Reading]]:

@@ -58,8 +58,12 @@ class Robot:
         self.spin_until(lambda: self.command.get_subscription_count() >= monitors)
 
     def restart(self) -> None:
-        """Begin a new run."""
+        """Begin a new run, once the monitor listens to the car."""
         self.ready()
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a new run."""
         client = self.node.create_client(Trigger, "/funnel_monitor/restart")
         self.spin_until(client.service_is_ready)
         self.said.clear()
