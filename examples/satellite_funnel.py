@@ -12,7 +12,6 @@ from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.proofs import check
 
 PUBLISHED_SECONDS = 13429.0  # thesis: 223 min 49 s on 12 cores, exact in time
-LQR_SCALE = 1.3045  # P_G in the order [ω; σ] times this is the LQR's cost
 WEIGHTS = {"Q": np.eye(6), "R": 10.0 * np.eye(3)}
 
 

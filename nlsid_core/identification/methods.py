@@ -71,7 +71,17 @@ class FirstRse:
 
 
 @dataclass(frozen=True)
-class Rse:
+class Iterated:
+    """iterations: 1 to 1000 at most."""
+
+    iterations: int = 40
+
+    def __post_init__(self) -> None:
+        require_whole(self, "iterations", 1, MOST_ITERATIONS)
+
+
+@dataclass(frozen=True)
+class Rse(Iterated):
     """Minimise the robust simulation error: bounds that are made exact by iterating.
 
     A linear model is iterated from several starts, and the best on the training data is kept.
@@ -79,27 +89,19 @@ class Rse:
     Source: thesis (4.1)-(4.3), Section 4.4.
     """
 
-    iterations: int = 40
     name: ClassVar[str] = "rse"
     title: ClassVar[str] = "robust simulation error, final iterate"
 
-    def __post_init__(self) -> None:
-        require_whole(self, "iterations", 1, MOST_ITERATIONS)
-
 
 @dataclass(frozen=True)
-class CertifiedRse:
+class CertifiedRse(Iterated):
     """`Rse` with every iterate inside a convex set of models that are stable for every input.
 
     iterations: as of `Rse`. Source: thesis Lemma 2.11 and (4.1)-(4.3).
     """
 
-    iterations: int = 40
     name: ClassVar[str] = "rse_certified"
     title: ClassVar[str] = "robust simulation error, stable for every input"
-
-    def __post_init__(self) -> None:
-        require_whole(self, "iterations", 1, MOST_ITERATIONS)
 
 
 @dataclass(frozen=True)
@@ -114,19 +116,15 @@ class Sem:
 
 
 @dataclass(frozen=True)
-class CertifiedSem:
+class CertifiedSem(Iterated):
     """`Sem` inside a convex set of stable models, from several starts, of which the best is kept.
 
     iterations: of `Rse` or `CertifiedRse`, one of its starts, for linear and state-affine models;
     else of its own steps from each start. Source: thesis Definition 2.2, Chapter 2, (4.1)-(4.3).
     """
 
-    iterations: int = 40
     name: ClassVar[str] = "sem_certified"
     title: ClassVar[str] = "simulation error minimisation, stable for every input"
-
-    def __post_init__(self) -> None:
-        require_whole(self, "iterations", 1, MOST_ITERATIONS)
 
 
 Method = LeastSquares | Rie | MomentRie | FirstRse | Rse | CertifiedRse | Sem | CertifiedSem

@@ -28,8 +28,6 @@ from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.models.signal import Signal
 from nlsid_core.polynomial.products import Products
 
-Advance = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-
 
 class Stepper:
     """A model's steps along one run.

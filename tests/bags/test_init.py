@@ -73,7 +73,7 @@ def whole_way(bags: Path, config: Path, out: Path) -> str:
 @pytest.mark.parametrize(
     ("options", "response", "excitation"),
     [
-        ((), YAW, "/steering_command:position[name=steering]"),
+        pytest.param((), YAW, "/steering_command:position[name=steering]", marks=pytest.mark.slow),
         (("-u", CMD), SPEED, CMD),
     ],
 )
@@ -276,6 +276,7 @@ def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: P
     whole_way(schunk()[0].parent, config, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     steering = "/steering_command:position[name=steering]"
@@ -290,6 +291,7 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
     assert whole_way(f1tenth()[0].parent, config, tmp_path / "out").count("inside") >= 6
 
 
+@pytest.mark.slow
 def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
     config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
@@ -350,6 +352,7 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
     assert settings.signals.response[0].path == SPEED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "seconds"),
     [

@@ -43,7 +43,10 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_coupled_bags(tmp_path_factory.mktemp("two"))
 
 
-@pytest.mark.parametrize("name", [*ONE, *TWO])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n == "cells" else ()) for n in (*ONE, *TWO)],
+)
 def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     name: str, one: Path, two: Path, tmp_path: Path
 ) -> None:

@@ -56,6 +56,7 @@ def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
     assert rms(straight, tanks(1)) > 3.0 * rms(fit, tanks(1))
 
 
+@pytest.mark.slow
 def test_select_takes_the_cells_where_the_data_are_of_cells() -> None:
     classes: list[Any] = [
         LinearClass(2),

@@ -148,6 +148,7 @@ def test_an_input_that_is_clipped_may_be_held_too() -> None:
     assert "every 0.02 s or more often" in found.verdict.assumptions[0]
 
 
+@pytest.mark.slow
 def test_a_clipped_input_of_several_states_may_be_held_too() -> None:
     """The angle enters nonlinearly and the rate does not: the proof takes the rate first."""
     found = design(tracking(limits=[[-4.5, 3.0]], hold=HOLD))
@@ -167,6 +168,7 @@ def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
         design(tracking(hold=1.0))
 
 
+@pytest.mark.slow
 def test_the_largest_hold_is_found_and_said() -> None:
     found = design(tracking(hold="largest"))
     assert HOLD <= found.claim["hold"] < 0.1

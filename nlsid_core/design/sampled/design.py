@@ -254,7 +254,3 @@ def refuse_assumption(model: MeasuredState, a: DisturbanceAssumption) -> None:
 
 def _room(centre: FloatArray, ranges: FloatArray) -> FloatArray:
     return np.minimum(ranges[:, 1] - centre, centre - ranges[:, 0])
-
-
-def _silent(_what: str, _fraction: float) -> None:
-    return None

@@ -94,6 +94,7 @@ def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> N
         named_bags([folder / "robot_0", drive(tmp_path / "drive_0.mcap")])
 
 
+@pytest.mark.slow
 def test_the_result_is_the_same_to_the_bit_whoever_reads(tmp_path: Path, config: Path) -> None:
     pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"
     run(pattern, config, tmp_path / "here")
@@ -101,6 +102,7 @@ def test_the_result_is_the_same_to_the_bit_whoever_reads(tmp_path: Path, config:
     assert contents(tmp_path / "here") == contents(tmp_path / "two")
 
 
+@pytest.mark.slow
 def test_a_fleet_of_one_folder_gives_what_identify_gives(tmp_path: Path) -> None:
     config = load_config(Path("config/f1tenth.yaml"))
     bags = f1tenth()
@@ -198,6 +200,7 @@ def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Pat
     assert [a.content.decode() for a in answers if not a.reason] == list("abdef")
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, config: Path) -> None:
     pattern = fleet(tmp_path / "fleet", 30) / "*" / "*.mcap"
     out = tmp_path / "out"
