@@ -1,5 +1,6 @@
 """Tables (CSV, MAT, HDF5) to a bag of standard messages."""
 
+import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -116,8 +117,9 @@ def read_tables(files: Sequence[Path | str]) -> Tables:
     """Every numeric array of the files.
 
     A CSV file without a header is one table by the file's name; with one, each column is a table by
-    its own name. In MAT (up to version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one,
-    those in a struct by `struct.field`; nothing in them is evaluated. A file is called by its stem,
+    its own name, an empty cell is NaN, and a column without a number is left out. In MAT (up to
+    version 7.2) and HDF5 files (MAT 7.3 too) each numeric array is one, those in a struct by
+    `struct.field`; nothing in them is evaluated. A file is called by its stem,
     with the folder before it where two have one stem. Raises DataError for a file that is none of
     these or holds no numbers.
     """
@@ -172,7 +174,9 @@ def import_tables(
     for what does not fit, and if `out` exists.
     """
     if (period is None) == (time is None):
-        raise BagError("state either the period of the rows or the column with their times")
+        raise BagError(
+            "state either the period of the rows (--period) or the column with their times (--time)"
+        )
     tables = read_tables(files)
     topics: dict[str, dict[SignalPath, FloatArray]] = {}
     sources: dict[str, str] = {}
@@ -225,7 +229,11 @@ class _Stream:
         self, topic: str, msgtype: str, columns: Mapping[SignalPath, FloatArray], stamps: IntArray
     ) -> None:
         store = standard_types()
-        fields_of(msgtype, store)
+        if msgtype not in store.types:
+            raise BagError(
+                f"'{msgtype}' is no ROS 2 Jazzy common interface, which a table is imported as"
+                f"{did_you_mean(msgtype, store.types)}"
+            )
         for path in columns:
             path.check(msgtype, store)
         self.topic, self.msgtype, self.stamps = topic, msgtype, stamps
@@ -254,6 +262,8 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
     assert time is not None
     if len(time) < rows:
         raise DataError(f"{rows} rows but {len(time)} times")
+    if len(unknown := np.flatnonzero(~np.isfinite(time[:rows]))):
+        raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
     stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
@@ -269,17 +279,48 @@ def _csv(path: Path) -> dict[str, FloatArray]:
     delimiter = next((mark for mark in (";", ",", "\t") if mark in first), None)
     cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
     titled = not all(_is_number(cell) for cell in cells if cell)
+    table: FloatArray
     try:
         table = np.loadtxt(
             path, delimiter=delimiter, skiprows=int(titled), ndmin=2, encoding="utf-8-sig"
         )
-    except ValueError as error:
-        raise DataError(f"{path}: {error}") from error
+    except ValueError:
+        table = _csv_by_cells(path, delimiter, titled, cells)
     if not titled:
         return {path.stem: table[:, 0] if table.shape[1] == 1 else table}
     if len(cells) != table.shape[1]:
         raise DataError(f"{path}: {len(cells)} titles over {table.shape[1]} columns")
-    return {cell: table[:, k] for k, cell in enumerate(cells)}
+    return {cell: table[:, k] for k, cell in enumerate(cells) if not np.isnan(table[:, k]).all()}
+
+
+def _csv_by_cells(
+    path: Path, delimiter: str | None, titled: bool, titles: Sequence[str]
+) -> FloatArray:
+    """What numpy does not read: NaN for empty cells, and all over a column without a number.
+
+    Raises DataError, with the line, for lines of another length and for a text among numbers.
+    """
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as stream:
+        if delimiter is None:
+            lines = [(number, line.split()) for number, line in enumerate(stream, start=1)]
+        else:
+            reader = csv.reader(stream, delimiter=delimiter, skipinitialspace=True)
+            lines = [(reader.line_num, cells) for cells in reader]
+    rows = [(number, cells) for number, cells in lines if cells][int(titled) :]
+    for number, cells in rows:
+        if len(cells) != len(titles):
+            raise DataError(f"{path}: {len(cells)} cells in line {number}, {len(titles)} in line 1")
+    table = np.full((len(rows), len(titles)), np.nan)
+    for k, title in enumerate(titles):
+        column = [(number, cells[k].strip()) for number, cells in rows]
+        texts = [(n, cell) for n, cell in column if cell and not _is_number(cell)]
+        if len(texts) == sum(cell != "" for _, cell in column):
+            continue
+        if texts:
+            where = f"line {texts[0][0]}, column '{title}'" if titled else f"line {texts[0][0]}"
+            raise DataError(f"{path}: '{texts[0][1]}' in {where} is no number")
+        table[:, k] = [float(cell) if cell else np.nan for _, cell in column]
+    return table
 
 
 def _mat(path: Path) -> dict[str, FloatArray]:

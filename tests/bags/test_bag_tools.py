@@ -519,6 +519,32 @@ def test_rows_with_one_time_are_dropped_only_when_asked(tmp_path: Path) -> None:
     assert read_signals(tmp_path / "bag", [SPEED])[SPEED].values.tolist() == [1.0, 2.0, 3.0]
 
 
+def test_empty_cells_are_unknown_and_columns_of_words_are_left_out(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text('t,"speed",mode\n0.0,1.5,auto\n0.1,,auto\n0.2,3,"by, hand"\n')
+    tables = read_tables([tmp_path / "log.csv"])
+    assert set(tables.files) == {"t", "speed"}
+    np.testing.assert_array_equal(tables.column("speed"), [1.5, np.nan, 3.0])
+    options: dict[str, Any] = {"types": {ODOM: ODOM_TYPE}, "time": "speed"}
+    with pytest.raises(DataError, match=r"^no time in row 1 \(1 such rows\)$"):
+        import_tables([tmp_path / "log.csv"], tmp_path / "x", [f"{SPEED}=t"], **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,x\n0,1\n0.1,fast\n0.2,2\n", r"'fast' in line 3, column 'x' is no number$"),
+        ("0 1\n0.1 fast\n0.2 2\n", r"'fast' in line 2 is no number$"),
+        ("t;x\n0;1\n\n0.1\n", r"1 cells in line 4, 2 in line 1$"),
+    ],
+)
+def test_what_is_wrong_in_a_table_is_said_with_its_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_tables([tmp_path / "log.csv"])
+
+
 def test_tables_in_matlab_structs_are_offered_and_its_own_workspace_is_not(tmp_path: Path) -> None:
     from scipy.io import savemat
 
