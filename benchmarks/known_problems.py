@@ -134,7 +134,7 @@ def draw(name: str, design: FunnelDesign, folder: Path) -> None:
         axes.set(xlabel="sideways [m]", ylabel="up [m]", aspect="equal")
     axes.legend(frameon=False, fontsize=8)
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"funnel-{name.replace('_', '-')}.png", dpi=110)
+    figure.savefig(folder / f"funnel-{name.replace('_', '-')}.png", dpi=110, bbox_inches="tight")
 
 
 def main() -> None:
