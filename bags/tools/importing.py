@@ -21,6 +21,7 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
 MAX_TABLE_BYTES: Final = 2**31
+STAMP_SECONDS: Final = 2**31  # builtin_interfaces/msg/Time counts them in an int32
 MAX_STRUCT_DEPTH: Final = 8  # of MATLAB structs in structs
 _COLUMN: Final = re.compile(
     r"(?P<table>[^\[\]]+?)(?:\[(?:(?:: *, *)?(?P<index>\d{1,6})|(?P<row>\d{1,6}) *, *:)\])?"
@@ -257,13 +258,19 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
     if period is not None:
         if not period > 0:
             raise DataError(f"a period of {period:g} s")
-        even: IntArray = start_ns + np.rint(np.arange(rows) * period * 1e9).astype(np.int64)
-        return even
+        time = np.arange(rows) * period
     assert time is not None
     if len(time) < rows:
         raise DataError(f"{rows} rows but {len(time)} times")
     if len(unknown := np.flatnonzero(~np.isfinite(time[:rows]))):
         raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
+    seconds = start_ns / 1e9 + time[:rows]
+    if len(wrong := np.flatnonzero((seconds < 0) | (seconds >= STAMP_SECONDS))):
+        raise DataError(
+            f"the time of row {wrong[0]} is {seconds[wrong[0]]:.15g} s since 1970 ({len(wrong)} "
+            f"such rows); stamps go from 0 to {STAMP_SECONDS} s: give the column in seconds, or "
+            "another --start"
+        )
     stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):
         raise DataError(
@@ -276,9 +283,12 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
 def _csv(path: Path) -> dict[str, FloatArray]:
     with path.open(encoding="utf-8-sig", errors="replace") as stream:
         first = stream.readline()
+        rest = any(line.strip() for line in stream)
     delimiter = next((mark for mark in (";", ",", "\t") if mark in first), None)
     cells = [cell.strip().strip('"') for cell in first.split(delimiter)]
     titled = not all(_is_number(cell) for cell in cells if cell)
+    if not (rest or (any(cells) and not titled)):
+        return {}  # which numpy warns of
     table: FloatArray
     try:
         table = np.loadtxt(

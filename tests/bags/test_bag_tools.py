@@ -545,6 +545,38 @@ def test_what_is_wrong_in_a_table_is_said_with_its_line(
         read_tables([tmp_path / "log.csv"])
 
 
+@pytest.mark.parametrize("text", ["", "\n\n", "t,x\n"])
+def test_a_table_without_rows_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(DataError, match=r"log\.csv holds no table of numbers$"):
+        read_tables([tmp_path / "log.csv"])
+
+
+@pytest.mark.parametrize(
+    ("first", "start_ns", "message"),
+    [
+        (1_700_000_000_000, 0, r"^the time of row 0 is 1700000000000 s since 1970 \(3 such"),
+        (-0.1, 0, r"^the time of row 0 is -0\.1 s since 1970 \(1 such rows\)"),
+        (2**31 - 1, 0, r"^the time of row 1 is 2147483648 s since 1970 \(2 such rows\)"),
+        (-0.1, 10**8, None),
+    ],
+)
+def test_times_that_no_stamp_can_say_are_refused(
+    tmp_path: Path, first: float, start_ns: int, message: str | None
+) -> None:
+    rows = [f"{first + k},{k}" for k in range(3)]
+    (tmp_path / "log.csv").write_text("\n".join(["t,speed", *rows]))
+    options: dict[str, Any] = {"types": {ODOM: ODOM_TYPE}, "time": "t", "start_ns": start_ns}
+    out = tmp_path / "bag"
+    if message is None:
+        import_tables([tmp_path / "log.csv"], out, [f"{SPEED}=speed"], **options)
+        assert read_signals(out, [SPEED])[SPEED].stamp_ns.tolist() == [0, 10**9, 2 * 10**9]
+        return
+    with pytest.raises(DataError, match=message):
+        import_tables([tmp_path / "log.csv"], out, [f"{SPEED}=speed"], **options)
+    assert not out.exists()
+
+
 def test_tables_in_matlab_structs_are_offered_and_its_own_workspace_is_not(tmp_path: Path) -> None:
     from scipy.io import savemat
 
