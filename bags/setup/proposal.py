@@ -7,7 +7,7 @@ refused there is changed (gaps cut out, responses resampled) or said.
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,7 @@ from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, slope_window
 from bags.signals.columns import read_columns
-from bags.signals.expressions import factors, parse_factors
+from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
@@ -117,10 +117,11 @@ def propose(
 
     Raises BagError and DataError if the bags cannot be read as any configuration says.
     """
-    chosen = {
-        "response": [_signal(found, text) for text in responses],
-        "excitation": [_signal(found, text) for text in excitations],
-    }
+    texts = [*responses, *excitations]
+    if twice := next((text for text in texts if texts.count(text) > 1), None):
+        raise BagError(f"{twice} is named twice")
+    signals = _named_apart([_signal(found, text) for text in texts])
+    chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
     proposal = Proposal({"robot": robot})
     _say_signals(proposal, chosen, found)
     if definitions:
@@ -172,14 +173,32 @@ def _signal(found: Found, text: str) -> Signal:
     known = next((c for c in found.candidates if c.text == text), None)
     known = known or next((c for c in found.candidates if _same(c.text, text)), None)
     if known is None:
-        return Signal(_name(text), "", text, "named by you")
+        path = text.partition("|")[0]
+        numbers = (
+            c for c in found.candidates if _same(c.text, path) and "|derivative" not in c.text
+        )
+        recorded = None if len(factors(text)) > 1 else next((c.unit for c in numbers), None)
+        unit = "" if recorded is None else Expression.parse(text).unit_of(recorded)
+        return Signal(_name(text), unit.partition(" or ")[0], text, "named by you")
     unit = known.unit.partition(" or ")[0]
     why = f"{known.low:.4g} to {known.high:.4g} {unit}".strip()
     return Signal(_name(text), unit, text, f"{why} at {known.rate:.4g} Hz; {known.why}")
 
 
+def _named_apart(signals: Sequence[Signal]) -> list[Signal]:
+    """With a number behind a name that an earlier signal has."""
+    names = [signal.name for signal in signals]
+    counts = [names[: k + 1].count(name) for k, name in enumerate(names)]
+    return [
+        replace(signal, name=f"{signal.name} {count}") if count > 1 else signal
+        for signal, count in zip(signals, counts, strict=True)
+    ]
+
+
 def _name(text: str) -> str:
     """A name for people: the joint or the last words of the path, and what is done to it."""
+    if len(parts := factors(text)) > 1:
+        return " times ".join(map(_name, parts))
     path, *operations = text.split("|")
     topic, _, fields = path.partition(":")
     steps = [

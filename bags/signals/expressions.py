@@ -127,7 +127,10 @@ class Expression:
 
         The path must fit `msgtype` (`SignalPath.check`).
         """
-        unit = _path_unit(self.path, msgtype, types)
+        return self.unit_of(_path_unit(self.path, msgtype, types))
+
+    def unit_of(self, unit: str) -> str:
+        """The unit of the result of numbers recorded in `unit`; BagError as `unit`."""
         for operation in self.operations:
             if operation.name == "unit":
                 unit = operation.unit

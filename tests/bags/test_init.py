@@ -260,6 +260,29 @@ def test_one_side_that_is_named_gets_the_other_that_goes_with_it_best() -> None:
     assert choose(found, [SPEED], ["/steering_command:position[name=steering]"])[0] == [SPEED]
 
 
+def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
+    tmp_path: Path,
+) -> None:
+    config, slope = (
+        tmp_path / "robot.yaml",
+        "|derivative(0.15 s)",
+    )  # not the window that is proposed
+    responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}"]
+    excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
+    named = [argument for y in responses for argument in ("-y", y)]
+    named += [argument for u in excitations for argument in ("-u", u)]
+    nlsid("init", *f1tenth()[:4], "--out", config, *named)
+    signals = load_config(config).signals
+    assert [signal.unit for signal in signals.response] == ["m/s", "cm/s"]
+    assert [signal.name for signal in signals.response] == [
+        "odom position x rate", "odom position x rate 2",
+    ]  # fmt: skip
+    assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
+    assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
+    again = nlsid("init", *f1tenth()[:4], "--out", config, "-u", CMD, "-y", CMD, status=None)
+    assert "is named twice" in again
+
+
 def test_a_measured_effort_drives_where_nothing_commands() -> None:
     """The Schunk arm has one topic; the joint's own rate follows its torque."""
     responses, excitations = choose(look(schunk()))
