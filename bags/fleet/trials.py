@@ -6,7 +6,7 @@ does, on the same numbers in the same order, so its result is the same to the la
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -81,13 +81,14 @@ def read_fleet(
 
 def usable_trials(answers: list[Answer], left_out: dict[str, str]) -> list[Trajectory]:
     """The trials of the answers in their order; adds to `left_out` what does not go with the first,
-    and the second copy of a recording.
+    and the second copy of a recording. An answer that is read keeps no content.
     """
     trials: list[Trajectory] = []
     recorded: dict[str, str] = {}
-    for answer in answers:
+    for k, answer in enumerate(answers):
         if answer.reason:
             continue
+        answers[k] = replace(answer, content=b"")
         own = decoded(answer.content, source=f"{answer.name}: not trials")[""].trajectories
         first = recorded.setdefault(own[0].digest, answer.name)
         if first != answer.name:
