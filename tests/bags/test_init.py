@@ -263,10 +263,8 @@ def test_one_side_that_is_named_gets_the_other_that_goes_with_it_best() -> None:
 def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     tmp_path: Path,
 ) -> None:
-    config, slope = (
-        tmp_path / "robot.yaml",
-        "|derivative(0.15 s)",
-    )  # not the window that is proposed
+    config = tmp_path / "robot.yaml"
+    slope = "|derivative(0.15 s)"  # not the window that is proposed
     responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}"]
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
@@ -279,7 +277,9 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
     ]  # fmt: skip
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
-    again = nlsid("init", *f1tenth()[:4], "--out", config, "-u", CMD, "-y", CMD, status=None)
+    again = nlsid(
+        "init", *f1tenth()[:4], "--out", tmp_path / "b.yaml", "-u", CMD, "-y", CMD, status=None
+    )
     assert "is named twice" in again
 
 
