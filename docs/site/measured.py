@@ -27,8 +27,8 @@ def page(results: Path, benchmarks: Path) -> str:
         "program that is compared with (*peers*) ran in the same run, each on one thread. Figures",
         "that were published elsewhere are in the descriptions. Seconds are wall-clock time unless",
         "the key says otherwise. *load* is how many programs wanted the machine's cores when the",
-        "benchmark began and when it ended (- where it was not recorded); if they were more than its",
-        "cores, seconds are too long. Words are in the [glossary](glossary.md).",
+        "benchmark began and when it ended (- where it was not recorded); if they were more than",
+        "its cores, seconds are too long. Words are in the [glossary](glossary.md).",
         "",
     ]
     if not files:
