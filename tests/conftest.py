@@ -18,8 +18,8 @@ from nlsid_core.models import DifferenceEquation
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# Tests in which pages and pictures are drawn. Elsewhere the commands find no matplotlib, as where it
-# is not installed: drawing takes half of their time.
+# Tests in which pages and pictures are drawn. In others the commands find no matplotlib, as where
+# it is not installed: drawing takes half of their time.
 DRAW = {"pictures", "slow", "ros", "colcon", "coq"}
 
 TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
