@@ -103,7 +103,7 @@ def init(
         list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
     ] = None,
     robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
-    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals.")] = False,
     live: Annotated[
         bool, typer.Option("--live", help="Look at the running robot's topics instead of bags.")
     ] = False,
