@@ -74,7 +74,7 @@ def whole_way(bags: Path, config: Path, out: Path) -> str:
     ("options", "response", "excitation"),
     [
         pytest.param((), YAW, "/steering_command:position[name=steering]", marks=pytest.mark.slow),
-        (("-u", CMD), SPEED, CMD),
+        pytest.param(("-u", CMD), SPEED, CMD, marks=pytest.mark.slow),
     ],
 )
 def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
