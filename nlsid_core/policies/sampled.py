@@ -28,15 +28,11 @@ class SampledPolicy:
     model: str
 
     def __post_init__(self) -> None:
-        freeze(self, "policy", ("x", "u", "K", "L"))
-        if self.x.ndim != 2 or self.u.ndim != 2 or not len(self.u):
-            raise ShapeError("policy: x should be (N + 1, n), u (N, p) with N > 0")
+        freeze(self, "policy", {"x": (None, None), "u": (None, None)})
         n, (steps, p) = self.x.shape[1], self.u.shape
-        if len(self.x) != steps + 1 or self.K.shape != (steps, p, n) or self.L.shape != (n, n):
-            raise ShapeError(
-                f"policy: x should be (N + 1, n), u (N, p), K (N, p, n), L (n, n); they are "
-                f"{self.x.shape}, {self.u.shape}, {self.K.shape}, {self.L.shape}"
-            )
+        if not steps:
+            raise ShapeError("policy: u should have one step at least")
+        freeze(self, "policy", {"x": (steps + 1, n), "K": (steps, p, n), "L": (n, n)})
 
     def __len__(self) -> int:
         """The number of steps N."""

@@ -32,11 +32,10 @@ class TubePolicy:
     model: str
 
     def __post_init__(self) -> None:
-        freeze(self, "policy", ("start", "u", "K", "L"))
-        shapes = [getattr(self, key).shape for key in ("start", "u", "K", "L")]
         n = (len(self.K),)
-        if shapes != [n, (len(self.u),), n, n] or not len(self.u):
-            raise ShapeError(f"policy: start, K and L should be (n,), u (N,); they are {shapes}")
+        freeze(self, "policy", {"start": n, "u": (None,), "K": n, "L": n})
+        if not len(self.u):
+            raise ShapeError("policy: u should have one sample at least")
 
     def __len__(self) -> int:
         """The number of planned samples N."""
