@@ -7,7 +7,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.funnels.factor import rounding_of
 from nlsid_core.funnels.tube import FORMAT
 
@@ -164,9 +164,7 @@ class SampledFunnel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "funnel") -> "SampledFunnel":
         """Raises DocumentError if the document is not a sampled funnel."""
-        files.header(document, FORMAT, source=source)
-        if document.get("kind") != KIND:
-            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         nested = files.member(document, "assumption", dict, source=source)
         where = f"{source} assumption"
         runs = files.member(nested, "measured_on", list, source=where)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal
 from nlsid_core.models.spline import Spline
 
@@ -132,10 +132,7 @@ class BlockCascade:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "BlockCascade":
         """Raises DocumentError if the document is not a block cascade."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         bags = files.member(document, "bags", list, source=source)
         return cls(
             a1=files.array(document, "a1", (None,), source=source),

@@ -14,7 +14,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze, keep
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal, objects, signals
 
 KIND = "cell_network"
@@ -200,10 +200,7 @@ class CellNetwork:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "CellNetwork":
         """Raises DocumentError if the document is not a cell network."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         maps = objects(document, "maps", source=source)
         arrays = {
             key: files.array(document, key, (None, None), source=source)

@@ -142,10 +142,9 @@ class DifferenceEquation:
     def from_document(cls, document: Json, *, source: str = "model") -> "DifferenceEquation":
         """Raises DocumentError if the document is not a difference equation."""
         files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
+        if (kind := document.get("kind")) != KIND:
             raise DocumentError(
-                f"{source}: kind is '{kind}', expected '{KIND}', which `model: linear` identifies"
+                f"{source}: kind is {kind!r}, expected '{KIND}', which `model: linear` identifies"
             )
         a = files.array(document, "a", (None,), source=source)
         lo, hi = files.array(document, "u_range", (2,), source=source)

@@ -124,10 +124,7 @@ class MonotoneEquation:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "MonotoneEquation":
         """Raises DocumentError if the document is not a monotone equation."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         signals = files.member(document, "u", list, source=source)
         window = files.array(document, "window", (None, 2), source=source)
         if not all(isinstance(signal, dict) for signal in signals) or (window % 1.0).any():

@@ -178,10 +178,7 @@ class StateAffineModel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "StateAffineModel":
         """Raises DocumentError if the document is not a state-affine model."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         y, u = (signals(document, key, source=source) for key in ("y", "u"))
         window = files.array(document, "window", (None, 2), source=source)
         if (window % 1.0).any():

@@ -150,10 +150,7 @@ def write_fields(model: Any, kind: str, equation: str) -> Json:
 
 def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]:
     """The fields of a model of kind `expected`; DocumentError says what is wrong."""
-    files.header(document, FORMAT, source=source)
-    kind = files.member(document, "kind", str, source=source)
-    if kind != expected:
-        raise DocumentError(f"{source}: kind is '{kind}', expected '{expected}'")
+    files.header(document, FORMAT, source=source, kind=expected)
     x, u = (signals(document, key, source=source) for key in ("x", "u"))
     exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
     if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():

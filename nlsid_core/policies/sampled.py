@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
-from nlsid_core.errors import DocumentError, ShapeError
+from nlsid_core.errors import ShapeError
 from nlsid_core.policies.tube import FORMAT
 
 KIND = "sampled"
@@ -81,9 +81,7 @@ class SampledPolicy:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "policy") -> "SampledPolicy":
         """Raises DocumentError if the document is not a sampled policy."""
-        files.header(document, FORMAT, source=source)
-        if document.get("kind") != KIND:
-            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         u = files.array(document, "u", (None, None), source=source)
         L = files.array(document, "L", (None, None), source=source)
         return cls(
