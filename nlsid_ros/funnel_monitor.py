@@ -29,6 +29,7 @@ from std_srvs.srv import Trigger
 from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
+from bags.signals.grid import seconds
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -43,7 +44,7 @@ from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
-DISCOVERY = 0.1  # s: how often the graph is asked for the signals' types
+LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signals' types
 RETRY = 0.5  # s until a service that has not answered is called again
 THROTTLE = 5.0  # s between log lines about a service that does not answer
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
@@ -151,8 +152,8 @@ class FunnelMonitor(ManagedNode):
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self._patience = self.get_clock() if self._simulated else wall
-        self._clock_ns = -1
-        self.create_timer(DISCOVERY, self._connect, clock=wall)
+        self._clock_ns = self._beat_ns = -1
+        self.create_timer(LOOK, self._look, clock=wall)
         self._retry = self.create_timer(RETRY, self._call, clock=wall)
         self._retry.cancel()
         self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
@@ -211,6 +212,20 @@ class FunnelMonitor(ManagedNode):
             self._tell("the controller tracks another funnel than the one in use here")
             return
         self._publish(self._watch.begin(self._run.start_ns))
+
+    def _look(self) -> None:
+        """Look whether simulated time went back, which would hold up all that waits for a later
+        one; and for the signals' topics.
+        """
+        clock_ns = self._patience.now().nanoseconds
+        back_ns, self._clock_ns = self._clock_ns - clock_ns, clock_ns
+        if back_ns > 0 and self._watch is not None:
+            self._deadlines.clear()
+            self._release.cancel()
+            self._stale.cancel()
+            reason = f"this node's clock went back by {seconds(back_ns, 0):.3g} s"
+            self._publish(self._watch.missing(reason))
+        self._connect()
 
     def _connect(self) -> None:
         """Subscribe to the signals' topics, each with a type that is published and carries them.
@@ -397,10 +412,10 @@ class FunnelMonitor(ManagedNode):
 
     def _on_heartbeat(self) -> None:
         clock_ns = self.get_clock().now().nanoseconds
-        if self._simulated and clock_ns == self._clock_ns and self._watch is not None:
+        if self._simulated and clock_ns == self._beat_ns and self._watch is not None:
             reason = "simulated time stands still: nobody publishes /clock"
             self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN)
-        self._clock_ns = clock_ns
+        self._beat_ns = clock_ns
         self._diagnostics.publish(self._status_message())
         self._slowest_ns = 0
 
