@@ -95,10 +95,9 @@ def measured(benchmark: Benchmark, data: Path | None, limit: float) -> dict[str,
     takes longer than `limit` (s), ValueError if its last line is not one JSON value.
     """
     command = benchmark.command(data)
-    started, date = time.monotonic(), datetime.now(UTC)
-    environment = os.environ | {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
+    started, date, load = time.monotonic(), datetime.now(UTC), os.getloadavg()[0]
     with subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True,
+        command, cwd=ROOT, stdout=subprocess.PIPE, text=True,
         start_new_session=True,
     ) as process:  # fmt: skip
         try:
@@ -113,6 +112,7 @@ def measured(benchmark: Benchmark, data: Path | None, limit: float) -> dict[str,
         "date": date.isoformat(timespec="seconds"),
         "machine": describe(),
         "commit": commit(),
+        "load": [round(load, 1), round(os.getloadavg()[0], 1)],  # of a minute, before and after
         "seconds": round(time.monotonic() - started, 1),
         "result": json.loads(written.strip().rpartition("\n")[2]),
     }
@@ -148,6 +148,7 @@ def main() -> None:
     if unknown := set(options.names) - set(BENCHMARKS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(BENCHMARKS)}")
     options.out.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     missing = []
     for name in options.names or BENCHMARKS:
         print(f"{name} ...", flush=True)

@@ -2,8 +2,10 @@
 
 Subscribes to the funnel, its model and its policy, and to the topics of its signals, of which there
 may be several, by the model's own field paths, on message stamps. Publishes ~/margin
-(sensor_msgs/JointState: stamped, named numbers) for every sample, ~/events when the state changes,
-and /diagnostics at once when it does, otherwise once a second. Leaving the funnel calls
+(sensor_msgs/JointState: stamped, named numbers) for every sample, ~/forecast if asked for (the same
+type: `low` and `high` of each output `ahead` s after the newest sample, at that stamp, while the
+command is held), ~/events when the state changes, and /diagnostics at once when it does, otherwise
+once a second. Leaving the funnel calls
 `stop_service` and `snapshot_service`. Missing, stale or NaN state is unknown (STALE), never inside.
 What is outside, or violates the assumption, stays so until `~/restart`, which begins a new run.
 """
@@ -48,6 +50,8 @@ LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signa
 RETRY = 0.5  # s until a service that has not answered is called again
 THROTTLE = 5.0  # s between log lines about a service that does not answer
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
+LOOK_AHEAD = 0.1  # s between forecasts
+MOST_STEPS = 100  # samples ahead: each takes about as long as judging one
 LEVELS = {
     State.INSIDE: DiagnosticStatus.OK,
     State.WARNING: DiagnosticStatus.WARN,
@@ -90,6 +94,7 @@ class FunnelMonitor(ManagedNode):
         number("warning_time", 0.0, "s: warn if exit is predicted sooner", between=(0.0, 60.0))
         number("hysteresis", 0.0, "margin above a threshold to come back", between=(0.0, 1.0))
         number("clear_after", 0.0, "s a better state lasts before it is said", between=(0.0, 60.0))
+        number("forecast", 0.0, "s ahead of the newest sample; 0: none", between=(0.0, 60.0))
         what = "judge stamps that are not of now: a recording that is played again"
         self._allow_old_stamps = bool(declare(self, "allow_old_stamps", False, what))
         what = "frame_id that the response must have; empty: that of the first"
@@ -107,6 +112,7 @@ class FunnelMonitor(ManagedNode):
         """Take patience and warnings, also in the middle of a run."""
         self._options = AlarmOptions(**{name: values[name] for name in ALARM})
         self._stale_after, self._command_wait = values["stale_after"], values["command_wait"]
+        self._forecast = values["forecast"]
         if self._watch is not None:
             self._watch.warn(self._options)
 
@@ -131,7 +137,9 @@ class FunnelMonitor(ManagedNode):
         self._deadlines: deque[tuple[int, int]] = deque()  # (clock ns, stamp ns) of a response
         self._slowest_ns = 0
         self._judged = 0
+        self._foreseen_ns = -1
         self._margin = self.create_publisher(JointState, "~/margin", qos.STREAM)
+        self._ahead = self.create_publisher(JointState, "~/forecast", qos.STREAM)
         self._events = self.create_publisher(DiagnosticArray, "~/events", qos.EVENTS)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._funnel = DesignSubscription(
@@ -157,6 +165,7 @@ class FunnelMonitor(ManagedNode):
         self._retry = self.create_timer(RETRY, self._call, clock=wall)
         self._retry.cancel()
         self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
+        self.create_timer(LOOK_AHEAD, self._look_ahead, clock=wall)
         self._stale = self.create_timer(self._patient_for, self._on_stale, clock=self._patience)
         self._stale.cancel()
         self._release = self.create_timer(
@@ -354,6 +363,28 @@ class FunnelMonitor(ManagedNode):
         message.name = [*numbers, "latency"]
         message.position = array("d", (*numbers.values(), latency_ns * 1e-9))
         self._margin.publish(message)
+
+    def _look_ahead(self) -> None:
+        """Publish what the outputs can be, once after a newest sample, while the state is known."""
+        watch, (reading, _) = self._watch, self._said
+        if watch is None or not self._forecast or reading.status is Status.UNKNOWN:
+            return
+        steps = min(max(1, round(self._forecast / watch.design.period)), MOST_STEPS)
+        found = watch.forecast(steps)
+        if found is None or not len(found[1].t) or found[0] == self._foreseen_ns:
+            return
+        self._foreseen_ns, (_, (t, low, high, _)) = found[0], found
+        message = JointState()
+        stamp_ns = found[0] + round(float(t[-1]) * 1e9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        ends = zip(low[-1].tolist(), high[-1].tolist(), strict=True)
+        for i, pair in enumerate(ends):
+            index = f"[{i}]" if low.shape[1] > 1 else ""
+            message.name += [f"low{index}", f"high{index}"]
+            message.position.extend(pair)
+        message.name.append("ahead")
+        message.position.append(float(t[-1]))
+        self._ahead.publish(message)
 
     def _tell(self, reason: str) -> None:
         """Unknown, and why, at once."""

@@ -1,8 +1,8 @@
 """Node `viewer`: serves what the monitor says to a browser (`page`) or to Foxglove.
 
-Hears ~/margin of `monitor` and /diagnostics, and publishes nothing. It listens to the margins as
-best effort, so that a slow viewer never holds up the monitor; what it shows is the monitor's word,
-while that is fresh (`bags.viewing.scene`).
+Hears ~/margin and ~/forecast of `monitor` and /diagnostics, and publishes nothing. It listens to
+the margins as best effort, so that a slow viewer never holds up the monitor; what it shows is the
+monitor's word, while that is fresh (`bags.viewing.scene`).
 """
 
 import sys
@@ -48,6 +48,8 @@ class Viewer(ManagedNode):
         self._shown = topic.removesuffix("/margin").removeprefix("/")
         self._scene = Scene(f"live: {self._shown}", self._shown)
         self.create_subscription(JointState, topic, self._on_margin, qos.SENSOR)
+        ahead = f"/{self._shown}/forecast"
+        self.create_subscription(JointState, ahead, self._on_forecast, qos.SENSOR)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, qos.EVENTS)
         server = serve(self._scene, page=self._page, host=self._host, port=self._port)
         address = self._served.enter_context(server)
@@ -56,6 +58,10 @@ class Viewer(ManagedNode):
     def stop(self) -> None:
         """Serve no more."""
         self._served.close()
+
+    def _on_forecast(self, message: JointState) -> None:
+        numbers = dict(zip(message.name, message.position, strict=False))
+        self._scene.forecast(stamp_ns_of(message), numbers)
 
     def _on_margin(self, message: JointState) -> None:
         numbers = dict(zip(message.name, message.position, strict=False))

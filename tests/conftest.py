@@ -1,6 +1,7 @@
 """A synthetic robot with a known truth, small enough for every test to fit its own model."""
 
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,10 @@ from nlsid_core.models import DifferenceEquation
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Tests in which pages and pictures are drawn. In others the commands find no matplotlib, as where
+# it is not installed: drawing takes half of their time.
+DRAW = {"pictures", "slow", "ros", "colcon", "coq"}
 
 TRUE_A = np.array([1.5, -0.56])  # poles 0.7 and 0.8
 TRUE_B = np.array([0.0, 0.05, 0.03])
@@ -53,6 +58,13 @@ def synthetic_dataset(noise: float, *, trials: int = 6, samples: int = 80) -> Da
             )
         )
     return Dataset(tuple(trajectories))
+
+
+@pytest.fixture(autouse=True)
+def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No matplotlib, unless the test is about what is drawn."""
+    if not DRAW & {mark.name for mark in request.node.iter_markers()}:
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 @pytest.fixture(scope="session")

@@ -103,7 +103,7 @@ def init(
         list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
     ] = None,
     robot: Annotated[str, typer.Option(help="What people call it.")] = "robot",
-    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals unasked.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Take the likeliest signals.")] = False,
     live: Annotated[
         bool, typer.Option("--live", help="Look at the running robot's topics instead of bags.")
     ] = False,
@@ -435,6 +435,9 @@ def monitor(
     plot: Annotated[
         Path | None, typer.Option(help="Where to draw; default monitor.png beside the funnel.")
     ] = None,
+    forecast: Annotated[
+        float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
+    ] = 0.0,
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
@@ -470,7 +473,9 @@ def monitor(
         replays = []
         for done, bag in enumerate(folders):
             progress(bag.name, done / len(folders))
-            replays.append(replay_bag(proved, bag, centre=centre, definitions=types))
+            replays.append(
+                replay_bag(proved, bag, centre=centre, definitions=types, forecast=forecast)
+            )
         progress("drawing", 1.0)
         picture = plot or funnel.with_name(documents.MARGIN_PLOT)
         drawn = report_available() and all(entry.half_width for entry in replays)
@@ -478,6 +483,8 @@ def monitor(
             write_margins(picture, replays)
     out.print(show.replay_table(replays))
     for entry in replays:
+        for line in show.forecasts(entry, proved.design) if forecast else ():
+            out.print(line, soft_wrap=True, markup=False, highlight=False)
         if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
         if (alarm := entry.first_alarm) is not None:

@@ -64,13 +64,16 @@ def run_init(
         robot=robot,
         definitions=definitions,
         types=types,
+        widen=not excitations and not asked,
     )
     if definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
             os.path.relpath(path, target.parent) for path in definitions
         ]
     write_atomically(target, yaml_text(proposal).encode())
-    for text in (*chosen_u, *chosen_y):
+    roles = ("excitation", "response")
+    taken = [signal["path"] for role in roles for signal in proposal.content["signals"][role]]
+    for text in taken:
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
     for wall in dict.fromkeys(proposal.walls):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
@@ -78,7 +81,7 @@ def run_init(
     given = "TRIALS" if live else " ".join(map(str, bags))
     if live:
         topics = dict.fromkeys(
-            factor.path.topic for text in (*chosen_u, *chosen_y) for factor in parse_factors(text)
+            factor.path.topic for text in taken for factor in parse_factors(text)
         )
         console.print(
             "this was a look at the running robot: record trials of it (folder TRIALS), then run "

@@ -1,7 +1,7 @@
 """What the commands of the chain print."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 
 from rich.box import SIMPLE_HEAD
@@ -13,10 +13,12 @@ from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
+from bags.designs.design import AnyDesign
 from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
 from nlsid_core.errors import DataError, duration, percent
@@ -259,6 +261,24 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
 def width_lines(catching: Catching) -> list[str]:
     """Every output's half-width beside its range."""
     return [f"half-width of {width.name}: {width.said}, {width.part}" for width in catching.widths]
+
+
+def forecasts(replay: Replay, design: AnyDesign) -> Iterator[str]:
+    """How many outputs were as forecast, and how wide the forecasts are at their ends."""
+    ends = [fan[-1] for fan in replay.fans if len(fan) > 1]
+    if not ends:
+        yield f"{replay.name}: no forecast was made"
+        return
+    kept = [entry.kept for entry in replay.forecasts if entry.ahead]
+    longest = max(entry.ahead for entry in ends)
+    whole = [entry for entry in ends if entry.ahead == longest]
+    yield (
+        f"{replay.name}: {len(ends)} forecasts, under the commands that came, hold "
+        f"{sum(kept)} of {len(kept)} samples; their half-width after {longest:.3g} s:"
+    )
+    for i, name in enumerate(signal_names(design)):
+        halves = [(entry.high[i] - entry.low[i]) / 2.0 for entry in whole]
+        yield f"  {name}: {sum(halves) / len(halves):.3g} on average, at most {max(halves):.3g}"
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -9,7 +9,7 @@ from typing import Any
 from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
-from bags.monitoring.watch import Stamped, Watch
+from bags.monitoring.watch import Forecasted, Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
@@ -29,6 +29,7 @@ class Replay:
     """One bag's readings, and what a summary says of them.
 
     axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
+    forecasts: those that were followed, one after another, if any were asked for.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Replay:
     unit: str
     half_width: float
     period: float = 0.0
+    forecasts: tuple[Forecasted, ...] = ()
 
     @property
     def span(self) -> float:
@@ -49,6 +51,16 @@ class Replay:
     def judged_span(self) -> float:
         """S of it that were judged."""
         return min(self.period * len(self.judged), self.span)
+
+    @property
+    def fans(self) -> list[list[Forecasted]]:
+        """The forecasts, each from where it begins."""
+        found: list[list[Forecasted]] = []
+        for entry in self.forecasts:
+            if entry.ahead == 0.0:
+                found.append([])
+            found[-1].append(entry)
+        return found
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:
@@ -133,14 +145,16 @@ def replay_bag(
     *,
     centre: Centre,
     definitions: Definitions | None = None,
+    forecast: float = 0.0,
 ) -> Replay:
     """Every response in `bag` held against a funnel.
 
-    definitions: of message types that the bag does not define. Raises BagError as
-    `replay_messages`.
+    definitions: of message types that the bag does not define. forecast: s ahead, of forecasts that
+    each begin where the one before ends, under the commands in the bag; 0: none. Raises BagError as
+    `replay_messages`, DataError of a forecast with a funnel that gives none.
     """
     design = proved.design
-    stamped = replay_messages(design, bag, centre=centre, definitions=definitions)
+    stamped, forecasts = _replayed(design, bag, centre, definitions, forecast)
     unit, half_width = "", 0.0
     if is_tube(design) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, design.funnel.half_width
@@ -152,6 +166,7 @@ def replay_bag(
         unit=unit,
         half_width=half_width,
         period=design.period,
+        forecasts=tuple(forecasts),
     )
 
 
@@ -169,17 +184,29 @@ def replay_messages(
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
     """
+    return _replayed(design, bag, centre, definitions, 0.0)[0]
+
+
+def _replayed(
+    design: AnyDesign,
+    bag: Path | str,
+    centre: Centre,
+    definitions: Definitions | None,
+    forecast: float,
+) -> tuple[list[Stamped], list[Forecasted]]:
+    """The readings, and the forecasts that were followed."""
     bag = place(bag)
     planned = centre is Centre.PROFILE or design.has_plan
     announced = planned and bool(announced_runs(design, bag, definitions))
-    watch = Watch(design, centre=centre, announced=announced)
+    steps = max(1, round(forecast / design.period)) if forecast > 0.0 else 0
+    watch = Watch(design, centre=centre, announced=announced, steps=steps)
     stamped = [
         entry for said in _fed(watch, bag, definitions, announced=announced) for entry in said
     ]
     stamped += watch.end()
     if not stamped:
         raise BagError(f"{bag}: no sample with all of {watch.pairing}")
-    return stamped
+    return stamped, watch.forecasts
 
 
 def announced_runs(

@@ -34,7 +34,8 @@ td code { white-space: nowrap } .digests td code { white-space: normal }
 @page { size: A4; margin: 15mm }
 @media print { nav { display: none } h2, h3 { break-after: avoid }
   figure, tr, svg { break-inside: avoid } section { overflow: visible }
-  table { font-size: .8em } th, td { padding: .2rem .4rem; white-space: normal }
+  table { font-size: .8em } th, td { padding: .2rem .4rem }
+  th, td:first-child, td[colspan] { white-space: normal }
   body { max-width: none; margin: 0; font-size: 11pt } }
 """
 PICTURES = {

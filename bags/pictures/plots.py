@@ -19,7 +19,7 @@ LINE = 1.2
 def svg(figure: Figure) -> str:
     """The figure as an <svg> element to put into a page."""
     stream = io.StringIO()
-    figure.savefig(stream, format="svg", bbox_inches="tight")
+    _laid_out(figure).savefig(stream, format="svg")
     text = stream.getvalue()
     return text[text.index("<svg") :]
 
@@ -27,8 +27,16 @@ def svg(figure: Figure) -> str:
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file's content."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=130, bbox_inches="tight")
+    _laid_out(figure).savefig(stream, format="png", dpi=130)
     return stream.getvalue()
+
+
+def _laid_out(figure: Figure) -> Figure:
+    """With the places that its layout computes fixed, so that it is drawn once and not twice."""
+    if (engine := figure.get_layout_engine()) is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+    return figure
 
 
 def write_png(path: Path, figure: Figure) -> None:
@@ -82,6 +90,13 @@ def _tube(axes: Axes, replay: Replay) -> None:
         t, nominal - width, nominal + width, color=BLUE, alpha=0.18, lw=0, label="proved tube"
     )
     axes.plot(t, nominal, color=BLUE, lw=LINE, label="nominal")
+    label = "forecast from its present estimate"
+    for fan in replay.fans:
+        axes.fill_between(
+            [f.t for f in fan], [f.low[0] for f in fan], [f.high[0] for f in fan],
+            color=ORANGE, alpha=0.35, lw=0, label=label,
+        )  # fmt: skip
+        label = ""
     everything = replay.readings
     measured = [_output(r.measured) for r in everything]
     axes.plot([r.t for r in everything], measured, color=INK, lw=LINE, label="measured")

@@ -163,16 +163,16 @@ class Prepared:
         self._blocks = [block for block in blocks if isinstance(block, ListedBlock)]
         self._place = {block.offset: i for i, block in enumerate(self._blocks)}
         self._channels: frozenset[int] = frozenset()
-        self._ready: set[int] = set()
+        self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
 
     def block(self, block: ListedBlock, channels: Collection[int]) -> Block:
         """The block with its index read, and with everything fetched that the channels need."""
         if not self._channels.issuperset(channels):
-            self._channels, self._ready = frozenset(channels), set()
+            self._channels, self._ready = frozenset(channels), {}
         if block.offset not in self._ready:
             window = list(self._window(block))
-            self._ready = {ahead.offset for ahead in window}
             self._path.fetch(_span(ahead) for ahead in window)
+            self._ready = {ahead.offset: self._entries_of(ahead) for ahead in window}
             self._path.fetch(
                 span for ahead in window if not ahead.compression for span in self._messages(ahead)
             )
@@ -195,23 +195,29 @@ class Prepared:
                 held += block.size
                 yield block
 
-    def _messages(self, block: Block) -> Iterator[tuple[int, int]]:
-        """(first byte, end) of each wanted message's record, up to the next record of a message."""
-        listed = self._blocks[self._place[block.offset]]
-        every = {c: self._entries(listed, c) for c in listed.index or ()}
-        starts = np.unique(np.concatenate([*every.values(), [block.uncompressed_size]]))
-        if len(starts) and (starts[0] < 0 or starts[-1] > block.uncompressed_size):
+    def _messages(self, block: Block) -> list[tuple[int, int]]:
+        """(first byte, end) of the wanted messages' records: runs without a gap of GAP_BYTES.
+
+        A record ends where the next record of a message begins.
+        """
+        every = self._ready[block.offset]
+        size = block.uncompressed_size
+        starts = np.unique(np.concatenate([*every.values(), [size]]))
+        if starts[0] < 0 or starts[-1] > size:
             raise BagError(f"a message index of the chunk at byte {block.offset} points outside it")
-        for channel in self._channels & every.keys():
-            after = starts[np.searchsorted(starts, every[channel], side="right")]
-            for start, end in zip(every[channel].tolist(), after.tolist(), strict=True):
-                yield block.offset + start, block.offset + end
+        wanted = [every[channel] for channel in self._channels & every.keys()]
+        first = np.unique(np.concatenate(wanted)) if wanted else np.empty(0, np.int64)
+        if not len(first):
+            return []
+        ends = starts[np.searchsorted(starts, first, side="right")]
+        gaps = np.flatnonzero(first[1:] > ends[:-1] + GAP_BYTES)
+        runs = block.offset + first[np.r_[0, gaps + 1]], block.offset + ends[np.r_[gaps, -1]]
+        return list(zip(*(edge.tolist() for edge in runs), strict=True))
 
     def _indexed(self, block: ListedBlock) -> Block:
         index = {}
         for channel, (at, _) in (block.index or {}).items():
-            entries = self._entries(block, channel)
-            index[channel] = (at + RECORD.size + 6, len(entries))
+            index[channel] = (at + RECORD.size + 6, len(self._ready[block.offset][channel]))
         crc = 0
         if block.compression:
             header = self._path.read_range(block.record, block.offset)
@@ -220,6 +226,9 @@ class Prepared:
             block.offset, block.size, block.compression, block.uncompressed_size, crc,
             block.start_ns, index,
         )  # fmt: skip
+
+    def _entries_of(self, block: ListedBlock) -> dict[int, IntArray]:
+        return {channel: self._entries(block, channel) for channel in block.index or ()}
 
     def _entries(self, block: ListedBlock, channel: int) -> IntArray:
         """Offsets of the channel's messages in the chunk, as its index record has them."""

@@ -21,7 +21,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
-from bags.setup.candidates import Found, slope_window
+from bags.setup.candidates import Found, Pair, slope_window
 from bags.signals.columns import read_columns
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
@@ -72,6 +72,7 @@ class Proposal:
     content: dict[str, Any]
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
+    error: float = math.inf  # %, of the best model that was tried, in simulation
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
         """As the later steps read it."""
@@ -112,10 +113,13 @@ def propose(
     robot: str,
     definitions: Sequence[Path] = (),
     types: Mapping[str, Definition] | None = None,
+    widen: bool = False,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
 
-    Raises BagError and DataError if the bags cannot be read as any configuration says.
+    widen: where models of one excitation are poor, take those too that the response follows
+    besides, if that is better. Raises BagError and DataError if the bags cannot be read as any
+    configuration says.
     """
     texts = [*responses, *excitations]
     if twice := next((text for text in texts if texts.count(text) > 1), None):
@@ -147,7 +151,18 @@ def propose(
     else:
         _say_degree(proposal, trials.train)
     _say_funnel(proposal)
-    return proposal
+    others = [pair.command.text for pair in _followed(proposal, found)]
+    if not (widen and proposal.error > POOR and others):
+        return proposal
+    wider = propose(
+        bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
+        definitions=definitions, types=types,
+    )  # fmt: skip
+    if not wider.error < proposal.error:
+        return proposal
+    without = f"; without it models are off by {proposal.error:.3g} %"
+    wider.why |= {text: wider.why[text] + without for text in others}
+    return wider
 
 
 @dataclass(frozen=True)
@@ -502,7 +517,7 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
             f"response that adds up its command for ever needs |derivative({window:g} s)"
         )
         return
-    best = min(known.values())
+    best = proposal.error = min(known.values())
     good = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
     others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
     for lags in (good, *others):
@@ -517,13 +532,17 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
         proposal.walls.append(_poor(best, where.removeprefix("on ")) + _others(proposal, found))
 
 
-def _others(proposal: Proposal, found: Found) -> str:
-    """The other commands that the response follows, for people."""
+def _followed(proposal: Proposal, found: Found) -> list[Pair]:
+    """The pairs of the first response with commands that were not chosen and that it follows."""
     signals = proposal.content["signals"]
     chosen = {signal["path"] for signal in signals["excitation"]}
-    follows = [p for p in found.best_for(signals["response"][0]["path"])
-               if p.command.text not in chosen and abs(p.correlation) >= RELATED]  # fmt: skip
-    said = ", ".join(f"{p.command.text} ({p.correlation:+.2f})" for p in follows[:OTHERS])
+    pairs = found.best_for(signals["response"][0]["path"])
+    follows = [p for p in pairs if p.command.text not in chosen and abs(p.correlation) >= RELATED]
+    return follows[:OTHERS]
+
+
+def _others(proposal: Proposal, found: Found) -> str:
+    said = ", ".join(f"{p.command.text} ({p.correlation:+.2f})" for p in _followed(proposal, found))
     return f": it follows {said} too (-u, once for each)" if said else ""
 
 
@@ -550,7 +569,7 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
                     known[tried] = error
     if not known:
         return
-    best = min(known.values())
+    best = proposal.error = min(known.values())
     good = min((c for c, error in known.items() if error * LAGS_BETTER <= best),
                key=lambda c: c.lags + _terms(c))  # fmt: skip
     section |= {"lags": good.lags, "right_degree": good.right_degree}

@@ -1,8 +1,9 @@
 """The same for Foxglove: its websocket protocol, by foxglove-sdk (extra `view`).
 
-Topics: /nlsid/margin, /nlsid/signals, /nlsid/status (JSON) and /nlsid/events (foxglove.Log), logged
-at the judged samples' stamps. config/foxglove_layout.json shows them. The first viewer that comes
-is sent the events of before, which bear their stamps; it draws samples when they arrive.
+Topics: /nlsid/margin, /nlsid/signals, /nlsid/forecast, /nlsid/status (JSON) and /nlsid/events
+(foxglove.Log), logged at the judged samples' stamps, a forecast at that of the sample it was made
+after. config/foxglove_layout.json shows them. The first viewer that comes is sent the events of
+before, which bear their stamps; it draws samples when they arrive.
 """
 
 import importlib.util
@@ -17,8 +18,8 @@ from nlsid_core.errors import DataError
 
 TICK: Final = 0.05  # s between looks at the scene
 REPEAT: Final = 10  # ticks: the status is said twice a second while it stays the same
-MARGIN, SIGNALS, STATUS, EVENTS = (
-    f"/nlsid/{name}" for name in ("margin", "signals", "status", "events")
+MARGIN, SIGNALS, FORECAST, STATUS, EVENTS = (
+    f"/nlsid/{name}" for name in ("margin", "signals", "forecast", "status", "events")
 )
 _NUMBER = {"type": "number"}
 _TEXT = {"type": "string"}
@@ -33,6 +34,16 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
                 | dict.fromkeys(("nominal", "lower", "upper", "measured"), _NUMBER),
             },
         }
+    },
+    FORECAST: {
+        "ahead": _NUMBER,
+        "signals": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {"name": _TEXT, "lower": _NUMBER, "upper": _NUMBER},
+            },
+        },
     },
     STATUS: {"word": _TEXT, "level": {"type": "integer"}, "text": _TEXT, "source": _TEXT},
 }
@@ -91,7 +102,7 @@ def _send(scene: Scene, context: Any, first: threading.Event, closing: threading
         for topic, properties in SCHEMAS.items()
     }
     log = LogChannel(EVENTS, context=context)
-    sampled = told = tick = 0
+    sampled = told = tick = foreseen_ns = 0
     newest_ns, before = 0, None
     while not closing.wait(TICK):
         if first.is_set():
@@ -103,6 +114,12 @@ def _send(scene: Scene, context: Any, first: threading.Event, closing: threading
             newest_ns = max(newest_ns, sample.stamp_ns)
             channels[MARGIN].log(_margin(sample), log_time=sample.stamp_ns)
             channels[SIGNALS].log(_signals(sample, scene.names), log_time=sample.stamp_ns)
+        for each in scene.forecasts_after(foreseen_ns):
+            foreseen_ns = max(foreseen_ns, each.stamp_ns)
+            ahead = each.numbers.get("ahead", 0.0)
+            made_ns = each.stamp_ns - round(ahead * 1e9)
+            said_ahead = {"ahead": ahead, "signals": _ends(each, scene.names)}
+            channels[FORECAST].log(said_ahead, log_time=made_ns)
         for event in events:
             newest_ns = max(newest_ns, event.stamp_ns)
             log.log(_log(event), log_time=event.stamp_ns)
@@ -131,6 +148,16 @@ def _signals(sample: Sample, names: tuple[str, ...]) -> dict[str, Any]:
         known: dict[str, Any] = {n: v for n, v in numbers.items() if math.isfinite(v)}
         entries.append({"name": names[i] if i < len(names) else f"signal {i + 1}"} | known)
     return {"signals": entries}
+
+
+def _ends(forecast: Sample, names: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Lower and upper of every signal, where they are finite."""
+    found = []
+    for i, name in enumerate(names):
+        numbers = {"lower": forecast.signal("low", i), "upper": forecast.signal("high", i)}
+        known: dict[str, Any] = {n: v for n, v in numbers.items() if math.isfinite(v)}
+        found.append({"name": name} | known)
+    return found
 
 
 def _log(event: Event) -> Any:

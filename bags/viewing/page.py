@@ -106,9 +106,11 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _news(scene: Scene, closing: threading.Event) -> Iterator[dict[str, Any]]:
     """What changed, every TICK; first what is known of the past."""
-    sampled = told = 0
+    sampled = told = foreseen_ns = 0
     most, wait = PER_START, 0.0
     while not closing.wait(wait):
+        forecasts = scene.forecasts_after(foreseen_ns)
+        foreseen_ns = max([foreseen_ns, *(each.stamp_ns for each in forecasts)])
         sampled, samples = scene.samples_after(sampled, most)
         told, events = scene.events_after(told)
         verdict, now = scene.verdict(), time.monotonic()
@@ -118,6 +120,7 @@ def _news(scene: Scene, closing: threading.Event) -> Iterator[dict[str, Any]]:
             "verdict": [verdict.word, verdict.level, verdict.text],
             "names": scene.names,
             "samples": [_sample(sample, now) for sample in samples],
+            "forecasts": [_forecast(each, len(scene.names)) for each in forecasts],
             "events": [_event(event) for event in events],
             "nodes": [
                 [name, said.level, said.text, round(now - said.came, 1)]
@@ -136,6 +139,12 @@ def _sample(sample: Sample, now: float) -> list[Any]:
     ]
     age = round(now - sample.came, 3)
     return [sample.stamp_ns / 1e9, age, *map(_number, numbers), signals]
+
+
+def _forecast(forecast: Sample, signals: int) -> list[Any]:
+    """Stamp in s, then low and high of every signal."""
+    ends = [[_number(forecast.signal(n, i)) for n in ("low", "high")] for i in range(signals)]
+    return [forecast.stamp_ns / 1e9, ends]
 
 
 def _event(event: Event) -> Sequence[Any]:

@@ -18,6 +18,7 @@ OK, WARN, ERROR, STALE = range(4)  # as diagnostic_msgs/DiagnosticStatus has the
 SILENT: Final = 2.5  # s without the monitor's status, which it repeats every second
 LATE: Final = 1.0  # s without a sample from a monitor that says inside
 MOST_SAMPLES: Final = 20_000  # kept: 20 s at 1 kHz
+MOST_FORECASTS: Final = 400  # kept: 20 s at 20 a second
 MOST_EVENTS: Final = 200
 MOST_NODES: Final = 32
 LONGEST_TEXT: Final = 300  # characters of anything that came from outside
@@ -28,6 +29,8 @@ MONITORING: Final = ("margin", "assumption", "time_to_exit", "latency")
 class Sample(NamedTuple):
     """One judged sample: stamp in ns, when it came in s of `time.monotonic`, its numbers by name
     (`margin`, `assumption`, `nominal`, `measured`, `half_width`; indexed where there are several).
+
+    Or a forecast, at the stamp that it is about: `low`, `high`, and `ahead`, s since it was made.
     """
 
     stamp_ns: int
@@ -35,7 +38,7 @@ class Sample(NamedTuple):
     numbers: Mapping[str, float]
 
     def signal(self, name: str, index: int) -> float:
-        """`nominal`, `measured` or `half_width` of a signal; NaN if it is not known."""
+        """`nominal`, `measured`, `half_width`, `low` or `high` of one; NaN if it is not known."""
         found = self.numbers.get(f"{name}[{index}]", self.numbers.get(name) if index == 0 else None)
         return math.nan if found is None else found
 
@@ -78,6 +81,7 @@ class Scene:
         self.source, self.monitor = clean(source), clean(monitor)
         self._lock = threading.Lock()
         self._samples: deque[Sample] = deque(maxlen=MOST_SAMPLES)
+        self._forecasts: deque[Sample] = deque(maxlen=MOST_FORECASTS)
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._nodes: dict[str, Said] = {}
         self._names: tuple[str, ...] = ()
@@ -89,6 +93,16 @@ class Scene:
         with self._lock:
             self._samples.append(Sample(stamp_ns, time.monotonic(), dict(numbers)))
             self._sampled += 1
+
+    def forecast(self, stamp_ns: int, numbers: Mapping[str, float]) -> None:
+        """Said of a sample that has not come yet."""
+        with self._lock:
+            self._forecasts.append(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+
+    def forecasts_after(self, stamp_ns: int) -> list[Sample]:
+        """Those about a later stamp."""
+        with self._lock:
+            return [each for each in self._forecasts if each.stamp_ns > stamp_ns]
 
     def say(
         self, stamp_ns: int, node: str, level: int, text: str, *, names: Sequence[str] = ()

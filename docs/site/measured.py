@@ -25,17 +25,23 @@ def page(results: Path, benchmarks: Path) -> str:
         "",
         "These figures are written by `make benchmarks`, each with its date, machine and commit. A",
         "program that is compared with (*peers*) ran in the same run, each on one thread. Figures",
-        "that were published elsewhere are in the descriptions. Seconds are wall-clock time, on a",
-        "machine that other programs used too. Words are in the [glossary](glossary.md).",
+        "that were published elsewhere are in the descriptions. Seconds are wall-clock time unless",
+        "the key says otherwise. *load* is how many programs wanted the machine's cores when the",
+        "benchmark began and when it ended (- where it was not recorded); if they were more than",
+        "its cores, seconds are too long. Words are in the [glossary](glossary.md).",
         "",
     ]
     if not files:
         return "\n".join([*lines, "No results lie in benchmarks/results of this checkout.", ""])
-    lines += ["| benchmark | measured | took | commit | peers |", "|---|---|---|---|---|"]
+    lines += [
+        "| benchmark | measured | took | load | commit | peers |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, found in files:
         lines.append(
             f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | "
-            f"{found['seconds']:g} s | {found['commit'][:8]} | {_peers(found['result'])} |"
+            f"{found['seconds']:g} s | {' to '.join(map(str, found.get('load', '-')))} | "
+            f"{found['commit'][:8]} | {_peers(found['result'])} |"
         )
     if without := sorted(BENCHMARKS.keys() - dict(files).keys()):
         lines += ["", f"Not measured on this checkout: {', '.join(without)}. To measure one:", ""]

@@ -12,7 +12,10 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from nlsid_core import files
+from nlsid_core.arrays import FloatArray
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateMismatch, DataError, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -29,10 +32,11 @@ from nlsid_core.running.comparison import (
     PlanComparison,
     SampledComparison,
 )
+from nlsid_core.running.forecast import Forecast
 from nlsid_core.running.grid import Grid
 from nlsid_core.running.held import Held
 from nlsid_core.running.reading import Level, Reading, Status
-from nlsid_core.running.tubes import TubeRun
+from nlsid_core.running.tubes import Ahead, TubeRun
 
 OVER = "the proof covers"  # how the reason of every reading after the end begins
 INSIDE, TUBE = Status.INSIDE, Level.TUBE
@@ -169,6 +173,31 @@ class Monitor:
             return self._tubes.missing(t, reason, doubted=doubted)
         self._ended = self._ended or reason
         return Reading(t, Status.UNKNOWN, reason=self._ended)
+
+    def ahead(self) -> Ahead:
+        """What the outputs can be at the next samples, from here; of tubes around a simulation.
+
+        DataError of other funnels.
+        """
+        if not self.goes_on:
+            raise DataError(
+                "a forecast is made from a tube around the model's simulation; around a plan, the "
+                "plan and its funnel say what comes"
+            )
+        return self._tubes.ahead()
+
+    def forecast(self, u: FloatArray) -> Forecast:
+        """`ahead` under the inputs u (h, n_u) of the next h samples."""
+        ahead, found = self.ahead(), []
+        for now in u:
+            bounds = ahead.step(now)
+            if bounds is None:
+                break
+            found.append(bounds)
+        period = self._tubes.period
+        bounds_of = np.reshape(found, (len(found), 2, -1)) if found else np.zeros((0, 2, 0))
+        t = period * np.arange(1, len(found) + 1)
+        return Forecast(t, bounds_of[:, 0], bounds_of[:, 1], ahead.ended)
 
     def update(self, t: float, y: Any, u: Any) -> Reading:
         """The reading at stamp t (s) for the output or state y and the input u."""

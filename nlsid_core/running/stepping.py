@@ -6,6 +6,7 @@ every class has one. Several states are advanced at once; what depends on the in
 computed once for them. The state is that of docs/certificate_stability.md, "The increment form".
 """
 
+import copy
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -63,6 +64,12 @@ class Stepper:
         self._past.extend(u[max(0, len(u) - self._kind.delays - 1) :])
         state: FloatArray = self._kind.begin(y, u)
         return state
+
+    def ahead(self) -> "Stepper":
+        """Another one in the same place, whose steps leave this one where it is."""
+        other = copy.copy(self)
+        other._past = self._past.copy()
+        return other
 
     def advance(self, x: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Outputs (B, p) and next states (B, n) of states x (B, n) under the input u (n_u,) now.

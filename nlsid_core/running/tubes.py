@@ -8,6 +8,7 @@ more numbers of state. Beside the tubes there may be an assumption about the out
 and CUSUM of the innovation, an alarm that nothing rests on. Source: docs/certificate_tube.md.
 """
 
+import copy
 import math
 from collections import deque
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
+from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status
 from nlsid_core.running.stepping import Stepper
@@ -87,6 +89,7 @@ class TubeRun:
             for f in boxed
         ]
         self._assuming = [assuming(funnel.tubes) for funnel in funnels]
+        self._linear, self._reach = linear_form(model), np.zeros((0, len(tubes), p))
         self.restart()
 
     def restart(self) -> None:
@@ -124,6 +127,10 @@ class TubeRun:
         if self._x is None:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
+
+    def ahead(self, funnel: int = 0) -> "Ahead":
+        """What follows from here while funnel number `funnel` keeps what it assumes."""
+        return Ahead(self, funnel)
 
     def missing(self, t: float, reason: str, *, doubted: bool = False) -> Reading:
         """The reading at t (s) where no sample came; the run goes on with the next one.
@@ -181,7 +188,7 @@ class TubeRun:
         if self._x is None or not known:
             self._begin(fault)
             return ""
-        _, after, refused = self._advance(u)
+        _, after, refused = self._advance(self._stepper, self._x, u)
         if refused:
             self._begin(refused)
             return refused
@@ -203,12 +210,12 @@ class TubeRun:
         why = f" of a new run: {self._ended}" if self._ended else ""
         return self._unknown(t, y, f"{STARTING} {self.lags} samples{why}")
 
-    def _advance(self, u: FloatArray) -> tuple[FloatArray, FloatArray, str]:
+    def _advance(
+        self, stepper: Stepper, x: FloatArray, u: FloatArray
+    ) -> tuple[FloatArray, FloatArray, str]:
         """Outputs and next states, and why there are none or nothing is known of them."""
-        x = self._x
-        assert x is not None
         try:
-            outputs, after = self._stepper.advance(x, u)
+            outputs, after = stepper.advance(x, u)
         except (DataError, SolverError) as error:
             return x, x, str(error)
         for (y_low, y_high), (u_low, u_high), (x_low, x_high) in self._boxes:
@@ -228,7 +235,8 @@ class TubeRun:
             self._g = {j: meter.update(now) for j, meter in self._meters.items()}
 
     def _judge(self, t: float, y: FloatArray, u: FloatArray) -> list[Reading]:
-        outputs, after, refused = self._advance(u)
+        assert self._x is not None
+        outputs, after, refused = self._advance(self._stepper, self._x, u)
         if refused:
             refused = f"{refused}, at t = {t:g} s"
             self._begin(refused)
@@ -237,7 +245,7 @@ class TubeRun:
         e = y - outputs[:-1]
         simulated = outputs[-1]
         deviation = y - simulated
-        level, widths = self._followed() if self._follow else (self._level, self._widths)
+        level, widths = self._followed(self._g)
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
             if self._single_R is not None:
                 used = self._single_R * (e[:, 0] * e[:, 0])
@@ -268,9 +276,11 @@ class TubeRun:
         judged = _Judged(t, sizes.tolist(), spent, level, widths, nominal, measured, away)
         return [self._reading(i, judged, innovations[rows[0]]) for i, rows in enumerate(self._rows)]
 
-    def _followed(self) -> tuple[FloatArray, FloatArray]:
-        """Levels (tubes,) and half-widths (tubes, p) at this sample."""
-        room = np.array([max(self._g[j][0], TINY) if j in self._g else 1.0
+    def _followed(self, g: dict[int, list[float]]) -> tuple[FloatArray, FloatArray]:
+        """Levels (tubes,) and half-widths (tubes, p) at a sample with this g."""
+        if not g:
+            return self._level, self._widths
+        room = np.array([max(g[j][0], TINY) if j in g else 1.0
                          for j in range(len(self._tubes))])  # fmt: skip
         return self._level * room, self._widths * np.sqrt(room)[:, None]
 
@@ -312,12 +322,12 @@ class TubeRun:
         """
         t, sizes, spent, level, widths, nominal, measured, away = judged
         alarm = self._alarm(i, innovation)
-        samples, k = self._samples, self._k
-        lasting = [j for j in self._rows[i] if samples[j] is None or k <= (samples[j] or 0)]
+        lasting = self._lasting(i, self._k)
         if not lasting:
+            covered = self._samples[self._rows[i][0]]
             return Reading(
                 t, Status.UNKNOWN, measured=measured, alarm=alarm,
-                reason=f"the proof covers {samples[self._rows[i][0]]} samples; they are over",
+                reason=f"the proof covers {covered} samples; they are over",
             )  # fmt: skip
         row = max((sizes[j] for j in lasting), key=max)
         size = max(row)
@@ -346,6 +356,17 @@ class TubeRun:
             tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
         )  # fmt: skip
 
+    def _reached(self, steps: int) -> FloatArray:
+        """(tubes, p) of `reach` after so many steps; found for twice as many where they are new."""
+        if steps > len(self._reach):
+            parts = [reach(tube, self._linear, 2 * steps) for tube in self._tubes]
+            self._reach = np.stack(parts, axis=1)
+        return np.asarray(self._reach[steps - 1])
+
+    def _lasting(self, i: int, k: int) -> list[int]:
+        """The tubes of funnel i whose proof covers k samples."""
+        return [j for j in self._rows[i] if (ends := self._samples[j]) is None or k <= ends]
+
     def _exit(self, i: int, t: float, margin: float) -> float:
         """S until the margin is 0 if it goes on falling as over the last samples."""
         before, earlier = self._fall[i][0] if self._fall[i] else (t, margin)
@@ -357,6 +378,44 @@ class TubeRun:
     def _unknown(self, t: float, y: FloatArray, reason: str) -> list[Reading]:
         measured = tuple(y.tolist())
         return [Reading(t, Status.UNKNOWN, measured=measured, reason=reason)] * len(self._funnels)
+
+
+class Ahead:
+    """A second simulation from a run's present estimate, and how far the robot can be from it.
+
+    `step` once for each next sample, with its inputs. Where it says nothing, `ended` says why, and
+    it never says anything again. The run goes on as if this were not there.
+    """
+
+    def __init__(self, run: TubeRun, funnel: int) -> None:
+        self._run, self._funnel = run, funnel
+        self._x, self._k, self._spent, self._g = run._x, run._k, run._spent, run._g
+        self._stepper, self._meters = run._stepper.ahead(), copy.deepcopy(run._meters)
+        self.steps = 0
+        self.ended = "no run has begun" if self._x is None else ""
+
+    def step(self, u: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Between which values (p,) the outputs are at the next sample, under its inputs u (n_u,).
+
+        Within the funnel's tubes too.
+        """
+        run = self._run
+        if self.ended or self._x is None:
+            return None
+        outputs, self._x, self.ended = run._advance(self._stepper, self._x, u)
+        self.steps += 1
+        self._g = {j: meter.update(u.tolist()) for j, meter in self._meters.items()}
+        level, widths = run._followed(self._g)
+        left = level * (1.0 + OUTWARD) - run._rho**self.steps * self._spent * (1.0 - OUTWARD)
+        lasting = run._lasting(self._funnel, self._k + self.steps)
+        if not lasting or not (left[lasting] >= 0.0).all():
+            self.ended = self.ended or "what the tube assumes is broken, or over"
+        if self.ended:
+            return None
+        beside = np.sqrt(left[lasting, None] * run._reached(self.steps)[lasting])
+        centres = np.vstack([outputs[lasting], np.tile(outputs[-1], (len(lasting), 1))])
+        room = np.vstack([beside, widths[lasting]]) * (1.0 + OUTWARD)
+        return (centres - room).max(axis=0), (centres + room).min(axis=0)
 
 
 class _Judged(NamedTuple):

@@ -220,6 +220,7 @@ def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     assert "refused was not tried: no such input" in said.get()
 
 
+@pytest.mark.pictures
 def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> None:
     figure = draw(found)
     (errors,), (caught,) = (part.axes for part in figure.subfigs)
@@ -228,6 +229,7 @@ def test_the_picture_has_a_bar_for_every_fault_and_detector(found: Catching) -> 
     assert [label.get_text() for label in caught.get_yticklabels()] == [r.fault for r in found.rows]
 
 
+@pytest.mark.pictures
 def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     """Half-widths are those of the readings: their mean, least and most on calibration trials."""
     made = follower("following")

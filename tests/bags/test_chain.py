@@ -86,6 +86,7 @@ def test_errors_without_the_calibration_trials_are_as_documented(
     assert len(result.train) == 17
 
 
+@pytest.mark.slow
 def test_test_trials_do_not_influence_the_model(
     config: Config, chain: Path, tmp_path: Path
 ) -> None:
@@ -393,6 +394,7 @@ def test_a_faulty_copy_differs_only_in_its_signal(tmp_path: Path) -> None:
     np.testing.assert_array_equal(copy.u, original.u)
 
 
+@pytest.mark.pictures
 def test_monitor_command_summarises_draws_and_ends_with_status_0(chain: Path) -> None:
     bags = [str(trial(name)) for name in TEST]
     done = CliRunner().invoke(

@@ -11,6 +11,8 @@ from examples import one_dimensional
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core.design import FunnelDesign, design_funnel
 
+pytestmark = pytest.mark.pictures
+
 
 @pytest.fixture(scope="module")
 def satellite() -> FunnelDesign:

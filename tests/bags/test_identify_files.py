@@ -148,6 +148,7 @@ def test_a_stronger_claim_needs_another_proof(made: tuple[str, Path, str], tmp_p
     assert REASONS[claimed(name)] in refused.output
 
 
+@pytest.mark.pictures
 def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -179,6 +180,7 @@ def test_what_cannot_be_compared_is_named_and_the_rest_is(folder: Path, tmp_path
         compare_bags([alone[0], *alone[-2:]], impossible, progress=silent)
 
 
+@pytest.mark.pictures
 def test_select_takes_the_order_with_the_least_validation_error(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -248,6 +250,7 @@ def test_a_selection_needs_validation_bags(folder: Path, tmp_path: Path) -> None
 # -- several inputs and outputs, gaps ----------------------------------------------------------
 
 
+@pytest.mark.pictures
 def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
     coupled: Path, tmp_path: Path
 ) -> None:
@@ -352,6 +355,7 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
 # -- models without a proof ---------------------------------------------------------------------
 
 
+@pytest.mark.pictures
 def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
     coupled: Path, tmp_path: Path
 ) -> None:
@@ -389,7 +393,7 @@ def test_every_example_of_the_how_to_runs(
     made = nlsid(command, folder, "--config", config, "--out", tmp_path / "out")
     assert made.exit_code == 0, made.output
     if command == "compare":
-        assert (tmp_path / "out" / documents.COMPARISON_PLOT).read_bytes()[:4] == b"\x89PNG"
+        assert "proved" in made.output
     else:
         assert nlsid("check", tmp_path / "out" / documents.MODEL_PROOF).exit_code == 0
 

@@ -74,7 +74,7 @@ def whole_way(bags: Path, config: Path, out: Path) -> str:
     ("options", "response", "excitation"),
     [
         pytest.param((), YAW, "/steering_command:position[name=steering]", marks=pytest.mark.slow),
-        (("-u", CMD), SPEED, CMD),
+        pytest.param(("-u", CMD), SPEED, CMD, marks=pytest.mark.slow),
     ],
 )
 def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
@@ -332,6 +332,42 @@ def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     )
     assert len(load_config(config).signals.response) == 2
     assert whole_way(folder, config, tmp_path / "out").count("inside") >= 6
+
+
+def thrusters(folder: Path, *, trials: int = 6) -> Path:
+    """Two unstamped thrusters of which the sum is the speed's command, and the noise is small."""
+    kind = "std_msgs/msg/Float64"
+    number = standard_types().types[kind]
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        thrust, speed = np.zeros(2), 0.0
+        with BagWriter(folder / f"run_{trial}") as writer:
+            for k in range(300):
+                thrust = rng.uniform(0.0, 1.0, 2) if k % 15 == 0 else thrust
+                speed += 0.15 * (float(thrust.sum()) - speed)
+                values = {"/left_cmd": thrust[0], "/right_cmd": thrust[1], "/speed": speed}
+                stamp = START_NS + k * 100_000_000
+                for topic, value in values.items():
+                    data = bytes(standard_types().serialize_cdr(number(float(value)), kind))
+                    writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    return folder
+
+
+def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(
+    tmp_path: Path,
+) -> None:
+    bags, config = thrusters(tmp_path / "bags"), tmp_path / "robot.yaml"
+    said = nlsid("init", bags, "--out", config, "--yes")
+    assert {signal.path for signal in load_config(config).signals.excitation} == {
+        "/left_cmd:data", "/right_cmd:data",
+    }  # fmt: skip
+    [without] = re.findall(r"without it models are off by (\S+) %", said)
+    assert float(without) > 50.0
+    assert "nothing that was tried" not in said
+    named = tmp_path / "named.yaml"  # who names one gets that one, and reads of the other
+    said = nlsid("init", bags, "--out", named, "-u", "/left_cmd:data", "--yes")
+    assert len(load_config(named).signals.excitation) == 1
+    assert "it follows /right_cmd:data" in said
 
 
 def test_without_a_terminal_somebody_has_to_choose(tmp_path: Path) -> None:

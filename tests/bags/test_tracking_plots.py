@@ -22,6 +22,8 @@ from nlsid_core.running.observer import StateObserver
 from nlsid_core.running.reading import Reading, Status
 from tests.tracked import PERIOD, STEPS, designed, pendulum, run
 
+pytestmark = pytest.mark.pictures
+
 ROOT = Path(__file__).resolve().parents[2]
 KICK = np.array([0.0, 0.6])
 

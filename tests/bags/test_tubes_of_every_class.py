@@ -1,5 +1,6 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,10 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     design_funnel_files(out / documents.MODEL, config, out)
     assert "for ever" in check(out / documents.FUNNEL_PROOF).statement
     proved = documents.load_proved(out / documents.FUNNEL)
-    replayed = replay_bag(proved, bags[5], centre=Centre.COMMAND)
+    replayed = replay_bag(proved, bags[5], centre=Centre.COMMAND, forecast=6 * PERIOD)
+    assert [len(fan) for fan in replayed.fans[:3]] == [7, 7, 7]
+    assert len(replayed.forecasts) > len(replayed.judged)
+    assert all(entry.kept for entry in replayed.forecasts)
     assert replayed.judged_span == pytest.approx(replayed.span)
     assert replayed.span > 1.5
     assert replayed.verdict == Status.INSIDE.value
@@ -103,6 +107,29 @@ def linear(one: Path, tmp_path: Path) -> Proved[AnyDesign]:
     identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     return documents.load_proved(out / documents.FUNNEL)
+
+
+def test_forecasts_of_a_bag_are_counted_and_a_faulty_output_leaves_them(
+    one: Path, tmp_path: Path
+) -> None:
+    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
+    config, out = load_config(path), tmp_path / "out"
+    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
+    design_funnel_files(out / documents.MODEL, config, out)
+    held = ["monitor", "--replay", "--funnel", str(out / documents.FUNNEL), "--forecast", "0.2"]
+    done = CliRunner().invoke(app, [*held, str(one / "run_5")])
+    said = re.search(r"under the commands that came, hold (\d+) of (\d+) samples", done.output)
+    assert said is not None, done.output
+    assert said[1] == said[2] != "0"
+    y = np.zeros((60, 2))
+    y[40:, 0] = 50.0
+    trial = Trajectory(t=PERIOD * np.arange(60), y=y, u=np.zeros((60, 1)), name="step")
+    bag, proved = write_joint_bag(tmp_path, trial), documents.load_proved(out / documents.FUNNEL)
+    replayed = replay_bag(proved, bag, centre=Centre.COMMAND, forecast=0.2)
+    left = [entry.t for entry in replayed.forecasts if not entry.kept]
+    assert left[0] == pytest.approx(40 * PERIOD)
+    assert replayed.first_bad is not None
+    assert replayed.first_bad.t <= left[0]
 
 
 def test_a_bag_with_a_long_hole_is_not_inside(linear: Proved[AnyDesign], tmp_path: Path) -> None:

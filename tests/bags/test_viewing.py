@@ -186,6 +186,18 @@ def test_the_stream_begins_with_the_past_and_goes_on_with_what_is_new(watched: S
     assert later["verdict"] == ["inside", OK, ""]
 
 
+def test_a_forecast_is_sent_once_at_the_stamp_it_is_about(watched: Scene) -> None:
+    watched.forecast(15 * 10**8, {"low": 0.9, "high": 1.3, "ahead": 0.5})
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        stream = news(address)
+        first = next(stream)
+        watched.forecast(16 * 10**8, {"low": math.nan, "high": 1.2, "ahead": 0.5})
+        later = next(part for part in stream if part["forecasts"])
+        stream.close()  # type: ignore[attr-defined]
+    assert first["forecasts"] == [[1.5, [[0.9, 1.3]]]]
+    assert later["forecasts"] == [[1.6, [[None, 1.2]]]]
+
+
 @pytest.mark.parametrize(
     ("path", "host", "status"),
     [
@@ -349,7 +361,7 @@ def test_a_replay_keeps_the_pace_of_the_stamps_and_stops_when_asked(funnel: Path
     assert again.verdict().word != "recording over"
 
 
-def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None:
+def test_foxglove_gets_margins_signals_forecasts_status_and_events(watched: Scene) -> None:
     pytest.importorskip("foxglove", reason="needs foxglove-sdk (extra `view`)")
     with serve_foxglove(watched, host=LOCAL, port=0) as address:
         port = urlsplit(address).port
@@ -357,7 +369,7 @@ def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None
         with WebSocket(port, protocol="foxglove.sdk.v1") as client:
             assert client.accepted
             channels: dict[str, int] = {}
-            while len(channels) < 4:
+            while len(channels) < 5:
                 message = json.loads(client.receive())
                 for each in message.get("channels", ()):
                     channels[each["topic"]] = each["id"]
@@ -366,12 +378,11 @@ def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None
             heard: dict[str, list[tuple[int, dict[str, Any]]]] = {}
             names = {i: topic for topic, i in channels.items()}
             deadline, k = time.monotonic() + 60, 1
-            while not {foxglove.MARGIN, foxglove.SIGNALS, foxglove.STATUS, foxglove.EVENTS} <= set(
-                heard
-            ):
+            while not set(channels) <= set(heard):
                 assert time.monotonic() < deadline, heard
                 k += 1
                 watched.sample(k * 10**9, GOOD | {"time_to_exit": math.inf})
+                watched.forecast(k * 10**9 + 5 * 10**8, {"low": 0.9, "high": 1.3, "ahead": 0.5})
                 watched.say(k * 10**9, "monitor", OK, "inside")
                 watched.say(k * 10**9, "controller", OK, f"sample {k}")
                 data = client.receive()
@@ -391,6 +402,10 @@ def test_foxglove_gets_margins_signals_status_and_events(watched: Scene) -> None
         {"name": "speed [m/s]", "nominal": 1.0, "lower": 0.6, "upper": 1.4, "measured": 1.1}
     )
     assert heard[foxglove.STATUS][0][1]["word"] == "inside"
+    stamp_ns, ahead = heard[foxglove.FORECAST][0]
+    assert stamp_ns % 10**9 == 0, "logged when it was made"
+    assert ahead["ahead"] == 0.5
+    assert ahead["signals"] == [{"name": "speed [m/s]", "lower": 0.9, "upper": 1.3}]
 
 
 def test_who_opens_foxglove_late_is_told_what_happened_before() -> None:
@@ -404,7 +419,7 @@ def test_who_opens_foxglove_late_is_told_what_happened_before() -> None:
         for _viewer in range(2):  # the second one comes after the first has gone
             with WebSocket(port, protocol="foxglove.sdk.v1") as client:
                 channels: dict[str, int] = {}
-                while len(channels) < 4:
+                while len(channels) < 5:
                     for each in json.loads(client.receive()).get("channels", ()):
                         channels[each["topic"]] = each["id"]
                 wanted = [{"id": i, "channelId": i} for i in channels.values()]

@@ -135,8 +135,8 @@ def proof_exchanged(files: Files) -> None:
 
 
 def stages_without_end(files: Files) -> None:
-    """A million multipliers for three stages."""
-    files["composition.proof.json"]["proof"]["multipliers"] = [0.5] * 1_000_000
+    """A hundred thousand multipliers for three stages."""
+    files["composition.proof.json"]["proof"]["multipliers"] = [0.5] * 100_000
 
 
 FORGERIES: list[tuple[Callable[[Files], None], str]] = [
@@ -147,7 +147,7 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
     (stage_left_out, "stage1 ends at 1 s, the next starts at 2 s"),
     (multiplier_raised, "that stage1 ends inside the next at 1 s"),
     (proof_exchanged, "stage1 ends at 1 s, the next starts at 0 s"),
-    (stages_without_end, "a composition has 2 to 100 stages, not 1000001"),
+    (stages_without_end, "a composition has 2 to 100 stages, not 100001"),
 ]
 
 

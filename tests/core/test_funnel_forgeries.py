@@ -161,6 +161,7 @@ def test_a_file_with_other_white_space_is_another_file(files: Files, tmp_path: P
         check(path)
 
 
+@pytest.mark.slow
 def test_no_proof_is_found_for_a_funnel_that_is_one_percent_too_wide() -> None:
     field, nominal, weights = problem(25)
     design = design_funnel(field, nominal, goal=goal_matrix(), **weights)

@@ -101,6 +101,7 @@ def unstable_recordings() -> Dataset:
     return Dataset(tuple(trials))
 
 
+@pytest.mark.pictures
 def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not_white() -> None:
     data = unstable_recordings()
     with pytest.raises(Infeasible, match="no proof of stability"):

@@ -388,7 +388,9 @@ def _huge_model(model: Json, _: Json) -> None:
     model["h"]["coefficients"] += [[1.0]] * 8
 
 
-@pytest.mark.parametrize("change", [_huge_degree, _huge_expansion, _huge_model])
+@pytest.mark.parametrize(
+    "change", [_huge_degree, pytest.param(_huge_expansion, marks=pytest.mark.slow), _huge_model]
+)
 def test_a_document_that_would_take_forever_is_refused_in_seconds(
     change: Change, tmp_path: Path, made: dict[str, tuple[Json, Json]]
 ) -> None:

@@ -56,6 +56,7 @@ def test_solutions_of_example_5_1_2_obey_both_guarantees() -> None:
     assert V.max(axis=0)[0] == 1
 
 
+@pytest.mark.pictures
 def test_the_two_figures_are_drawn_from_what_was_proved(tmp_path: Any) -> None:
     two_lemmas.draw(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")

@@ -271,6 +271,7 @@ def test_value_gradient_volume_and_outline_agree() -> None:
 # -- command line ----------------------------------------------------------------------------
 
 
+@pytest.mark.pictures
 def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> None:
     field, nominal = hanging(9)
     goal = Goal(np.zeros(2), 20 * np.eye(2))

@@ -12,6 +12,7 @@ from nlsid_core.arrays import FloatArray
 from tests.conftest import SHARED
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_served_has_every_figure(tmp_path: Path) -> None:
     speed = next(robot for robot in ROBOTS if robot.name == "F1TENTH speed")
     row = measure(speed, tmp_path, cache=tmp_path)

@@ -23,9 +23,9 @@ def test_every_benchmark_is_in_the_list() -> None:
     assert {entry.module for entry in BENCHMARKS.values()} == runnable
 
 
-def test_a_result_has_its_date_machine_and_commit() -> None:
+def test_a_result_has_its_date_machine_load_and_commit() -> None:
     found = measured(Benchmark("first_order_bias", ("--trials", "1")), None, 120.0)
-    assert set(found) == {"command", "date", "machine", "commit", "seconds", "result"}
+    assert set(found) == {"command", "date", "machine", "commit", "load", "seconds", "result"}
     assert found["command"][-3:] == ["--trials", "1", "--json"]
     assert found["result"]
 

@@ -44,6 +44,16 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
     assert not broken
 
 
+def test_every_test_that_a_page_names_is_there() -> None:
+    named = [
+        (page.relative_to(ROOT), name)
+        for page in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+        for name in re.findall(r"\btests(?:/\w+)+\.py", page.read_text())
+    ]
+    assert named
+    assert not [found for found in named if not (ROOT / found[1]).is_file()]
+
+
 def test_what_the_pages_of_theory_name_is_there() -> None:
     pages = sorted(DOCS.glob("theory*.md"))
     assert len(pages) > 2

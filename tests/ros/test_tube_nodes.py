@@ -85,6 +85,35 @@ def test_an_unknown_command_ends_the_run_and_a_new_one_begins_by_itself(robot: R
     assert math.isnan(margins[stamp_ns(bad + 1)]), "a new run takes samples to begin"
 
 
+def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(
+    monkeypatch: pytest.MonkeyPatch, tube: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    ahead_ns, forecasts = 10 * PERIOD_NS, dict[int, dict[str, float]]()
+
+    def hear(message: JointState) -> None:
+        numbers = zip(message.name, message.position, strict=True)
+        forecasts[stamp_ns_of(message)] = dict(numbers)
+
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=5.0, allow_old_stamps=True, forecast=0.25) as monitor,
+    ):
+        node.create_subscription(JointState, "/funnel_monitor/forecast", hear, qos.STREAM)
+        robot = Robot(node, spin_until, tube)
+        robot.ready()
+        k = -1
+        while len(forecasts) < 5:
+            robot.drive([k := k + 1])
+            assert k < 400, robot.said
+        stop(monitor)
+    for stamp_ns, numbers in forecasts.items():
+        assert (stamp_ns - 10**18) % PERIOD_NS == 0
+        assert stamp_ns - 10**18 <= k * PERIOD_NS + ahead_ns
+        assert numbers["ahead"] == pytest.approx(0.25)
+        assert numbers["low"] < 0.0 < numbers["high"], "the car stands still, as it is told"
+
+
 @contextmanager
 def sprung(
     monkeypatch: pytest.MonkeyPatch, folder: Path

@@ -128,6 +128,7 @@ def test_storage_gives_the_same_numbers_and_digests_of_its_own(
     assert all(answer.requests for answer in there.answers)
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same(tmp_path: Path, config: Path) -> None:
     distributed = pytest.importorskip("distributed")
     pattern = fleet(tmp_path / "fleet") / "*" / "*.mcap"

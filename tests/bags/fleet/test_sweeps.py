@@ -49,6 +49,7 @@ def pendulum(x: Any, u: Any) -> Any:
     return np.array([x[1], -x[0] + x[0] ** 3 / 6 - x[1] / 5 + u[0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("identification", [LAGS, pytest.param(SEEDS, marks=pytest.mark.slow)])
 def test_a_selection_is_the_same_whoever_tries(tmp_path: Path, identification: str) -> None:
     folders = [tmp_path / "here", tmp_path / "two"]
@@ -63,6 +64,7 @@ def test_a_selection_is_the_same_whoever_tries(tmp_path: Path, identification: s
         assert "parameters" in here[0], "of the class that does not fit, the reason"
 
 
+@pytest.mark.slow
 def test_the_l_steps_of_a_funnel_are_the_same_whoever_solves_them() -> None:
     field = VectorField.from_function(pendulum, 2, 1)
     t = np.linspace(0, 2, 5)

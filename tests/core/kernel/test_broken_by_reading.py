@@ -191,6 +191,7 @@ def test_a_long_plan_is_read_and_no_more() -> None:
     assert time.process_time() - started < SECONDS
 
 
+@pytest.mark.slow
 def test_long_coefficients_count_as_the_time_and_the_memory_that_they_take() -> None:
     """Each product μh has a million terms of 2 KB; ten of them were kept, at 90 µs a product."""
     names = [f"x{i}" for i in range(6)]

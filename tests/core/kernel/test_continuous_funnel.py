@@ -500,6 +500,7 @@ def test_what_is_out_of_range_is_refused_with_the_reason(
     refused(files, reason)
 
 
+@pytest.mark.slow
 def test_more_pieces_than_the_kernel_has_time_for_are_refused_before_it_starts(
     files: Files,
 ) -> None:

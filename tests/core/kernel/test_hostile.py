@@ -242,6 +242,7 @@ def test_odd_denominators_beyond_any_machine_word_are_exact() -> None:
     refused(proof(bound_claim([[0, 0]], [less], tiny), SQUARES), "not positive")
 
 
+@pytest.mark.slow
 def test_what_would_take_long_is_refused_early() -> None:
     many = [[i, j] for i in range(14) for j in range(14)]
     dense = {"basis": many, "columns": [0] * len(many)}

@@ -97,6 +97,7 @@ def powers(count: int, first: int = 0) -> list[list[int]]:
     return [[(first + i) // 21**k % 21 for k in range(5)] for i in range(count)]
 
 
+@pytest.mark.slow
 def test_a_model_whose_matrix_does_not_fit_in_memory_is_refused_before_it_is_built() -> None:
     """1190 states and 10 outputs: 145 000 monomials of 32 MiB were to be 17 GB."""
 
@@ -116,6 +117,7 @@ def test_a_model_whose_matrix_does_not_fit_in_memory_is_refused_before_it_is_bui
             proofs.decide(proofs.proof_document(stated, proof), {"model.json": model})
 
 
+@pytest.mark.slow
 def test_ends_of_a_box_whose_matrix_does_not_fit_in_memory_are_refused_before_it_is_built() -> None:
     """80 000 times the same input in a window: 1.4 MB were to be a matrix of 48 GB."""
     none = [0] * 80_000

@@ -1,0 +1,205 @@
+"""Forecasts from a tube's present estimate: no output that keeps the assumption leaves them."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
+from operator import mul
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.funnels.level import LevelMeter
+from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.running.forecast import Forecast, linear_form, reach
+from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Status
+from nlsid_core.running.stepping import Stepper
+from tests.core.kernel.tube_claims import HIGH, LOW, MODELS, design
+
+AHEAD = 12
+EVERY = pytest.mark.parametrize("name", MODELS)
+
+
+def alone(name: str, i: int = 0) -> tuple[Any, TubeFunnel]:
+    """A model and a funnel of its tube i only."""
+    made = design(name)
+    return made.model, replace(made.funnel, tubes=(made.funnel.tubes[i],))
+
+
+def attack(
+    model: Any, funnel: TubeFunnel, kind: str, samples: int, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """Outputs (samples, p) and inputs (samples, n_u) of a robot that keeps the tube's assumption.
+
+    It is what innovations make of the observer: `spent`, all that is left from time to time and
+    nothing between; `random`, any part in any direction; `sign`, away from the simulation.
+    """
+    tube, rng, stepper = funnel.tubes[0], np.random.default_rng(seed), Stepper(model)
+    p, n_u, lags = len(stepper.y), len(stepper.u), funnel.settling
+    u, y = np.zeros((samples, n_u)), np.zeros((samples, p))
+    x = np.tile(stepper.begin(y[:lags], u[:lags]), (2, 1))
+    meter = None if tube.follows is None else LevelMeter(tube.follows)
+    if meter is not None:
+        for now in u[:lags]:
+            meter.update(now.tolist())
+    spent = 0.0
+    for k in range(lags, samples):
+        u[k] = rng.uniform(LOW, HIGH, n_u) if rng.random() < 0.2 else u[k - 1]
+        outputs, x = stepper.advance(x, u[k])
+        level = tube.level * (1.0 if meter is None else meter.update(u[k].tolist())[0])
+        left = max(level - tube.rho * spent, 0.0) * (1.0 - 1e-9)
+        away = np.sign(outputs[0] - outputs[1] + 1e-12 * rng.normal(size=p)) * rng.random(p)
+        direction = away if kind == "sign" else rng.normal(size=p)
+        part = {"spent": float(rng.random() < 0.1), "random": rng.random(), "sign": 1.0}[kind]
+        e = direction * np.sqrt(part * left / (direction @ tube.R @ direction))
+        spent = tube.rho * spent + float(e @ tube.R @ e)
+        y[k], x[0] = outputs[0] + e, x[0] + tube.L @ e
+    return y, u
+
+
+def forecasts(
+    model: Any, funnel: TubeFunnel, y: FloatArray, u: FloatArray
+) -> Iterator[tuple[int, Forecast]]:
+    """That of every third judged sample k, for the AHEAD after it."""
+    monitor = Monitor(model, None, funnel)
+    for k in range(len(y) - AHEAD):
+        reading = monitor.update(k * model.period, y[k], u[k])
+        if reading.status is not Status.UNKNOWN and k % 3 == 0:
+            yield k, monitor.forecast(u[k + 1 : k + 1 + AHEAD])
+
+
+def used(forecast: Forecast, y: FloatArray) -> FloatArray:
+    """How far from its middle the outputs (AHEAD, p) are, 1 at its ends; as many as it has."""
+    middle, half = (forecast.low + forecast.high) / 2, (forecast.high - forecast.low) / 2
+    return np.asarray(np.abs(y[: len(middle)] - middle) / half)
+
+
+@EVERY
+def test_no_output_that_keeps_the_assumption_leaves_its_forecast(name: str) -> None:
+    for i, tube in enumerate(design(name).funnel.tubes):
+        model, funnel = alone(name, i)
+        samples = 80 if tube.samples is None else funnel.settling + tube.samples
+        most, count = 0.0, 0
+        for kind in ("spent", "random", "sign"):
+            y, u = attack(model, funnel, kind, samples, seed=1)
+            for k, forecast in forecasts(model, funnel, y, u):
+                times = model.period * np.arange(1, len(forecast.t) + 1)
+                assert forecast.t == pytest.approx(times)
+                assert (len(forecast.t) == AHEAD) == (forecast.reason == "")
+                part = used(forecast, y[k + 1 :])
+                most, count = max(most, float(part.max(initial=0.0))), count + len(part)
+        assert count > 0.2 * AHEAD * (samples - AHEAD)
+        assert 0.7 < most <= 1.0
+
+
+@pytest.mark.slow
+@EVERY
+def test_no_output_of_thousands_leaves_its_forecast(name: str) -> None:
+    model, funnel = alone(name)
+    most, count = 0.0, 0
+    for kind in ("spent", "random", "sign"):
+        y, u = attack(model, funnel, kind, 3000, seed=2)
+        for k, forecast in forecasts(model, funnel, y, u):
+            part = used(forecast, y[k + 1 :])
+            most, count = max(most, float(part.max(initial=0.0))), count + len(part)
+    print(f"{name}: {count} outputs, largest part used {most:.4f}")
+    assert most <= 1.0
+
+
+def test_a_linear_forecast_is_reached_at_every_sample() -> None:
+    """The worst innovations by Cauchy and Schwarz: e_q = B ρ^-(h-1-q) R⁻¹ c_q' / reach."""
+    model, funnel = alone("linear")
+    tube, linear = funnel.tubes[0], linear_form(model)
+    assert linear is not None
+    A, C = linear.A, linear.C[0]
+    lags, zero = funnel.settling, np.zeros((AHEAD, 1))
+    for h in range(1, AHEAD + 1):
+        monitor, stepper = Monitor(model, None, funnel), Stepper(model)
+        x = stepper.begin(np.zeros((lags, 1)), np.zeros((lags, 1)))[None]
+        u = np.zeros(1)
+        for k in range(lags + 1):
+            y = np.zeros(1)
+            if k == lags:  # nothing is spent before
+                predicted, x = stepper.advance(x, u)
+                y = predicted[0]
+            monitor.update(k * model.period, y, u)
+        forecast = monitor.forecast(zero)
+        powers = [np.linalg.matrix_power(A, h - 2 - q) for q in range(h - 1)]
+        gains = [*(float(C @ power @ tube.L[:, 0]) for power in powers), 1.0]
+        weights = np.array([tube.rho ** (h - 1 - q) for q in range(h)])
+        e = np.array(gains) / weights
+        e *= np.sqrt(tube.level / (weights @ e**2))
+        for q in range(h):
+            predicted, x = stepper.advance(x, u)
+            y = predicted[0] + e[q]
+            x = x + tube.L[:, 0] * e[q]
+        assert 0.0 <= forecast.high[h - 1, 0] - y[0] < 1e-6 * tube.half_widths[0]
+
+
+def test_the_reach_of_a_linear_model_is_above_the_exact_one_and_close() -> None:
+    for name in ("linear", "implicit_linear"):
+        model, funnel = alone(name)
+        linear, tube = linear_form(model), funnel.tubes[0]
+        assert linear is not None
+        exact, bound = exact_reach(tube, linear), reach(tube, linear, AHEAD)
+        ever = 1.0 / tube.tau
+        for h in range(AHEAD):
+            for j, value in enumerate(exact[h]):
+                least = min(value, Fraction(float(ever[j])))
+                assert least <= Fraction(float(bound[h, j])) <= least * (1 + Fraction(3, 10**8))
+
+
+def exact_reach(tube: Any, linear: Any) -> list[list[Fraction]]:
+    """Σ ρ^-(q+1) C_j A^q L R⁻¹ L'A^q' C_j' + R⁻¹_jj of these float64, in fractions."""
+
+    def of(M: FloatArray) -> list[list[Fraction]]:
+        return [[Fraction(v) for v in row] for row in np.atleast_2d(M).tolist()]
+
+    def times(X: Any, Y: Any) -> list[list[Fraction]]:
+        columns = list(zip(*Y, strict=True))
+        return [[sum(map(mul, row, column)) for column in columns] for row in X]
+
+    A, C, G, (p, R) = of(linear.A), of(linear.C), of(tube.L), (len(tube.R), of(tube.R))
+    if p == 1:
+        inverse = [[1 / R[0][0]]]
+    else:
+        d = R[0][0] * R[1][1] - R[0][1] * R[1][0]
+        inverse = [[R[1][1] / d, -R[0][1] / d], [-R[1][0] / d, R[0][0] / d]]
+    totals, found = [inverse[j][j] for j in range(p)], []
+    weight = 1 / Fraction(tube.rho)
+    for _ in range(AHEAD):
+        found.append(list(totals))
+        rows = times(C, G)
+        spread = times(times(rows, inverse), list(zip(*rows, strict=True)))
+        totals = [total + weight * spread[j][j] for j, total in enumerate(totals)]
+        weight /= Fraction(tube.rho)
+        G = times(A, G)
+    return found
+
+
+def test_forecasting_leaves_the_run_where_it_is() -> None:
+    for name in ("cascade", "two_following", "implicit_ray"):
+        model, funnel = alone(name)
+        y, u = attack(model, funnel, "random", 60, seed=3)
+        looking, plain = Monitor(model, None, funnel), Monitor(model, None, funnel)
+        for k in range(len(y)):
+            expected = plain.update(k * model.period, y[k], u[k])
+            assert str(looking.update(k * model.period, y[k], u[k])) == str(expected)
+            looking.forecast(u[k : k + 5])
+
+
+def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:
+    model, funnel = alone("linear")
+    monitor = Monitor(model, None, funnel)
+    waiting = monitor.forecast(np.zeros((3, 1)))
+    assert (len(waiting.t), waiting.reason) == (0, "no run has begun")
+    for k in range(20):
+        monitor.update(k * model.period, [100.0 * (k == 19)], np.zeros(1))
+    assert monitor.forecast(np.zeros((3, 1))).reason == "what the tube assumes is broken, or over"
+    model, funnel = alone("implicit_box")
+    monitor = Monitor(model, None, funnel)
+    for k in range(20):
+        monitor.update(k * model.period, np.zeros(1), np.zeros(1))
+    assert "outside the box" in monitor.forecast(np.full((3, 1), 50.0)).reason
