@@ -123,7 +123,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals: list[Subscription] = []
+        self._signals: dict[str, Subscription] = {}  # by topic
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
@@ -182,7 +182,7 @@ class FunnelMonitor(ManagedNode):
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
-        for subscription in self._signals:
+        for subscription in self._signals.values():
             self.destroy_subscription(subscription)
         self._signals.clear()
         self._watch, self._digest = watch, digest
@@ -260,8 +260,10 @@ class FunnelMonitor(ManagedNode):
             self._kinds[topic], self._unfit = kind, ""
             callback = partial(self._on_signal, topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.append(
-                self.create_subscription(message_class(kind), name, callback, profile)
+            if topic in self._signals:
+                self.destroy_subscription(self._signals[topic])
+            self._signals[topic] = self.create_subscription(
+                message_class(kind), name, callback, profile
             )
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
