@@ -76,10 +76,10 @@ class FunnelMonitor(ManagedNode):
         self._controller = declare_text(
             self, "controller", "", "node that announces when a run starts; empty: first sample"
         )
-        what = "what the tube is around: command or profile"
+        what = "what the tube is around: command, motion (command, begun in motion) or profile"
         nominal = declare_text(self, "nominal", "command", what)
         if nominal not in [centre.value for centre in Centre]:
-            raise DataError(f"nominal is '{nominal}'; it should be command or profile")
+            raise DataError(f"nominal is '{nominal}'; it should be command, motion or profile")
         self._centre = Centre(nominal)
         self._wiring = declare_wiring(self)
         self._expected = declare_expected(self)

@@ -33,9 +33,14 @@ COMMAND_TOLERANCE = 1e-9  # relative: rounding between computing a policy's inpu
 
 
 class Centre(Enum):
-    """What a tube is around: the model driven by the received commands, or the policy's plan."""
+    """What a tube is around: the model driven by the received commands, or the policy's plan.
+
+    MOTION is COMMAND for a robot that may be in motion when a run begins: not from the measured
+    start, but from one that the range of the inputs bounds, once that has faded.
+    """
 
     COMMAND = "command"
+    MOTION = "motion"
     PROFILE = "profile"
 
 

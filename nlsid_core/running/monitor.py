@@ -133,7 +133,7 @@ class Monitor:
         self.goes_on = len(tubes) == len(funnels) and not followed
         if self.goes_on:
             model: Any = models[0]
-            self._tubes = TubeRun(model, tubes)
+            self._tubes = TubeRun(model, tubes, in_motion=centre is Centre.MOTION)
             self.lags = self._tubes.lags
             return
         self._comparison = _comparison(models, policies, funnels, period, held)

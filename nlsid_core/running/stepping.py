@@ -33,8 +33,8 @@ from nlsid_core.polynomial.products import Products
 class Stepper:
     """A model's steps along one run.
 
-    order: n; lags: how many samples `begin` needs. y, u: the model's signals. Raises DataError for
-    an implicit model that is not of recorded signals.
+    order: n; lags: how many samples `begin` needs; delays: how old an input may be. y, u: the
+    model's signals. Raises DataError for an implicit model that is not of recorded signals.
     """
 
     def __init__(self, model: StableModel) -> None:
@@ -48,6 +48,7 @@ class Stepper:
         self._kind = made
         self.order: int = made.order
         self.lags: int = max(made.lags, made.delays)
+        self.delays: int = made.delays
         self._past: deque[FloatArray] = deque(maxlen=made.delays + 1)
 
     def begin(self, y: FloatArray, u: FloatArray) -> FloatArray:
@@ -64,6 +65,15 @@ class Stepper:
         self._past.extend(u[max(0, len(u) - self._kind.delays - 1) :])
         state: FloatArray = self._kind.begin(y, u)
         return state
+
+    def rest(self, u: FloatArray) -> None:
+        """Go on as if the inputs (n_u,) had always been u."""
+        self._past.extend([u] * (self.delays + 1))
+
+    def after(self, x: FloatArray, window: FloatArray) -> FloatArray:
+        """The next state (n,) of x (n,) under the inputs (delays + 1, n_u), the oldest first."""
+        _, after = self._kind.advance(x[None], deque(window))
+        return np.asarray(after[0])
 
     def ahead(self) -> "Stepper":
         """Another one in the same place, whose steps leave this one where it is."""

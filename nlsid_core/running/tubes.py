@@ -26,6 +26,7 @@ from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
 from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.start import start_in_motion
 from nlsid_core.running.stepping import Stepper
 
 TREND = 10  # samples over which the margin's fall is taken
@@ -38,10 +39,13 @@ STARTING = "waiting for the first"
 class TubeRun:
     """Samples (t, y, u) of one run against funnels of one model; `readings` once per sample.
 
-    lags: samples that start a run. Raises DataError if the funnels start in different ways.
+    lags: samples that start a run. in_motion: begin at `start_in_motion`, without the outputs.
+    Raises DataError if the funnels start in different ways, or no such start is known.
     """
 
-    def __init__(self, model: StableModel, funnels: Sequence[TubeFunnel]) -> None:
+    def __init__(
+        self, model: StableModel, funnels: Sequence[TubeFunnel], *, in_motion: bool = False
+    ) -> None:
         self._stepper = Stepper(model)
         self.period, self.lags = model.period, funnels[0].settling
         if any(funnel.settling != self.lags for funnel in funnels):
@@ -49,6 +53,9 @@ class TubeRun:
         if self.lags < self._stepper.lags:
             raise DataError(f"a run of this model starts after {self._stepper.lags} samples")
         self._funnels = tuple(funnels)
+        self._moving = start_in_motion(model, funnels) if in_motion else None
+        if self._moving is not None:
+            self.lags = self._moving.samples
         tubes = [tube for funnel in funnels for tube in funnel.tubes]
         self._tubes = tubes
         places = iter(range(len(tubes)))
@@ -102,6 +109,7 @@ class TubeRun:
         self._ended = why
         self._start: list[tuple[FloatArray, FloatArray]] = []
         self._x: FloatArray | None = None
+        self._fading = 0 if self._moving is None else self._moving.samples
         self._spent = np.zeros(len(self._tubes))
         self._k = 0
         self._meters = {j: LevelMeter(level) for j, level in self._follow.items()}
@@ -124,7 +132,7 @@ class TubeRun:
         fault = self._fault(t, measured, applied)
         if fault:
             return self._unknown(t, measured, self._without(applied, fault) or fault)
-        if self._x is None:
+        if self._x is None or self._fading:
             return self._collect(t, measured, applied)
         return self._judge(t, measured, applied)
 
@@ -193,6 +201,7 @@ class TubeRun:
             self._begin(refused)
             return refused
         self._x, self._spent, self._k = after, self._rho * self._spent, self._k + 1
+        self._fading = max(self._fading - 1, 0)
         self._follow_command(u)
         return ""
 
@@ -201,8 +210,17 @@ class TubeRun:
             away = f"outside the box in which the tube is proved, at t = {t:g} s"
             self._begin(away)
             return self._unknown(t, y, away)
-        self._start.append((y, u))
         self._follow_command(u)
+        if self._moving is not None:
+            if self._x is None:
+                self._x = np.tile(self._moving.x, (len(self._tubes) + 1, 1))
+                self._stepper.rest(u)
+            if refused := self._without(u, ""):
+                return self._unknown(t, y, f"{refused}, at t = {t:g} s")
+            self._k = 0
+            ended = f", after {self._ended}" if self._ended else ""
+            return self._unknown(t, y, f"{STARTING} {self.lags} samples: the start fades{ended}")
+        self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
             self._x = np.tile(self._stepper.begin(ys, us), (len(self._tubes) + 1, 1))

@@ -114,6 +114,29 @@ def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(
         assert numbers["low"] < 0.0 < numbers["high"], "the car stands still, as it is told"
 
 
+def test_of_a_robot_in_motion_nothing_is_said_until_the_start_has_faded(
+    monkeypatch: pytest.MonkeyPatch, tube: Path
+) -> None:
+    use_domain_of_this_run(monkeypatch)
+    given = {"stale_after": 5.0, "allow_old_stamps": True, "nominal": "motion"}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, **given) as monitor,
+    ):
+        robot = Robot(node, spin_until, tube)
+        robot.ready()
+        k = -1
+        while not robot.has_said("samples: the start fades"):
+            robot.drive([k := k + 1], speed=0.3 if k < 3 else 0.0)
+            assert k < 400, robot.said
+        while not robot.has_said("inside"):
+            robot.drive([k := k + 1])
+            assert k < 400, robot.said
+        stop(monitor)
+    assert k > 20
+    assert not robot.has_said("violated"), "three outputs at the start were off"
+
+
 @contextmanager
 def sprung(
     monkeypatch: pytest.MonkeyPatch, folder: Path
