@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail
 from nlsid_core.models.spline import Spline
 
 KIND = "block_cascade"
@@ -114,26 +114,19 @@ class BlockCascade:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
-            "format": FORMAT,
-            "version": files.VERSION,
-            "kind": KIND,
-            "period": self.period,
-            "y": self.y.document(),
-            "u": self.u.document(),
+            **head(self, KIND),
             "a1": self.a1.tolist(),
             "b1": self.b1.tolist(),
             "f": self.f.document(),
             "a2": self.a2.tolist(),
             "b2": self.b2.tolist(),
-            "training": self.training,
-            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            **tail(self),
         }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "BlockCascade":
         """Raises DocumentError if the document is not a block cascade."""
         files.header(document, FORMAT, source=source, kind=KIND)
-        bags = files.member(document, "bags", list, source=source)
         return cls(
             a1=files.array(document, "a1", (None,), source=source),
             b1=files.array(document, "b1", (None, None), source=source),
@@ -142,11 +135,7 @@ class BlockCascade:
             ),
             a2=files.array(document, "a2", (None,), source=source),
             b2=files.array(document, "b2", (None, None), source=source),
-            period=files.number(document, "period", source=source),
-            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
-            u=Signal.from_document(files.member(document, "u", dict, source=source), source=source),
-            training=files.member(document, "training", str, source=source),
-            bags=tuple(files.named_digests(bags, source=source)),
+            **recorded(document, several=(), source=source),
         )
 
 

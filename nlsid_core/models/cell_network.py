@@ -9,13 +9,14 @@ and feedback through a nonlinearity are networks. States may be hidden.
 
 from bisect import bisect_right
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze, keep
 from nlsid_core.errors import DataError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal, objects, signals
+from nlsid_core.models.signal import FORMAT, Signal, head, objects, recorded, tail
 
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
@@ -181,20 +182,14 @@ class CellNetwork:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
-            "format": FORMAT,
-            "version": files.VERSION,
-            "kind": KIND,
-            "period": self.period,
-            "y": [signal.document() for signal in self.y],
-            "u": [signal.document() for signal in self.u],
+            **head(self, KIND),
             "maps": [f.document() for f in self.maps],
             "into": self.into.tolist(),
             "next": self.next.tolist(),
             "output": self.output.tolist(),
             "start": self.start.tolist(),
             "start_samples": self.start_samples,
-            "training": self.training,
-            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            **tail(self),
         }
 
     @classmethod
@@ -202,11 +197,10 @@ class CellNetwork:
         """Raises DocumentError if the document is not a cell network."""
         files.header(document, FORMAT, source=source, kind=KIND)
         maps = objects(document, "maps", source=source)
-        arrays = {
+        arrays: dict[str, Any] = {
             key: files.array(document, key, (None, None), source=source)
             for key in ("into", "next", "output")
         }
-        bags = files.member(document, "bags", list, source=source)
         return cls(
             maps=tuple(
                 PiecewiseLinear(
@@ -217,9 +211,5 @@ class CellNetwork:
             **arrays,
             start=files.array(document, "start", (None,), source=source),
             start_samples=files.member(document, "start_samples", int, source=source),
-            period=files.number(document, "period", source=source),
-            y=signals(document, "y", source=source),
-            u=signals(document, "u", source=source),
-            training=files.member(document, "training", str, source=source),
-            bags=tuple(files.named_digests(bags, source=source)),
+            **recorded(document, several=("y", "u"), source=source),
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail
 
 KIND = "difference_equation"
 
@@ -123,19 +123,12 @@ class DifferenceEquation:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
-            "format": FORMAT,
-            "version": files.VERSION,
-            "kind": KIND,
-            "equation": "y(t) = sum a[k-1] y(t-k) + sum b[j] u(t-j) + c",
-            "period": self.period,
-            "y": self.y.document(),
-            "u": self.u.document(),
+            **head(self, KIND, "y(t) = sum a[k-1] y(t-k) + sum b[j] u(t-j) + c"),
             "a": self.a.tolist(),
             "b": self.b.tolist(),
             "c": self.c,
             "u_range": list(self.u_range),
-            "training": self.training,
-            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            **tail(self),
         }
 
     @classmethod
@@ -148,15 +141,10 @@ class DifferenceEquation:
             )
         a = files.array(document, "a", (None,), source=source)
         lo, hi = files.array(document, "u_range", (2,), source=source)
-        bags = files.member(document, "bags", list, source=source)
         return cls(
             a=a,
             b=files.array(document, "b", (len(a) + 1,), source=source),
             c=files.number(document, "c", source=source),
-            period=files.number(document, "period", source=source),
-            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
-            u=Signal.from_document(files.member(document, "u", dict, source=source), source=source),
             u_range=(float(lo), float(hi)),
-            training=files.member(document, "training", str, source=source),
-            bags=tuple(files.named_digests(bags, source=source)),
+            **recorded(document, several=(), source=source),
         )

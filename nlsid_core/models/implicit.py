@@ -6,7 +6,6 @@ Source: thesis (2.4), (2.7), (2.11)-(2.15).
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.monotone import ellipsoid, newton
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.models.signal import FORMAT, Signal, recorded, tail, window_of
 from nlsid_core.polynomial.values import monomial_values
 
 KIND = "implicit"
@@ -273,8 +272,7 @@ class ImplicitModel:
                 "y": [signal.document() for signal in self.y],
                 "u": [signal.document() for signal in self.u],
                 "window": [list(entry) for entry in self.window],
-                "training": self.training,
-                "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+                **tail(self),
             }
         return document
 
@@ -297,36 +295,20 @@ class ImplicitModel:
             member = files.member(document, key, dict, source=source)
             return Polynomials.from_document(member, variables, (size,), source=f"{source} {key}")
 
+        if "y" in document:
+            made = recorded(document, several=("y", "u"), source=source)
+            made["window"] = window_of(document, source=source)
+        else:
+            made = {"period": files.number(document, "period", source=source)}
         return cls(
             h=part("h", n_v + n + m, n_v),
             shift=part("shift", n + m, n - n_v) if n_v < n else _nothing(n + m),
             monotonicity=files.number(document, "monotonicity", source=source),
-            period=files.number(document, "period", source=source),
             states=tuple(states),
             inputs=tuple(inputs),
             centre=part("centre", n_v, n_v) if "centre" in document else None,
-            **(_recorded(document, source) if "y" in document else {}),
+            **made,
         )
-
-
-def _recorded(document: Json, source: str) -> dict[str, Any]:
-    """The members of a model of recorded signals."""
-    signals = {key: files.member(document, key, list, source=source) for key in ("y", "u")}
-    window = files.array(document, "window", (None, 2), source=source)
-    if (
-        not all(isinstance(s, dict) for part in signals.values() for s in part)
-        or (window % 1.0).any()
-    ):
-        raise DocumentError(f"{source}: 'y', 'u' should hold objects, 'window' integers")
-    bags = files.member(document, "bags", list, source=source)
-    return {
-        key: tuple(Signal.from_document(s, source=source) for s in part)
-        for key, part in signals.items()
-    } | {
-        "window": tuple((int(i), int(d)) for i, d in window),
-        "training": files.member(document, "training", str, source=source),
-        "bags": tuple(files.named_digests(bags, source=source)),
-    }
 
 
 def _nothing(variables: int) -> Polynomials:

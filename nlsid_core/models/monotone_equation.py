@@ -15,8 +15,8 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
-from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.models.signal import FORMAT, Signal
+from nlsid_core.errors import DataError, ShapeError
+from nlsid_core.models.signal import FORMAT, Signal, head, recorded, tail, window_of
 
 KIND = "monotone_equation"
 NEWTON_STEPS = 100  # far from the solution a cubic takes a third off the distance a step
@@ -104,12 +104,7 @@ class MonotoneEquation:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
-            "format": FORMAT,
-            "version": files.VERSION,
-            "kind": KIND,
-            "period": self.period,
-            "y": self.y.document(),
-            "u": [signal.document() for signal in self.u],
+            **head(self, KIND),
             "e": self.e.tolist(),
             "a": self.a.tolist(),
             "b": self.b.tolist(),
@@ -117,32 +112,23 @@ class MonotoneEquation:
             "window": [list(entry) for entry in self.window],
             "y_offset": self.y_offset,
             "u_offset": self.u_offset.tolist(),
-            "training": self.training,
-            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            **tail(self),
         }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "MonotoneEquation":
         """Raises DocumentError if the document is not a monotone equation."""
         files.header(document, FORMAT, source=source, kind=KIND)
-        signals = files.member(document, "u", list, source=source)
-        window = files.array(document, "window", (None, 2), source=source)
-        if not all(isinstance(signal, dict) for signal in signals) or (window % 1.0).any():
-            raise DocumentError(f"{source}: 'u' should hold objects, 'window' integers")
-        bags = files.member(document, "bags", list, source=source)
+        window = window_of(document, source=source)
         return cls(
             e=files.array(document, "e", (3,), source=source),
             a=files.array(document, "a", (None,), source=source),
             b=files.array(document, "b", (len(window),), source=source),
             c=files.number(document, "c", source=source),
-            window=tuple((int(i), int(d)) for i, d in window),
+            window=window,
             y_offset=files.number(document, "y_offset", source=source),
-            u_offset=files.array(document, "u_offset", (len(signals),), source=source),
-            period=files.number(document, "period", source=source),
-            y=Signal.from_document(files.member(document, "y", dict, source=source), source=source),
-            u=tuple(Signal.from_document(signal, source=source) for signal in signals),
-            training=files.member(document, "training", str, source=source),
-            bags=tuple(files.named_digests(bags, source=source)),
+            u_offset=files.array(document, "u_offset", (None,), source=source),
+            **recorded(document, several=("u",), source=source),
         )
 
 

@@ -1,7 +1,7 @@
 """What every model document shares: its header and the signals it is about."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from nlsid_core import files
 from nlsid_core.arrays import Json
@@ -49,3 +49,50 @@ def signals(document: Json, key: str, *, source: str) -> tuple[Signal, ...]:
     """The signals of the list `document[key]`. Raises DocumentError if it is none."""
     entries = objects(document, key, source=source)
     return tuple(Signal.from_document(entry, source=f"{source} {key}") for entry in entries)
+
+
+def head(model: Any, kind: str, equation: str = "") -> Json:
+    """The members that the document of a model of recorded signals begins with."""
+    y, u = (
+        [part.document() for part in side] if isinstance(side, tuple) else side.document()
+        for side in (model.y, model.u)
+    )
+    stated = {"equation": equation} if equation else {}
+    return {
+        "format": FORMAT, "version": files.VERSION, "kind": kind, **stated,
+        "period": model.period, "y": y, "u": u,
+    }  # fmt: skip
+
+
+def tail(model: Any) -> Json:
+    """Those that it ends with: what the model was made of."""
+    bags = [{"name": name, "digest": digest} for name, digest in model.bags]
+    return {"training": model.training, "bags": bags}
+
+
+def recorded(document: Json, *, several: tuple[str, ...], source: str) -> dict[str, Any]:
+    """The fields of `head` and `tail`; several: which of y and u are lists of signals.
+
+    Raises DocumentError if one is missing or wrong.
+    """
+    sides = {
+        key: signals(document, key, source=source)
+        if key in several
+        else Signal.from_document(files.member(document, key, dict, source=source), source=source)
+        for key in ("y", "u")
+    }
+    bags = files.member(document, "bags", list, source=source)
+    return {
+        "period": files.number(document, "period", source=source),
+        "training": files.member(document, "training", str, source=source),
+        "bags": tuple(files.named_digests(bags, source=source)),
+        **sides,
+    }
+
+
+def window_of(document: Json, *, source: str) -> tuple[tuple[int, int], ...]:
+    """The (input, delay) pairs of `document["window"]`; DocumentError if they are none."""
+    window = files.array(document, "window", (None, 2), source=source)
+    if (window % 1.0).any():
+        raise DocumentError(f"{source}: window should hold integers")
+    return tuple((int(i), int(d)) for i, d in window)

@@ -15,9 +15,17 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.polynomials import Polynomials
-from nlsid_core.models.signal import FORMAT, Signal, objects, signals
+from nlsid_core.models.signal import (
+    FORMAT,
+    Signal,
+    head,
+    objects,
+    recorded,
+    tail,
+    window_of,
+)
 
 KIND = "state_affine"
 OutOfRange = Literal["clip", "refuse"]
@@ -64,9 +72,9 @@ class StateAffineModel:
             raise DataError(f"input range {self.u_range.tolist()} is empty")
         if len(self.G) < 2:
             raise ShapeError(f"{len(self.G)} left coefficients; a model has at least one lag")
-        for polynomials, tail in (*((g, (n_y, n_y)) for g in self.G), (self.p, (n_y,))):
-            if polynomials.coefficients.shape[1:] != tail:
-                raise ShapeError(f"coefficients {polynomials.coefficients.shape}, wanted {tail}")
+        for polynomials, shape in (*((g, (n_y, n_y)) for g in self.G), (self.p, (n_y,))):
+            if polynomials.coefficients.shape[1:] != shape:
+                raise ShapeError(f"coefficients {polynomials.coefficients.shape}, wanted {shape}")
             if polynomials.exponents.shape[1] != len(self.window):
                 raise ShapeError(f"exponents for {polynomials.exponents.shape[1]} window entries")
         if any(not (0 <= i < n_u and 0 <= d <= len(self)) for i, d in self.window):
@@ -155,13 +163,7 @@ class StateAffineModel:
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         return {
-            "format": FORMAT,
-            "version": files.VERSION,
-            "kind": KIND,
-            "equation": "0 = sum G[k](w) ybar(t-k) + p(w), ybar = (y - y_offset)/y_scale",
-            "period": self.period,
-            "y": [signal.document() for signal in self.y],
-            "u": [signal.document() for signal in self.u],
+            **head(self, KIND, "0 = sum G[k](w) ybar(t-k) + p(w), ybar = (y - y_offset)/y_scale"),
             "window": [list(entry) for entry in self.window],
             "G": [g.document() for g in self.G],
             "p": self.p.document(),
@@ -171,41 +173,33 @@ class StateAffineModel:
             "u_scale": self.u_scale.tolist(),
             "u_range": self.u_range.tolist(),
             "on_out_of_range": self.on_out_of_range,
-            "training": self.training,
-            "bags": [{"name": name, "digest": digest} for name, digest in self.bags],
+            **tail(self),
         }
 
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "StateAffineModel":
         """Raises DocumentError if the document is not a state-affine model."""
         files.header(document, FORMAT, source=source, kind=KIND)
-        y, u = (signals(document, key, source=source) for key in ("y", "u"))
-        window = files.array(document, "window", (None, 2), source=source)
-        if (window % 1.0).any():
-            raise DocumentError(f"{source}: window should hold integers")
+        window = window_of(document, source=source)
+        y, u = (files.member(document, key, list, source=source) for key in ("y", "u"))
         n_w, n_y = len(window), len(y)
         left = objects(document, "G", source=source)
         right = files.member(document, "p", dict, source=source)
-        bags = files.member(document, "bags", list, source=source)
         return cls(
             G=tuple(
                 Polynomials.from_document(g, n_w, (n_y, n_y), source=f"{source} G") for g in left
             ),
             p=Polynomials.from_document(right, n_w, (n_y,), source=f"{source} p"),
-            window=tuple((int(i), int(d)) for i, d in window),
+            window=window,
             y_offset=files.array(document, "y_offset", (n_y,), source=source),
             y_scale=files.array(document, "y_scale", (n_y,), source=source),
             u_offset=files.array(document, "u_offset", (len(u),), source=source),
             u_scale=files.array(document, "u_scale", (len(u),), source=source),
             u_range=files.array(document, "u_range", (len(u), 2), source=source),
-            period=files.number(document, "period", source=source),
-            y=y,
-            u=u,
             on_out_of_range=cast(
                 OutOfRange, files.member(document, "on_out_of_range", str, source=source)
             ),
-            training=files.member(document, "training", str, source=source),
-            bags=tuple(files.named_digests(bags, source=source)),
+            **recorded(document, several=("y", "u"), source=source),
         )
 
 

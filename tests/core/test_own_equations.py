@@ -86,6 +86,17 @@ def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
     assert followed.x.ends()[-1] == pytest.approx(end, abs=0.02)
 
 
+def test_inputs_share_what_they_do_by_the_square_of_their_scale() -> None:
+    """ẍ = u₀ + u₁ at the cost ∫(u₀/s₀)² + (u₁/s₁)² has u₀/u₁ = (s₀/s₁)² at the least."""
+    found = plan_motion(
+        lambda x, u: [x[1], u[0] + u[1]], start=[0, 0], end=[1, 0], seconds=1, m=2, scale=[1.0, 2.0]
+    )
+    inner = found.u.ends()[1:-1]
+    assert np.abs(inner[:, 1] - 4 * inner[:, 0]).max() < 0.01 * np.abs(inner).max()
+    with pytest.raises(DataError, match="scale should be 2 positive numbers"):
+        plan_motion(pendulum, start=[0, 0], end=[1, 0], seconds=1, m=2, scale=[1.0, 0.0])
+
+
 def test_what_is_no_motion_is_not_returned() -> None:
     with pytest.raises(Infeasible, match="more seconds"):
         plan_motion(pendulum, start=[0, 0], end=[3, 0], seconds=1, m=1, limits=[[-1, 1]])
