@@ -46,6 +46,15 @@ class SignalsConfig(Section):
     response: Annotated[Signals, Key("what is measured and modelled")]
     excitation: Annotated[Signals, Key("what drives the robot")]
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """What the signals are read from, each topic once."""
+        return tuple(dict.fromkeys(
+            factor.path.topic
+            for signal in (*self.response, *self.excitation)
+            for factor in parse_factors(signal.path)
+        ))  # fmt: skip
+
 
 class GridConfig(Section):
     """How the numbers in messages become samples (`bags.signals.sampling`)."""
