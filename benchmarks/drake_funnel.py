@@ -24,12 +24,12 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"
 import numpy as np  # noqa: E402 - the thread counts have to be set first
 
 from benchmarks.machine import describe, peers  # noqa: E402
+from benchmarks.thesis.relaxation import sample_funnel  # noqa: E402
 from examples import satellite  # noqa: E402
 from examples.satellite_funnel import goal_matrix, problem  # noqa: E402
 from nlsid_core.arrays import FloatArray  # noqa: E402
 from nlsid_core.design import design_funnel  # noqa: E402
 from nlsid_core.design.continuous.shape import STOP  # noqa: E402
-from nlsid_core.design.thesis.relaxation import sample_funnel  # noqa: E402
 
 BALL = np.pi**3 / 6  # volume of the unit ball in 6 dimensions
 SAMPLES = satellite.SAMPLES_PER_INTERVAL

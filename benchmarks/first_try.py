@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from benchmarks.thesis.soundness import simulate_boundary, simulate_held
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -29,7 +30,6 @@ from nlsid_core.design import (
     integrate_nominal,
     plan_motion,
 )
-from nlsid_core.design.thesis.soundness import simulate_boundary, simulate_held
 from nlsid_core.dynamics import Rates, solve
 from nlsid_core.errors import NlsidError
 from nlsid_core.proofs import check

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import cart_pole, planar_quadrotor, torque_limited_pendulum
 from nlsid_core.design import FunnelDesign
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.dynamics import VectorField
 from nlsid_core.proofs import check
 

@@ -26,6 +26,7 @@ for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"
 import numpy as np  # noqa: E402 - the thread counts have to be set first
 
 from benchmarks.machine import peers  # noqa: E402
+from benchmarks.rigorous import bound_holds  # noqa: E402
 from examples import satellite  # noqa: E402
 from nlsid_core.polynomial import Polynomial, constant, monomials, variables  # noqa: E402
 from nlsid_core.proofs import decide  # noqa: E402
@@ -40,7 +41,6 @@ from nlsid_core.sos import (  # noqa: E402
     template,
 )
 from nlsid_core.sos.proofs import bound_document  # noqa: E402
-from nlsid_core.sos.rigorous import bound_holds  # noqa: E402
 
 SAMPLES = 12
 REPEATS = 5

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from benchmarks.thesis.alternation import alternate_rho, exponential_start
 from examples.one_dimensional import BEST_AREA, designed, problem, radius, true_sets
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
 
 TIMES = np.linspace(-1.0, 1.0, 2001)
 

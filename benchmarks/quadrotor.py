@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import quadrotor
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.proofs import check
 
 

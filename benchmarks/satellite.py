@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
+from benchmarks.thesis.alternation import alternate_rho, exponential_start
+from benchmarks.thesis.soundness import simulate_boundary, smallest_escape
 from examples.satellite import FINAL_TIME
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core.design import FunnelDesign, design_funnel
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
-from nlsid_core.design.thesis.soundness import simulate_boundary, smallest_escape
 from nlsid_core.proofs import check
 
 TIMES = (0.0, 1.25, 2.5, 3.75, 5.0)

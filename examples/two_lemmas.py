@@ -16,12 +16,12 @@ from scipy.integrate import solve_ivp
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces
-from nlsid_core.design.thesis.lemmas import Lemma, lemma_decay
 from nlsid_core.dynamics import VectorField, constant_on
 from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial import variables
+from nlsid_core.sos.lemmas import Lemma, lemma_decay
 
 END, KNOTS = 4 * np.pi, 9
 FIRST, LAST = 2.65, 1.1  # W at both ends of Figure 5.2(a)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from nlsid_core.errors import ShapeError
 from nlsid_core.polynomial import Polynomial, constant, jacobian, variables
 from nlsid_core.polynomial.algebra import as_polynomial
+from nlsid_core.sos import SumOfSquares, matrix_sum_of_squares
 
 Polynomials = NDArray[Any]  # object array of `Polynomial`, or numbers
 Domain = tuple[Polynomial, ...]
@@ -52,6 +53,15 @@ class Inequality:
         everything = (*self.matrix.ravel(), *self.domain)
         used = set().union(*(_used(entry) for entry in everything))
         return tuple(name for name in names if name in used) or tuple(names[:1])
+
+
+def constraint(inequality: Inequality, *, name: str) -> SumOfSquares:
+    """The inequality as a sum of squares on its domain, for a `sos.Program`; name: for messages."""
+    matrix, domain, gaps = inequality.matrix, inequality.domain, inequality.vanishing
+    if len(matrix) == 1:
+        return SumOfSquares(matrix[0, 0], domain=domain, vanishing=gaps, name=name)
+    found = matrix_sum_of_squares(matrix, domain=domain, name=name)
+    return replace(found, vanishing=(*gaps, *found.forms[1:])) if gaps else found
 
 
 def linear(E: Polynomials, F: Polynomials, delta: Number = 1, *, rate: Number = 1) -> Inequality:

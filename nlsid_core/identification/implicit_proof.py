@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
-from nlsid_core.identification.conditions import Inequality
+from nlsid_core.identification.conditions import Inequality, constraint
 from nlsid_core.identification.implicit_sets import (
     SETS,
     STORAGE,
@@ -19,7 +19,6 @@ from nlsid_core.identification.implicit_sets import (
     inequalities,
     well_posed,
 )
-from nlsid_core.identification.stable_sets import constraint
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.algebra import as_polynomial

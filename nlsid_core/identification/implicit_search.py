@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import Infeasible
 from nlsid_core.identification import conditions
-from nlsid_core.identification.conditions import GAP, Inequality
+from nlsid_core.identification.conditions import GAP, Inequality, constraint
 from nlsid_core.identification.implicit_class import DELAYED, FARTHEST, ImplicitRows
 from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit, storage_template
 from nlsid_core.identification.implicit_sets import Names
-from nlsid_core.identification.stable_sets import constraint
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.polynomial.algebra import as_polynomial

@@ -14,10 +14,10 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import Infeasible
+from nlsid_core.identification.conditions import constraint, linear
 from nlsid_core.identification.implicit_class import with_signals
 from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit
 from nlsid_core.identification.regressors import refuse_poor, signal_scale
-from nlsid_core.identification.stable_sets import linear_models
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import variables
@@ -101,9 +101,10 @@ def _solved(R: FloatArray, n: int, slowest: float) -> tuple[FloatArray, Solution
     F, G = _unknown("F", n, n), _unknown("G", n, R.shape[1] - 2 * n)
     (bound,) = variables("bound")
     residual = R[:, :n] @ E - R[:, n : 2 * n] @ F.T - R[:, 2 * n :] @ G.T
+    stable = constraint(linear(E, F, rate=slowest), name="linear models (2.19)")
     program = Program(
         forms_of(2 * n),
-        (linear_models(E, F, rate=slowest), NormBound(tuple(residual.ravel()), bound)),
+        (stable, NormBound(tuple(residual.ravel()), bound)),
         minimise=bound,
     )
     found = solve(program)

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.thesis.alternation import design_by_alternation
+from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.design import ContinuousTracking, design, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.lstep import sphere_program
-from nlsid_core.design.thesis.alternation import design_by_alternation
-from nlsid_core.design.thesis.soundness import simulate_boundary
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial import constant, variables

@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.thesis.alternation import (
+    alternate_rho,
+    design_by_alternation,
+    exponential_start,
+)
+from benchmarks.thesis.relaxation import sample_funnel
+from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.vstep import improve
-from nlsid_core.design.thesis.alternation import (
-    alternate_rho,
-    design_by_alternation,
-    exponential_start,
-)
-from nlsid_core.design.thesis.relaxation import sample_funnel
-from nlsid_core.design.thesis.soundness import simulate_boundary
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.thesis.soundness import simulate_held
 from nlsid_core import proofs
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
-from nlsid_core.design.thesis.soundness import simulate_held
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
 from nlsid_core.running.held import Held

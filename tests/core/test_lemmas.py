@@ -11,11 +11,11 @@ from examples import one_dimensional, two_lemmas
 from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.closed_loop import closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
-from nlsid_core.design.thesis.lemmas import lemma_decay, lemma_invariance
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.polynomial import variables
 from nlsid_core.sos import Program, SumOfSquares, solve
+from nlsid_core.sos.lemmas import lemma_decay, lemma_invariance
 
 
 def test_example_5_1_1_is_refused() -> None:

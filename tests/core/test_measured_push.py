@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import ContinuousTracking, design, plan_motion
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.dynamics import VectorField, measured_push
 from nlsid_core.errors import DataError
 

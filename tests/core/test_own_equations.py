@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.first_try import Truth, dubins, lines_of, rocket, van_der_pol
+from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -18,7 +19,6 @@ from nlsid_core.design import (
     integrate_nominal,
     plan_motion,
 )
-from nlsid_core.design.thesis.soundness import simulate_boundary
 from nlsid_core.dynamics import Nominal, Rates
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.proofs import check

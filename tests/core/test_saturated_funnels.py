@@ -12,13 +12,13 @@ from typer.testing import CliRunner
 
 from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from examples import torque_limited_pendulum as pendulum
 from nlsid_core import files as documents
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.closed_loop import Pieces, closed_loop_polynomial
 from nlsid_core.design.continuous.graded import Graded, monomials_of
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.dynamics import Nominal, VectorField, constant_on
 from nlsid_core.errors import CertificateRejected, DataError
 from nlsid_core.policies.continuous import ContinuousPolicy

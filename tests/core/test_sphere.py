@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.rigorous import bound_holds
 from examples import satellite
 from nlsid_core.errors import (
     CertificateRejected,
@@ -24,7 +25,6 @@ from nlsid_core.sos import (
 )
 from nlsid_core.sos import sphere as sphere_module
 from nlsid_core.sos.proofs import bound_document
-from nlsid_core.sos.rigorous import bound_holds
 
 TWICE_SOLVER = 1e-6  # of the spread: Clarabel stops at 1e-8 of quantities of size 1, not of g
 

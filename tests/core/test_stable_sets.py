@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from examples import not_a_contraction
 from nlsid_core import files
 from nlsid_core.errors import CertificateRejected, Infeasible, ShapeError, SolverError
-from nlsid_core.identification import stable_sets
+from nlsid_core.identification import conditions
+from nlsid_core.identification.conditions import Inequality, constraint
 from nlsid_core.polynomial import variables
 from nlsid_core.proofs import check, proof_document
 from nlsid_core.sos import Program, SumOfSquares, forms_of, solve, symmetric_template
@@ -18,8 +19,11 @@ from nlsid_core.sos import Program, SumOfSquares, forms_of, solve, symmetric_tem
 FORMS = 4
 
 
-def feasible(*constraints: SumOfSquares, names: tuple[str, ...]) -> bool:
+def feasible(*parts: SumOfSquares | Inequality, names: tuple[str, ...]) -> bool:
     """Whether a solver finds the decisions; the sizes here leave no doubt either way."""
+    constraints = tuple(
+        constraint(part, name="a set") if isinstance(part, Inequality) else part for part in parts
+    )
     try:
         solve(Program((*names, *forms_of(FORMS)), constraints))
     except (Infeasible, SolverError):
@@ -61,7 +65,7 @@ def test_the_linear_set_contains_every_stable_matrix(seed: int, radius: float) -
     """With E = sX, F = sXA for a Lyapunov matrix X of A; here the solver finds E itself."""
     A = random_matrix(seed, radius)
     E = symmetric_template("E", 2)
-    assert feasible(stable_sets.linear_models(E, E @ A), names=())
+    assert feasible(conditions.linear(E, E @ A), names=())
 
 
 @pytest.mark.parametrize("radius", [1.05, 1.5])
@@ -69,7 +73,7 @@ def test_the_linear_set_contains_no_unstable_matrix(radius: float) -> None:
     for seed in range(3):
         E = symmetric_template("E", 2)
         A = random_matrix(seed, radius)
-        assert not feasible(stable_sets.linear_models(E, E @ A), names=())
+        assert not feasible(conditions.linear(E, E @ A), names=())
 
 
 @settings(deadline=None, max_examples=8)
@@ -82,7 +86,7 @@ def test_proposition_2_14_stable_matrices_satisfy_lemma_2_13(seed: int, radius: 
         P = np.eye(2) + A.T @ P @ A
     names = ["x0", "x1"]
     e, f = linear_map(P, names), linear_map(P @ A, names)
-    for condition in (stable_sets.derivatives, stable_sets.increments):
+    for condition in (conditions.derivatives, conditions.increments):
         assert feasible(
             condition(e, f, P, names, delta=0.5), names=("x0", "x1", "x0~", "x1~")
         )  # fmt: skip
@@ -93,12 +97,12 @@ def test_a_cubic_map_needs_a_domain_and_gets_one() -> None:
     (x,) = variables("x")
     e, f = np.array([1.0 * x]), np.array([0.5 * x + 0.25 * x**3])
     P = np.eye(1)
-    domain = stable_sets.box(["x"], [-0.7], [0.7])
-    assert not feasible(stable_sets.derivatives(e, f, P, ["x"], delta=0.01), names=("x",))
-    inside = stable_sets.derivatives(e, f, P, ["x"], delta=0.01, domain=domain)
+    domain = conditions.box(["x"], [(-0.7, 0.7)])
+    assert not feasible(conditions.derivatives(e, f, P, ["x"], delta=0.01), names=("x",))
+    inside = conditions.derivatives(e, f, P, ["x"], delta=0.01, domain=domain)
     assert feasible(inside, names=("x",))
-    wide = stable_sets.box(["x"], [-2.0], [2.0])
-    outside = stable_sets.derivatives(e, f, P, ["x"], delta=0.01, domain=wide)
+    wide = conditions.box(["x"], [(-2.0, 2.0)])
+    outside = conditions.derivatives(e, f, P, ["x"], delta=0.01, domain=wide)
     assert not feasible(outside, names=("x",))
 
 
@@ -117,11 +121,11 @@ def test_lemmas_2_10_and_2_11_tell_stable_delay_models_from_unstable_ones(
     P = symmetric_template("P", 2)
     gap = np.array(variables(gaps))
     V = gap @ P @ gap
-    pairs = stable_sets.implicit_increments(h, shift, V, ["v"], names, delta=0.01)
+    pairs = conditions.implicit_increments(h, shift, V, ["v"], names, delta=0.01)
     positive = SumOfSquares(V)
     everything = ("v", "v~", *names, *gaps)
     assert feasible(pairs, positive, names=everything) == stable
-    slopes = stable_sets.implicit_derivatives(h, shift, P, ["v"], names, delta=0.01)
+    slopes = conditions.implicit_derivatives(h, shift, P, ["v"], names, delta=0.01)
     assert feasible(slopes, positive, names=everything) == stable
 
 
@@ -130,16 +134,16 @@ def test_proposition_2_7_contains_its_centre_and_not_its_negative() -> None:
     centre = np.array([x + x**3])
     for sign, contained in ((1.0, True), (0.6, True), (-1.0, False)):
         e = np.array([sign * centre[0]])
-        assert feasible(stable_sets.invertible(e, centre, ["x"]), names=("x",)) == contained
-        pairs = stable_sets.invertible_increments(e, centre, ["x"])
+        assert feasible(conditions.centred(e, centre, ["x"]), names=("x",)) == contained
+        pairs = conditions.centred_increments(e, centre, ["x"])
         assert feasible(pairs, names=("x", "x~")) == contained
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:
     h, _ = delayed(0.5, 0.1)
     with pytest.raises(ShapeError, match="1 equations for 1 unknowns, 0 shifted"):
-        stable_sets.implicit_increments(
+        conditions.implicit_increments(
             h, np.array([]), variables("x0")[0] ** 2, ["v"], ["x0", "x1"]
         )
-    with pytest.raises(ShapeError, match="2 names, 1 lower"):
-        stable_sets.box(["x", "u"], [0.0], [1.0])
+    with pytest.raises(ShapeError, match="2 names and the ends of 1"):
+        conditions.box(["x", "u"], [(0.0, 1.0)])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.known_problems import encloses, run
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, design_funnel, nominal_through
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.dynamics import Rates, VectorField, solve, taylor_field
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeError
 from nlsid_core.polynomial import Polynomial

@@ -12,14 +12,14 @@ from typer.testing import CliRunner
 
 from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
+from benchmarks.thesis.alternation import alternate_rho, exponential_start
+from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary, smallest_escape
 from examples import one_dimensional, pendulum
 from examples.satellite_funnel import goal_matrix, problem
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, Goal, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.thesis.alternation import alternate_rho, exponential_start
-from nlsid_core.design.thesis.soundness import TrueDynamics, simulate_boundary, smallest_escape
 from nlsid_core.dynamics import (
     Nominal,
     PiecewisePolynomial,

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
-from nlsid_core.design.thesis.soundness import simulate_boundary
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.proofs import check

@@ -77,31 +77,6 @@ class KnotForms:
                 self.pairs.append((own, other))
                 self.margins.append(min(margin, KEEP * m))
 
-    def levels(self, k: int, after: float) -> list[tuple[FloatArray, FloatArray]]:
-        """c/ρ = constant + slope·ρ_k at both ends of interval k, for ρ_{k+1} = after.
-
-        In the frames of the present funnel W = ρ°|z|², ρ° the present ρ at that end: the sample's
-        constant is -Ẇ/ρ° + μ(1 - |z|²), so c/ρ° = it + ρ̇/ρ° + μ(ρ/ρ° - 1).
-        """
-        result = []
-        half = len(self.h) * self.vertices
-        for end in (0, 1):
-            present = self.rho[k + end]
-            for v in range(self.vertices):
-                sample = self.samples[end * half + k * self.vertices + v]
-                mu = sample.mu
-                constant, slope = sample.constant.copy(), np.zeros_like(sample.constant)
-                constant[0] += after / self.h[k] / present
-                slope[0] -= 1 / self.h[k] / present
-                size = len(mu)
-                if end == 0:
-                    constant[:size] -= mu
-                    slope[:size] += mu / present
-                else:
-                    constant[:size] += mu * (after / present - 1)
-                result.append((constant, slope))
-        return result
-
 
 def _count(n: int, degree: int) -> int:
     return sum(len(monomials_of(n, q)) for q in range(degree + 1))

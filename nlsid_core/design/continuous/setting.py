@@ -201,20 +201,6 @@ def _dynamics(
     return expansion.linear(), expansion
 
 
-def refuse_first(setting: Setting, rho: FloatArray) -> None:
-    """Raise DataError unless a first ρ (K,) given by a user is positive and ends in the goal."""
-    if rho.shape != setting.policy.t.shape or not (np.isfinite(rho).all() and (rho > 0).all()):
-        raise DataError(
-            f"the first rho should be {len(setting.policy.t)} positive numbers, one per knot; it "
-            f"has shape {rho.shape}"
-        )
-    if rho[-1] > setting.rho_final:
-        raise DataError(
-            f"the first rho does not end in the goal: rho(t_f) = {rho[-1]:.6g}, and the goal holds "
-            f"what ends with at most {setting.rho_final:.6g}. Scale it down, or take a larger goal"
-        )
-
-
 def refuse_nominal(field: VectorField | Rates, nominal: Nominal) -> None:
     """Raise unless the nominal fits the dynamics' sizes and obeys them well enough."""
     sizes = (nominal.x.control.shape[2], nominal.u.control.shape[2])

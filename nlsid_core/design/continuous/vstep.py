@@ -84,25 +84,7 @@ def affine_form(sample: Sample) -> Affine:
     return Affine(constant, own, others, sample.mu)
 
 
-def largest_level(constant: FloatArray, slope: FloatArray, basis: IntArray) -> float:
-    """The largest r with constant + r·slope = v'Qv, Q ⪰ 0; both in the monomials of degree 0..4.
-
-    Raises Infeasible or SolverError if there is none.
-    """
-    gram, size = _gram_columns(basis)
-    A = sp.vstack([
-        sp.hstack([sp.csc_matrix(-slope[:, None]), gram]),
-        sp.hstack([sp.csc_matrix((size, 1)), -sp.eye(size)]),
-    ], format="csc")  # fmt: skip
-    q = np.zeros(1 + size)
-    q[0] = -1.0
-    cones = (Cone("zero", len(constant)), Cone("psd", len(basis)))
-    program = ConeProgram(sp.csc_matrix((1 + size, 1 + size)), q, A,
-                          np.concatenate([constant, np.zeros(size)]), cones)  # fmt: skip
-    return float(conic.solve(program).x[0])
-
-
-def _gram_columns(basis: IntArray) -> tuple[sp.csc_matrix, int]:
+def gram_columns(basis: IntArray) -> tuple[sp.csc_matrix, int]:
     """Monomial coefficients of v'Qv from svec(Q), and how long that is."""
     n = basis.shape[1]
     i, j = conic.triangle(len(basis))
@@ -133,7 +115,7 @@ def improve(
     """
     n, k = basis.shape[1], len(basis)
     d = n * (n + 1) // 2
-    gram, triangle = _gram_columns(basis)
+    gram, triangle = gram_columns(basis)
     rows = gram.shape[0]
     extra = free if reference is not None else 0
     left, right = [], []

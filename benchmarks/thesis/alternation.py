@@ -11,17 +11,20 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
+import scipy.sparse as sp
 
-from nlsid_core.arrays import ArrayLike, FloatArray
+from benchmarks.thesis.relaxation import Sampled
+from nlsid_core import conic
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
+from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.design import FunnelDesign, decided, proved_for
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
-from nlsid_core.design.continuous.setting import Setting, prepare, refuse_first
+from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
-from nlsid_core.design.continuous.vstep import largest_level
+from nlsid_core.design.continuous.vstep import gram_columns
 from nlsid_core.design.problems import ContinuousTracking
-from nlsid_core.design.thesis.relaxation import Sampled
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -126,16 +129,74 @@ def alternate_rho(
         forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
         rho = funnel.rho.copy()
         for k in range(len(rho) - 2, -1, -1):
-            levels = []
-            for constant, slope in forms.levels(k, rho[k + 1]):
+            largest = []
+            for constant, slope in levels(forms, k, rho[k + 1]):
                 constant[0] -= margin
                 try:
-                    levels.append(largest_level(constant, slope, forms.basis))
+                    largest.append(largest_level(constant, slope, forms.basis))
                 except SolverError:
-                    levels.append(0.0)
-            rho[k] = max(funnel.rho[k], min(levels) * (1 - 1e-6))
+                    largest.append(0.0)
+            rho[k] = max(funnel.rho[k], min(largest) * (1 - 1e-6))
         funnel = replace(funnel, rho=rho)
         volumes.append(funnel.volume_integral())
         if volumes[-1] < volumes[-2] * (1 + stop):
             break
     return Sampled(funnel, tuple(volumes))
+
+
+def levels(forms: KnotForms, k: int, after: float) -> list[tuple[FloatArray, FloatArray]]:
+    """c/ρ = constant + slope·ρ_k at both ends of interval k, for ρ_{k+1} = after.
+
+    In the frames of the present funnel W = ρ°|z|², ρ° the present ρ at that end: the sample's
+    constant is -Ẇ/ρ° + μ(1 - |z|²), so c/ρ° = it + ρ̇/ρ° + μ(ρ/ρ° - 1).
+    """
+    result = []
+    half = len(forms.h) * forms.vertices
+    for end in (0, 1):
+        present = forms.rho[k + end]
+        for v in range(forms.vertices):
+            sample = forms.samples[end * half + k * forms.vertices + v]
+            mu = sample.mu
+            constant, slope = sample.constant.copy(), np.zeros_like(sample.constant)
+            constant[0] += after / forms.h[k] / present
+            slope[0] -= 1 / forms.h[k] / present
+            size = len(mu)
+            if end == 0:
+                constant[:size] -= mu
+                slope[:size] += mu / present
+            else:
+                constant[:size] += mu * (after / present - 1)
+            result.append((constant, slope))
+    return result
+
+
+def largest_level(constant: FloatArray, slope: FloatArray, basis: IntArray) -> float:
+    """The largest r with constant + r·slope = v'Qv, Q ⪰ 0; both in the monomials of degree 0..4.
+
+    Raises Infeasible or SolverError if there is none.
+    """
+    gram, size = gram_columns(basis)
+    A = sp.vstack([
+        sp.hstack([sp.csc_matrix(-slope[:, None]), gram]),
+        sp.hstack([sp.csc_matrix((size, 1)), -sp.eye(size)]),
+    ], format="csc")  # fmt: skip
+    q = np.zeros(1 + size)
+    q[0] = -1.0
+    cones = (Cone("zero", len(constant)), Cone("psd", len(basis)))
+    program = ConeProgram(sp.csc_matrix((1 + size, 1 + size)), q, A,
+                          np.concatenate([constant, np.zeros(size)]), cones)  # fmt: skip
+    return float(conic.solve(program).x[0])
+
+
+def refuse_first(setting: Setting, rho: FloatArray) -> None:
+    """Raise DataError unless a first ρ (K,) given by a user is positive and ends in the goal."""
+    if rho.shape != setting.policy.t.shape or not (np.isfinite(rho).all() and (rho > 0).all()):
+        raise DataError(
+            f"the first rho should be {len(setting.policy.t)} positive numbers, one per knot; it "
+            f"has shape {rho.shape}"
+        )
+    if rho[-1] > setting.rho_final:
+        raise DataError(
+            f"the first rho does not end in the goal: rho(t_f) = {rho[-1]:.6g}, and the goal holds "
+            f"what ends with at most {setting.rho_final:.6g}. Scale it down, or take a larger goal"
+        )

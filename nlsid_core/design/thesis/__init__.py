@@ -1,1 +1,0 @@
-"""The literal algorithms of the thesis, beside the faster ones."""
