@@ -356,12 +356,24 @@ def test_what_is_recorded_and_excited_is_what_the_configuration_names(
         left_out = operator.values["model_identifier"]["left out"]
         assert "trial_new: it is not closed" in left_out
         assert "trial_01: it has nothing on /diff/cmd_vel" in left_out
-        operator.call("/excitation/start")
+        assert called("/excitation/start").returncode == 0
         operator.hears("excitation", "done")
         operator.waits(0.5)
+        there = called().stdout.split()
+        assert {"/excitation/start", "/model_identifier/identify"} <= set(there)
+        refused = called("/excitation/begin")
+        assert refused.returncode == 2
+        assert "no service /excitation/begin" in refused.stderr
+        assert "/excitation/start" in refused.stderr
     with Bag(trials / "trial_new") as recorded:
         assert recorded.count("/diff/cmd_vel") > 30
         assert "/cmd_vel" not in recorded.topics
+
+
+def called(*service: str) -> "subprocess.CompletedProcess[str]":
+    """`nlsid call`."""
+    command = [sys.executable, "-m", "bags.commands.cli", "call", *service]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
 def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
