@@ -555,6 +555,8 @@ def live(
         for name in WORKFLOWS:
             typer.echo(str(LaunchFile(shipped_file("launch", f"{name}.launch.xml"))))
         raise typer.Exit(2)
+    if workflow not in WORKFLOWS:
+        raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
     commands = launch.commands(arguments or [])
     raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))

@@ -8,57 +8,43 @@ semidefinite programs, on the training trials; the level is measured on other tr
 Source: docs/certificate_tube.md.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 from typing import Any, TypeAlias
 
-import cvxpy
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, null_space, solve_discrete_lyapunov
+from scipy.linalg import LinAlgError
 from scipy.signal import lfilter
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.calibration import calibration_trials
 from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.design.increment_form import Form, read_form
 from nlsid_core.design.levels import LevelKind, followed
 from nlsid_core.design.plan import lqr_gain, track_profile
 from nlsid_core.design.riccati import solve_riccati
+from nlsid_core.design.tube_program import Found, gramian, solved
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
-from nlsid_core.funnels.level import CommandLevel
 from nlsid_core.funnels.tube import Cusum, Response, Tube, TubeFunnel
-from nlsid_core.identification.stability import prove_stability, storage_on
-from nlsid_core.kernel import Rejected, increments
-from nlsid_core.kernel.files import Node, parse
+from nlsid_core.kernel import Rejected
 from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
 from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.detectors import DRIFT, cusum
 from nlsid_core.running.stepping import Stepper
 
-cp: Any = cvxpy  # its functions are not seen by type checkers
 NOISE_RATIOS = np.logspace(-4, 4, 17)  # process over measurement noise, of a Kalman gain
-FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
 SOLVED = 6  # pairs (L, ρ) whose program is solved, best forecasts first
 CLOSE = 1.25  # times the narrowest forecast: of these the tube that is narrowest for ever is taken
-SCALES = (1.0, 1e2, 1e4)  # of the balance, tried in order: slow vertices spread what V is worth
-CORNERS = 16  # vertices whose Gramians balance a program
 MOST = 36  # pairs that are tried where the first are infeasible or refused
 REACTION = 10  # samples: the reaction time if none is named
 LEAST_WINDOW = 10  # times settling and reaction: a window of a single recording
 SETTLED = 1e-3  # part of a cascade's first filter that is left of its start at sample 0
 LONGEST_SETTLING = 0.25  # of the shortest trial
-ROOM = 1e-6  # least eigenvalue asked for, in balanced units
-WORST = 0.3  # part of it that a solution has to have
-TAU_ROOM = 1e-3  # relative, given up of τ for the exact proof
-UNREACHED = 1e-4  # of the Gramian's mean: noise on states that no injection moves
-LARGEST = 1e4  # entry of a multiplier in balanced units
-ROUNDS = 6  # of cutting planes, most of the time 2-4
-CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
 BOX_ROOM = 0.1  # of a signal's range, on both sides of it
 
 OutputTubeDesign: TypeAlias = Design[Any, Any, TubeFunnel, None]
@@ -91,7 +77,7 @@ def design_output_tube(
     K: FloatArray | None = None
     if profile is not None:
         K, level = _gain(model, lqr_weights), "constant"
-    form = _Form.of(model, bounds, K)
+    form = Form.of(model, bounds, K)
     samples = REACTION if reaction_time is None else max(1, round(reaction_time / model.period))
     amplitudes = np.maximum(
         np.ptp(np.concatenate([trial.y for trial in train]), axis=0) / 2.0, np.finfo(float).tiny
@@ -99,7 +85,7 @@ def design_output_tube(
     gains = _gains(form, amplitudes)
     e = [innovations(model, gains, trial, settling) for trial in train]
 
-    def tube_of(design: _Found, samples: int | None) -> Tube:
+    def tube_of(design: Found, samples: int | None) -> Tube:
         return Tube(
             rho=design.rho, L=design.L, P=design.P, R=design.R, tau=design.tau,
             half_widths=1.0 / np.sqrt(0.99 * design.tau), level=1.0, measured=0.0,
@@ -109,7 +95,7 @@ def design_output_tube(
         )  # fmt: skip
 
     def proved(
-        tubes: Sequence[Tube], found: Sequence[_Found],
+        tubes: Sequence[Tube], found: Sequence[Found],
         response: Response | None = None, alarm: Cusum | None = None,
     ) -> OutputTubeDesign:  # fmt: skip
         funnel = TubeFunnel(
@@ -130,7 +116,7 @@ def design_output_tube(
         proof: Json = {} if trees[0] is None else {"multipliers": trees}
         return Design.proved(model, policy, funnel, claim={"kind": "tube"}, proof=proof, found=None)
 
-    def decided(design: _Found) -> str:
+    def decided(design: Found) -> str:
         """Why the kernel refuses the candidate, whatever its level; empty if it is proved."""
         try:
             tube = tube_of(design, 1 if design.rho == 1.0 else None)
@@ -163,14 +149,15 @@ def design_output_tube(
         tube = tube_of(design, samples_left)
         if level != "constant" and samples_left is None:
             spent = [energy(part[:, design.at], tube)[:, None] for part in e]
-            tube = replace(tube, follows=_chosen(level, spent, u))
+            tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
     if profile is not None:  # what is assumed around a plan is what is held there
         return proved(tubes, found)
     errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
     response = Response(
         np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
-        None if level == "constant" else _chosen(level, [part**2 for part in errors], u),
+        None if level == "constant"
+        else followed([part**2 for part in errors], u, always=level == "commands"),
     )  # fmt: skip
     calibrated = [
         innovations(model, np.stack([np.zeros_like(found[0].L), found[0].L]), t, settling)
@@ -227,13 +214,6 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
         tube, measured=measured, level=level,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
     )  # fmt: skip
-
-
-def _chosen(
-    level: LevelKind, energies: Sequence[FloatArray], inputs: Sequence[FloatArray]
-) -> CommandLevel | None:
-    """The level that follows the commands, if it is asked for or narrower on these trials."""
-    return followed(energies, inputs, always=level == "commands")
 
 
 def _scaled_response(
@@ -302,7 +282,7 @@ def _box(
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """(p, 2) and (n_u, 2) ranges, of a model whose increments are known on a box only."""
     try:
-        _read(model, None)
+        read_form(model, None)
     except Rejected:
         if not isinstance(model, ImplicitModel):
             raise
@@ -319,117 +299,7 @@ def _box(
     return None, None
 
 
-def _read(model: StableModel, bounds: Json | None) -> increments.Model:
-    node = None if bounds is None else parse(files.encode(bounds), "box")
-    return increments.read_model(parse(files.encode(model.document()), "model"), node)
-
-
-@dataclass(frozen=True, eq=False)
-class _Form:
-    """The increment form in floats. modes: (F, H), and a second with a policy engaged.
-
-    tree: of a proof's multipliers, with the vertices E of each of its leaves in order, (count, m,
-    m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
-    """
-
-    F: FloatArray
-    H: FloatArray
-    modes: list[tuple[FloatArray, FloatArray]]
-    tree: Json | None
-    leaves: list[FloatArray]
-    mean: FloatArray
-    A: FloatArray
-    C: FloatArray
-    ray: bool
-    rate: float
-    inputs: tuple[FloatArray, FloatArray] | None
-    storage: FloatArray
-
-    @classmethod
-    def of(cls, model: StableModel, bounds: Json | None, K: FloatArray | None = None) -> "_Form":
-        form = _read(model, bounds)
-        proof = prove_stability(model) if bounds is None else storage_on(form)
-        if proof is None:
-            where = bounds and "; ".join(
-                f"{letter} in {', '.join(f'[{low:.3g}, {high:.3g}]' for low, high in rows)}"
-                for letter, rows in bounds.items()
-            )
-            raise Infeasible(
-                "no one storage proves that the model forgets its start, so no tube of it lasts"
-                + (
-                    f": tried for {where}, the `box` of the tube or else a tenth more than the "
-                    "training trials reach; take a smaller one, another `set`, or fewer lags"
-                    if where
-                    else ""
-                )
-            )
-        F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
-        m = form.unknowns
-        leaves: list[FloatArray] = [
-            np.array(form.vertices(part, ends), dtype=np.float64)
-            for part, ends in _parts(proof.multipliers, form.box)
-        ]
-        mean = np.mean([E.mean(axis=0) for E in leaves], axis=0) if m else np.zeros((0, len(F)))
-        G = np.linalg.solve(mean[:, :m], mean[:, m:]) if m else mean
-        inputs = None
-        if form.linear is not None:
-            B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
-            inputs = B[:, None], D[:, None]
-        modes: list[tuple[FloatArray, FloatArray]] = [(F, H)]
-        if K is not None and K.any() and inputs is not None:
-            modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
-        return cls(
-            F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
-            H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
-            np.linalg.inv(proof.P),
-        )  # fmt: skip
-
-    @property
-    def corners(self) -> list[FloatArray]:
-        """x̄⁺ of x̄ where E is one of its vertices, of a few: one of them may be much slower."""
-        m, vertices = self.m, [E for leaf in self.leaves for E in leaf]
-        if not m:
-            return [self.A]
-        chosen = vertices[:: max(1, len(vertices) // CORNERS)]
-        F = self.F
-        return [F[:, m:] - F[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]) for E in chosen]
-
-    @property
-    def m(self) -> int:
-        """The number of ν."""
-        return int(self.F.shape[1] - len(self.F))
-
-    def fading(self) -> list[float]:
-        """ρ between rate² and 1."""
-        return [1.0 - part * (1.0 - self.rate**2) for part in FADING]
-
-
-def _parts(tree: Json | None, box: increments.Box) -> list[tuple[increments.Box, Node | None]]:
-    """The leaves' parts of the box, and what bounds E there."""
-    if tree is None:
-        return []
-    if "split" not in tree:
-        if "ends" not in tree:
-            return [(box, None)]
-        return [(box, parse(files.encode(tree["ends"]), "ends"))]
-    i = tree["split"]
-    low, high = box[i]
-    middle = (low + high) / 2
-    halved = ([*box[:i], half, *box[i + 1 :]] for half in ((low, middle), (middle, high)))
-    return [leaf for part, half in zip(tree["parts"], halved, strict=True)
-            for leaf in _parts(part, half)]  # fmt: skip
-
-
-def _with_multipliers(tree: Json, leaves: list[list[FloatArray]]) -> Json:
-    """The tree with these multipliers in its leaves, in order."""
-    if "split" in tree:
-        parts = [_with_multipliers(part, leaves) for part in tree["parts"]]
-        return {"split": tree["split"], "parts": parts}
-    ends = {"ends": tree["ends"]} if "ends" in tree else {}
-    return {"N": [N.tolist() for N in leaves.pop(0)]} | ends
-
-
-def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
+def _gains(form: Form, amplitudes: FloatArray) -> FloatArray:
     """(B, n, p) Kalman gains of x̄⁺ = A x̄ + G d, o = C x̄ + D d + noise.
 
     d is what enters with ν (a linear model: with the input, or with the output's equation).
@@ -464,32 +334,16 @@ def _gains(form: _Form, amplitudes: FloatArray) -> FloatArray:
     return np.array(found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """L, ρ and what a program found for them; multipliers: the tree, as a proof file holds it.
-
-    at: which of the gains L is.
-    """
-
-    L: FloatArray
-    rho: float
-    P: FloatArray
-    R: FloatArray
-    tau: FloatArray
-    multipliers: Json | None
-    at: int = 0
-
-
 def _best(
-    form: _Form,
+    form: Form,
     gains: FloatArray,
     e: list[FloatArray],
     amplitudes: FloatArray,
     samples: int,
     rhos: Sequence[float],
-    decided: Callable[[_Found], str],
+    decided: Callable[[Found], str],
     start: float = 0.0,
-) -> _Found:
+) -> Found:
     """The pair (L, ρ), solved and proved, of the narrowest tube with a forecast near the narrowest.
 
     start: the first output's error there, in the unit in which the innovations are not scaled up.
@@ -521,7 +375,7 @@ def _best(
     ranked = []
     for i, rho in product(range(len(gains)), rhos):
         try:
-            W, R = _gramian(form, gains[i], rho, [part[:, i] for part in e])
+            W, R = gramian(form, gains[i], rho, [part[:, i] for part in e])
         except (LinAlgError, ValueError):
             continue
         variance = np.diag(np.linalg.inv(R)) + np.einsum("ij,jk,ik->i", form.C, W, form.C) / rho
@@ -531,7 +385,7 @@ def _best(
     for first in range(0, min(len(pairs), MOST), SOLVED):
         tried: list[tuple[float, float, Any]] = []
         for i, rho in pairs[first : first + SOLVED]:
-            found = _solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
+            found = solved(form, gains[i], rho, [part[:, i] for part in e], amplitudes)
             if found is not None:
                 entry = replace(found, at=i)
                 W = np.linalg.inv(found.P)
@@ -553,213 +407,6 @@ def _best(
         "no storage function bounds the output by the innovations: the increments are too "
         "different over the model's range; give a smaller range of inputs or a smaller box"
     )
-
-
-def _gramian(
-    form: _Form, L: FloatArray, rho: float, e: list[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """W, mean over a few vertices, and R = diag(1/(p max S_jj)), so that no window has E > 1."""
-    p = len(form.H)
-    most = np.max([_fading_squares(part, rho).max(axis=0) for part in e], axis=0)
-    R = np.diag(1.0 / (p * np.maximum(most, np.finfo(float).tiny)))
-    noise = L @ np.linalg.inv(R) @ L.T
-    noise = noise + UNREACHED * (np.trace(noise) / len(noise) or 1.0) * np.eye(len(noise))
-    Ws = [solve_discrete_lyapunov(A / np.sqrt(rho), noise) for A in form.corners]
-    W = np.mean(Ws, axis=0)
-    return (W + W.T) / 2.0, R
-
-
-def _fading_squares(e: FloatArray, rho: float) -> FloatArray:
-    """Σ ρ^i e_j(t - i)², (N, p)."""
-    return np.asarray(lfilter([1.0], [1.0, -rho], e**2, axis=0))
-
-
-def _solved(
-    form: _Form, L: FloatArray, rho: float, e: list[FloatArray], amplitudes: FloatArray
-) -> _Found | None:
-    """P, R, N, τ of the least Σ 1/(τ_j a_j²), E <= 1 on the trials (one output: R = 1).
-
-    Units: x in those of the Gramian W^(1/2) of the increments at a few vertices, or of the inverse
-    of the stability proof's storage if that gives nothing; e_j, o_j of √max S_jj; ν of what it
-    moves state and output by; E with an identity in ν at its mean.
-    """
-    try:
-        W, R0 = _gramian(form, L, rho, e)
-    except (LinAlgError, ValueError):
-        return None
-    inverse = form.storage * (np.trace(W) / np.trace(form.storage))
-    for balance, scale in product((W, inverse), SCALES):
-        found = _balanced(form, L, rho, e, amplitudes, scale * balance, R0)
-        if found is not None:
-            return found
-    return None
-
-
-def _balanced(
-    form: _Form,
-    L: FloatArray,
-    rho: float,
-    e: list[FloatArray],
-    amplitudes: FloatArray,
-    W: FloatArray,
-    R0: FloatArray,
-) -> _Found | None:
-    """`_solved` in the units of W^(1/2)."""
-    m, p = form.m, len(form.H)
-    try:
-        values, vectors = np.linalg.eigh(W)
-        root = (vectors * np.sqrt(np.maximum(values, np.finfo(float).tiny))) @ vectors.T
-        T = np.linalg.inv(root)
-    except (LinAlgError, ValueError):
-        return None
-    sizes = 1.0 / np.sqrt(np.diag(R0) * p)
-    moved = np.linalg.norm(np.vstack([T @ form.F[:, :m], form.H[:, :m] / sizes[:, None]]), axis=0)
-    nu = 1.0 / np.where(moved > 0.0, moved, 1.0)
-    S = block_diag(np.diag(nu), root)
-    modes = [
-        (np.hstack([T @ F @ S, T @ L * sizes]), np.hstack([H @ S / sizes[:, None], np.eye(p)]))
-        for F, H in form.modes
-    ]
-    D = np.linalg.inv(form.mean[:, :m] * nu) if m else np.zeros((0, 0))
-    leaves = [D @ E @ S for E in form.leaves]
-    windows = _Windows([part / sizes for part in e], rho)
-    solution = None
-    for _ in range(ROUNDS if p > 1 else 1):
-        solution = _program(modes, leaves, rho, m, windows.chosen, sizes / amplitudes, ray=form.ray)
-        if solution is None:
-            return None
-        if p == 1 or not windows.cut(solution[1]):
-            break
-    assert solution is not None
-    P, R, tau, Ns = solution
-    # E should be at most 1 on the trials; with one output R = 1, so that E has the unit of e².
-    P, R = T.T @ P @ T, R / np.outer(sizes, sizes)
-    unit = float(sizes[0] ** 2) if p == 1 else 1.0
-    outside = np.linalg.inv(block_diag(S, np.diag(sizes))).T
-    found = [[_shaped(outside @ N @ D * unit, form.ray) for N in leaf] for leaf in Ns]
-    return _Found(
-        L, rho, (P + P.T) * (unit / 2.0), np.eye(1) if p == 1 else (R + R.T) / 2.0,
-        unit * (1.0 - TAU_ROOM) * tau / sizes**2,
-        None if form.tree is None else _with_multipliers(form.tree, found),
-    )  # fmt: skip
-
-
-def _shaped(N: FloatArray, ray: bool) -> FloatArray:
-    """(T, 0 … 0)', T >= 0, where there is a ray."""
-    if ray:
-        N = N.copy()
-        N[1:, 0], N[0, 0] = 0.0, max(N[0, 0], 0.0)
-    return N
-
-
-class _Windows:
-    """S_k = Σ ρ^(k-j) e_j e_j' of every sample k, and those that bound R: tr(R S_k) <= 1."""
-
-    def __init__(self, e: list[FloatArray], rho: float) -> None:
-        outer = [np.einsum("ti,tj->tij", part, part) for part in e]
-        self._S = np.concatenate([lfilter([1.0], [1.0, -rho], part, axis=0) for part in outer])
-        p = self._S.shape[1]
-        self.chosen = [self._S[int(np.argmax(self._S[:, j, j]))] for j in range(p)]
-        self.chosen.append(self._S[int(np.argmax(np.trace(self._S, axis1=1, axis2=2)))])
-
-    def cut(self, R: FloatArray) -> bool:
-        """Take the window in which R is exceeded the most; False if it is in none."""
-        used = np.einsum("ij,kji->k", R, self._S)
-        worst = int(np.argmax(used))
-        if used[worst] <= 1.0 + CUT:
-            return False
-        self.chosen.append(self._S[worst])
-        return True
-
-
-def _program(
-    modes: list[tuple[FloatArray, FloatArray]],
-    leaves: list[FloatArray],
-    rho: float,
-    m: int,
-    windows: list[FloatArray],
-    weights: FloatArray,
-    *,
-    ray: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, list[list[FloatArray]]] | None:
-    """P, R, τ and [N, N_1 … N_p] of each leaf, or None.
-
-    modes: F (n, m + n + p) = [F L], H (p, m + n + p) = [H I], all in balanced units; more than one
-    of a linear model only. Of several outputs, where E is one matrix, M + sym(N [E 0]) ≻ 0 has a
-    solution N just where M ≻ 0 on the null space of [E 0] (Finsler's lemma): these N are no
-    unknowns of the program.
-    """
-    n, p = len(modes[0][0]), len(modes[0][1])
-    size = m + n + p
-    P = cp.Variable((n, n), symmetric=True)
-    tau = cp.Variable(p)
-    R: Any = np.eye(1) if p == 1 else cp.Variable((p, p), symmetric=True)
-    supply: Any = _placed(rho * P, m, size) + _placed(R, m + n, size)
-    forms = [supply - F.T @ P @ F for F, _ in modes]
-    forms += [supply - tau[j] * np.outer(h, h) for _, H in modes for j, h in enumerate(H)]
-    room = ROOM * np.eye(size)
-    constraints: list[Any] = [P >> ROOM * np.eye(n)]
-    if p > 1:
-        constraints += [R >> ROOM * np.eye(p), *(cp.trace(R @ S) <= 1.0 for S in windows)]
-    if not m:
-        constraints += [M >> room for M in forms]
-    constant = p > 1 and not ray and len(leaves) == 1 and len(leaves[0]) == 1
-    only = np.hstack([leaves[0][0], np.zeros((m, p))]) if constant else None
-    if only is not None:
-        Z = null_space(only)
-        constraints += [Z.T @ M @ Z >> ROOM * np.eye(Z.shape[1]) for M in forms]
-    unknown: list[list[Any]] = []
-    for vertices in leaves if m and only is None else []:
-        Ns: list[Any] = []
-        for M in forms:
-            N: Any
-            if ray:
-                T = cp.Variable((1, 1), nonneg=True)
-                N = cp.vstack([T, np.zeros((size - 1, 1))])
-            else:
-                N = cp.Variable((size, m))
-                constraints.append(cp.abs(N) <= LARGEST)
-            Ns.append(N)
-            for E in vertices:
-                cross = N @ np.hstack([E, np.zeros((m, p))])
-                constraints.append(M + cross + cross.T >> room)
-        unknown.append(Ns)
-    least = cp.sum(cp.multiply(weights**2, cp.inv_pos(tau)))
-    problem = cp.Problem(cp.Maximize(tau[0]) if p == 1 else cp.Minimize(least), constraints)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of inaccuracy: the kernel judges the result
-            problem.solve(solver=cp.CLARABEL)
-    except (cp.SolverError, ArithmeticError):
-        return None
-    if P.value is None or tau.value is None or not (np.asarray(tau.value) > 0.0).all():
-        return None
-    for constraint in constraints:
-        if (
-            isinstance(constraint, cp.constraints.PSD)
-            and float(np.linalg.eigvalsh(constraint.args[0].value)[0]) < (WORST - 1.0) * ROOM
-        ):
-            return None
-    R_found = np.eye(1) if p == 1 else np.asarray(R.value)
-    found = [[np.asarray(N.value) for N in Ns] for Ns in unknown]
-    if only is not None:
-        found = [[finsler(np.asarray(M.value), only) for M in forms]]
-    return np.asarray(P.value), R_found, np.asarray(tau.value), found
-
-
-def finsler(M: FloatArray, E: FloatArray) -> FloatArray:
-    """N with M + sym(N E) = Z'MZ on the null space of E, 1 on its complement and 0 between them."""
-    Z = null_space(E)
-    Y = null_space(Z.T)
-    N = (0.5 * np.eye(len(M)) - (Z @ Z.T + 0.5 * Y @ Y.T) @ M) @ Y
-    return np.asarray(N @ np.linalg.inv(E @ Y))
-
-
-def _placed(M: Any, start: int, size: int) -> Any:
-    """M in the rows and columns from `start` on of a matrix that is zero elsewhere."""
-    J = np.zeros((M.shape[0], size))
-    J[:, start : start + len(J)] = np.eye(len(J))
-    return J.T @ M @ J
 
 
 def _rounded_up(width: float) -> float:

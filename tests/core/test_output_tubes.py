@@ -12,7 +12,8 @@ import pytest
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, design_output_tube
-from nlsid_core.design.tube import energy, finsler, innovations
+from nlsid_core.design.tube import energy, innovations
+from nlsid_core.design.tube_program import finsler
 from nlsid_core.errors import CertificateMismatch, DataError, OptionError
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.identification.prediction import history, simulate_trial

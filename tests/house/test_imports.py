@@ -39,7 +39,7 @@ BELOW = {
 SOLVERS = {"clarabel", "cvxpy"}
 SOLVERS_KNOWN_TO = {
     "nlsid_core/conic.py": SOLVERS,
-    "nlsid_core/design/tube.py": {"cvxpy"},  # a few small ones a funnel
+    "nlsid_core/design/tube_program.py": {"cvxpy"},  # a few small ones a funnel
 }
 SYMPY_EDGE = "nlsid_core/polynomial/sympy_edge.py"  # optional, and imported by nobody inside
 BAG_FORMATS = {"rosbags", "mcap"}

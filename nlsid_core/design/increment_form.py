@@ -1,0 +1,122 @@
+"""`Form`: a model's increment form in floats, as the program that looks for a tube needs it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.errors import Infeasible
+from nlsid_core.identification.stability import prove_stability, storage_on
+from nlsid_core.kernel import increments
+from nlsid_core.kernel.files import Node, parse
+from nlsid_core.models import StableModel
+
+CORNERS = 16  # vertices whose Gramians balance a program
+FADING = (0.85, 0.6, 0.35, 0.2, 0.08)  # 1 - ρ as parts of 1 - rate²
+
+
+def read_form(model: StableModel, bounds: Json | None) -> increments.Model:
+    """As the kernel reads it; kernel.Rejected if it needs a box, or needs none."""
+    node = None if bounds is None else parse(files.encode(bounds), "box")
+    return increments.read_model(parse(files.encode(model.document()), "model"), node)
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """The increment form in floats. modes: (F, H), and a second with a policy engaged.
+
+    tree: of a proof's multipliers, with the vertices E of each of its leaves in order, (count, m,
+    m + n); None without ν. A, C: x̄⁺, o of x̄ at the mean of E.
+    """
+
+    F: FloatArray
+    H: FloatArray
+    modes: list[tuple[FloatArray, FloatArray]]
+    tree: Json | None
+    leaves: list[FloatArray]
+    mean: FloatArray
+    A: FloatArray
+    C: FloatArray
+    ray: bool
+    rate: float
+    inputs: tuple[FloatArray, FloatArray] | None
+    storage: FloatArray
+
+    @classmethod
+    def of(cls, model: StableModel, bounds: Json | None, K: FloatArray | None = None) -> "Form":
+        """Of a model, perhaps on the box `bounds` {y, u}, perhaps with a policy's K (n,).
+
+        Raises Infeasible if no storage proves that it forgets its start.
+        """
+        form = read_form(model, bounds)
+        proof = prove_stability(model) if bounds is None else storage_on(form)
+        if proof is None:
+            where = bounds and "; ".join(
+                f"{letter} in {', '.join(f'[{low:.3g}, {high:.3g}]' for low, high in rows)}"
+                for letter, rows in bounds.items()
+            )
+            raise Infeasible(
+                "no one storage proves that the model forgets its start, so no tube of it lasts"
+                + (
+                    f": tried for {where}, the `box` of the tube or else a tenth more than the "
+                    "training trials reach; take a smaller one, another `set`, or fewer lags"
+                    if where
+                    else ""
+                )
+            )
+        F, H = (np.array(part, dtype=np.float64) for part in (form.F, form.H))
+        m = form.unknowns
+        leaves: list[FloatArray] = [
+            np.array(form.vertices(part, ends), dtype=np.float64)
+            for part, ends in _parts(proof.multipliers, form.box)
+        ]
+        mean = np.mean([E.mean(axis=0) for E in leaves], axis=0) if m else np.zeros((0, len(F)))
+        G = np.linalg.solve(mean[:, :m], mean[:, m:]) if m else mean
+        inputs = None
+        if form.linear is not None:
+            B, D = (np.array(v, dtype=np.float64) for v in (form.linear.B, [form.linear.D]))
+            inputs = B[:, None], D[:, None]
+        modes: list[tuple[FloatArray, FloatArray]] = [(F, H)]
+        if K is not None and K.any() and inputs is not None:
+            modes.append((F - np.outer(inputs[0], K), H - inputs[1] * K))
+        return cls(
+            F, H, modes, proof.multipliers, leaves, mean, F[:, m:] - F[:, :m] @ G,
+            H[:, m:] - H[:, :m] @ G, form.ray, proof.rate, inputs,
+            np.linalg.inv(proof.P),
+        )  # fmt: skip
+
+    @property
+    def corners(self) -> list[FloatArray]:
+        """x̄⁺ of x̄ where E is one of its vertices, of a few: one of them may be much slower."""
+        m, vertices = self.m, [E for leaf in self.leaves for E in leaf]
+        if not m:
+            return [self.A]
+        chosen = vertices[:: max(1, len(vertices) // CORNERS)]
+        F = self.F
+        return [F[:, m:] - F[:, :m] @ np.linalg.solve(E[:, :m], E[:, m:]) for E in chosen]
+
+    @property
+    def m(self) -> int:
+        """The number of ν."""
+        return int(self.F.shape[1] - len(self.F))
+
+    def fading(self) -> list[float]:
+        """ρ between rate² and 1."""
+        return [1.0 - part * (1.0 - self.rate**2) for part in FADING]
+
+
+def _parts(tree: Json | None, box: increments.Box) -> list[tuple[increments.Box, Node | None]]:
+    """The leaves' parts of the box, and what bounds E there."""
+    if tree is None:
+        return []
+    if "split" not in tree:
+        if "ends" not in tree:
+            return [(box, None)]
+        return [(box, parse(files.encode(tree["ends"]), "ends"))]
+    i = tree["split"]
+    low, high = box[i]
+    middle = (low + high) / 2
+    halved = ([*box[:i], half, *box[i + 1 :]] for half in ((low, middle), (middle, high)))
+    return [leaf for part, half in zip(tree["parts"], halved, strict=True)
+            for leaf in _parts(part, half)]  # fmt: skip
