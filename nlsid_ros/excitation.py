@@ -8,8 +8,10 @@ its own, and those of one signal have one `repeat_group`. Refuses to run without
 
 import hashlib
 import json
+import math
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.chain.config import load_config
+from bags.signals.expressions import Expression, factors
 from bags.signals.grid import seconds
 from bags.signals.reader import read_signals
 from bags.signals.signal import SignalPath
@@ -30,12 +34,22 @@ from nlsid_core.data.excitation import Shape, chirp, multisine, prbs, steps
 from nlsid_core.errors import DataError, NlsidError
 from nlsid_ros import qos
 from nlsid_ros.diagnostics import name_of, status
-from nlsid_ros.messages import OTHERS, ZERO, SignalMessage
+from nlsid_ros.messages import (
+    OTHERS,
+    PATIENT_PERIODS,
+    ZERO,
+    SignalMessage,
+    base_stopped,
+    patience,
+)
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "excitation"
+COMMAND = "/cmd_vel:twist.linear.x"
 KINDS = ("multisine", "chirp", "prbs", "steps", "replay")
 BIG = 1e9
+STILL = 1.0  # s of the wall's time without a command while a signal is played
+ANSWER = 10.0  # s for the recorder to answer
 LAST_WORD = 1.0  # s for the last command to be received before the node goes
 
 
@@ -50,9 +64,7 @@ class Excitation(ManagedNode):
         number = partial(declare_number, self)
         self._kind = declare_text(self, "kind", "multisine", "one of " + ", ".join(KINDS))
         self._command = SignalMessage(
-            SignalPath.parse(
-                declare_text(self, "command", "/cmd_vel:twist.linear.x", "signal published")
-            ),
+            self._signal(),
             declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "its type"),
             declare_text(self, "others", ZERO, f"its fields that are not the signal: {OTHERS}"),
         )
@@ -82,6 +94,22 @@ class Excitation(ManagedNode):
             fade=number("fade", 1.0, "s of soft start and stop", between=(0.0, 60.0)),
             rest=number("rest", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
         )
+
+    def _signal(self) -> SignalPath:
+        """What is published: the parameter `command`, else the one excitation of `config`."""
+        command = declare_text(
+            self, "command", "", f"signal published; empty: that of config, else {COMMAND}"
+        )
+        config = declare_text(self, "config", "", "a robot's configuration, whose excitation it is")
+        if command or not config:
+            return SignalPath.parse(command or COMMAND)
+        texts = [signal.path for signal in load_config(Path(config)).signals.excitation]
+        if len(texts) > 1 or len(factors(texts[0])) > 1:
+            raise DataError(
+                f"{config} has the excitations {', '.join(texts)}; name the one to move by the "
+                "parameter command"
+            )
+        return Expression.parse(texts[0]).path
 
     def prepare(self) -> None:
         """Make the whole signal before anything moves."""
@@ -125,6 +153,8 @@ class Excitation(ManagedNode):
         self._still = 0  # ticks until the bag of a repeat that is over is closed
         self._repeat = 0
         self._input = self._shape.rest
+        self._sent = -math.inf  # when the last command went out, s of the wall's time
+        self._asked: tuple[Any, Callable[[Any], None], float] | None = None  # the recorder
         self._state, self._failed, self._busy = "idle", False, False
         self._did: dict[str, object] = {}
         self._publisher = self.create_publisher(
@@ -155,6 +185,10 @@ class Excitation(ManagedNode):
         self._publisher.wait_for_all_acked(Duration(seconds=LAST_WORD))
 
     def _on_tick(self) -> None:
+        """Send what is due by this node's clock, on the grid of stamps and all of it: a signal that
+        ran late, or skipped a part, would not be the one that the limits were kept by.
+        """
+        self._hear_recorder()
         if self._next is None:
             if self._input != self._shape.rest:
                 self._to_rest()
@@ -166,40 +200,71 @@ class Excitation(ManagedNode):
         if lacking := self._command.lacking():
             self._fail(lacking)
             return
-        self._input = float(self._once[self._next])
-        self._send(self._start_ns + self._next * round(self._period * 1e9))
-        self._next += 1
-        if self._next == len(self._once):
-            self._next = None
-            self._end_repeat()
+        now_ns, most = self.get_clock().now().nanoseconds, patience(0.0, self._period)
+        late = (now_ns - self._due_ns(self._next)) * 1e-9
+        if abs(late) > most + self._period:
+            way = "before" if late > 0 else "after"
+            self._fail(
+                f"stopped: a command was due {abs(late):.3g} s {way} this node's clock; {most:g} s "
+                "are allowed"
+            )
+            return
+        if time.monotonic() - self._sent > max(STILL, PATIENT_PERIODS * self._period):
+            self._fail("stopped: this node's clock stands still")
+            return
+        while self._next is not None and (stamp_ns := self._due_ns(self._next)) <= now_ns:
+            self._input = float(self._once[self._next])
+            self._send(stamp_ns)
+            self._next += 1
+            if self._next == len(self._once):
+                self._next = None
+                self._end_repeat()
+
+    def _due_ns(self, k: int) -> int:
+        return self._start_ns + k * round(self._period * 1e9)
 
     def _to_rest(self) -> None:
+        if base_stopped(self._sent, self._period):
+            self._input = self._shape.rest
         step = self._shape.slew * self._period
         self._input += min(max(self._shape.rest - self._input, -step), step)
         self._send(self.get_clock().now().nanoseconds)
 
     def _send(self, stamp_ns: int) -> None:
+        self._sent = time.monotonic()
         self._publisher.publish(self._command.make(stamp_ns, self._input))
 
     def _begin_repeat(self) -> None:
         """Play at once, or when the recorder has a new bag."""
         if self._recorder:
             self._say(f"repeat {self._repeat + 1}: asking for a bag")
-            asked = self._bags["start"].call_async(Trigger.Request())
-            asked.add_done_callback(self._on_bag_begun)
+            self._ask("start", self._on_bag_begun)
         else:
             self._play(self.get_clock().now().nanoseconds)
 
-    def _on_bag_begun(self, asked: Any) -> None:
-        if not self._busy:  # ~/stop came first
+    def _ask(self, what: str, then: Callable[[Any], None]) -> None:
+        asked = self._bags[what].call_async(Trigger.Request())
+        self._asked = asked, then, time.monotonic() + ANSWER
+
+    def _hear_recorder(self) -> None:
+        """Go on with what the recorder answers, if it does."""
+        if self._asked is None:
             return
-        if not asked.result().success:
-            self._fail(f"no bag from the recorder: {asked.result().message}")
-            return
-        self._play(self.get_clock().now().nanoseconds)
+        asked, then, until = self._asked
+        if asked.done():
+            self._asked = None
+            then(asked.result())
+        elif time.monotonic() > until:
+            self._fail(f"the recorder {self._recorder} has not answered for {ANSWER:g} s")
+
+    def _on_bag_begun(self, answer: Trigger.Response) -> None:
+        if answer.success:
+            self._play(self.get_clock().now().nanoseconds)
+        else:
+            self._fail(f"no bag from the recorder: {answer.message}")
 
     def _play(self, start_ns: int) -> None:
-        self._next, self._start_ns = 0, start_ns
+        self._next, self._start_ns, self._sent = 0, start_ns, time.monotonic()
         self._did = {
             "kind": self._kind, "signal": str(self._command.path), "period": self._period,
             "duration": self._duration, "repeat": self._repeat + 1, "repeats": self._repeats,
@@ -218,14 +283,13 @@ class Excitation(ManagedNode):
 
     def _close_bag(self) -> None:
         self._say(f"repeat {self._repeat + 1}: closing the bag")
-        asked = self._bags["stop"].call_async(Trigger.Request())
-        asked.add_done_callback(self._on_bag_closed)
+        self._ask("stop", self._on_bag_closed)
 
-    def _on_bag_closed(self, asked: Any) -> None:
-        if not asked.result().success:
-            self._fail(f"the bag is not whole: {asked.result().message}")
-        elif self._busy:
+    def _on_bag_closed(self, answer: Trigger.Response) -> None:
+        if answer.success:
             self._next_repeat(None)
+        else:
+            self._fail(f"the bag is not whole: {answer.message}")
 
     def _next_repeat(self, start_ns: int | None) -> None:
         self._repeat += 1
@@ -238,7 +302,7 @@ class Excitation(ManagedNode):
 
     def _finish(self, state: str, *, whole: bool = True) -> None:
         """Say how it ended; a repeat that is not whole is no repeat."""
-        self._next, self._still, self._busy = None, 0, False
+        self._next, self._still, self._busy, self._asked = None, 0, False, None
         ended = {"ended": state} | ({} if whole else {"repeat_group": ""})
         self._experiment.publish(String(data=json.dumps(self._did | ended)))
         self._say(state)

@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
+from bags.signals.grid import seconds
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -45,7 +46,7 @@ from nlsid_ros.messages import frame_of, off_clock, patience, stamp_ns_of
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "funnel_monitor"
-DISCOVERY = 0.1  # s: how often the graph is asked for the signals' types
+LOOK = 0.1  # s of the wall's time between looks at the clock, and for the signals' types
 RETRY = 0.5  # s until a service that has not answered is called again
 THROTTLE = 5.0  # s between log lines about a service that does not answer
 HEARTBEAT = 1.0  # s: diagnostics are repeated this often while nothing changes
@@ -122,7 +123,7 @@ class FunnelMonitor(ManagedNode):
 
     def start(self) -> None:
         """Listen for the funnel; its signals are subscribed to once it is there."""
-        self._signals: list[Subscription] = []
+        self._signals: dict[str, Subscription] = {}  # by topic
         self._kinds: dict[str, str] = {}  # topic -> the type it is subscribed with
         self._frames: dict[str, str] = {}  # response topic -> the frame it has to have
         self._unfit = ""
@@ -159,8 +160,8 @@ class FunnelMonitor(ManagedNode):
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         wall = Clock(clock_type=ClockType.STEADY_TIME)
         self._patience = self.get_clock() if self._simulated else wall
-        self._clock_ns = -1
-        self.create_timer(DISCOVERY, self._connect, clock=wall)
+        self._clock_ns = self._beat_ns = -1
+        self.create_timer(LOOK, self._look, clock=wall)
         self._retry = self.create_timer(RETRY, self._call, clock=wall)
         self._retry.cancel()
         self.create_timer(HEARTBEAT, self._on_heartbeat, clock=wall)
@@ -181,7 +182,7 @@ class FunnelMonitor(ManagedNode):
         watch = Watch(
             design, centre=self._centre, options=self._options, announced=bool(self._controller)
         )
-        for subscription in self._signals:
+        for subscription in self._signals.values():
             self.destroy_subscription(subscription)
         self._signals.clear()
         self._watch, self._digest = watch, digest
@@ -221,6 +222,20 @@ class FunnelMonitor(ManagedNode):
             return
         self._publish(self._watch.begin(self._run.start_ns))
 
+    def _look(self) -> None:
+        """Look whether simulated time went back, which would hold up all that waits for a later
+        one; and for the signals' topics.
+        """
+        clock_ns = self._patience.now().nanoseconds
+        back_ns, self._clock_ns = self._clock_ns - clock_ns, clock_ns
+        if back_ns > 0 and self._watch is not None:
+            self._deadlines.clear()
+            self._release.cancel()
+            self._stale.cancel()
+            reason = f"this node's clock went back by {seconds(back_ns, 0):.3g} s"
+            self._publish(self._watch.missing(reason))
+        self._connect()
+
     def _connect(self) -> None:
         """Subscribe to the signals' topics, each with a type that is published and carries them.
 
@@ -245,8 +260,10 @@ class FunnelMonitor(ManagedNode):
             self._kinds[topic], self._unfit = kind, ""
             callback = partial(self._on_signal, topic)
             profile = qos.subscription_to([p.qos_profile.reliability for p in publishers])
-            self._signals.append(
-                self.create_subscription(message_class(kind), name, callback, profile)
+            if topic in self._signals:
+                self.destroy_subscription(self._signals[topic])
+            self._signals[topic] = self.create_subscription(
+                message_class(kind), name, callback, profile
             )
 
     def _fitting(self, topic: str, kinds: list[str]) -> str:
@@ -428,10 +445,10 @@ class FunnelMonitor(ManagedNode):
 
     def _on_heartbeat(self) -> None:
         clock_ns = self.get_clock().now().nanoseconds
-        if self._simulated and clock_ns == self._clock_ns and self._watch is not None:
+        if self._simulated and clock_ns == self._beat_ns and self._watch is not None:
             reason = "simulated time stands still: nobody publishes /clock"
             self._say(Reading(0.0, Status.UNKNOWN, reason=reason), State.UNKNOWN)
-        self._clock_ns = clock_ns
+        self._beat_ns = clock_ns
         self._diagnostics.publish(self._status_message())
         self._slowest_ns = 0
 

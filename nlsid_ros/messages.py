@@ -24,6 +24,7 @@ REFUSED: Final = "refused"
 OTHERS: Final = "zero, refused, a JSON object of fields, or a topic whose last message has them"
 LEAST_PATIENCE: Final = 0.1  # s without a response,
 PATIENT_PERIODS: Final = 4.0  # and of the design: a slow robot's come seldom
+BASE_PATIENCE: Final = 0.5  # s without a command after which a base stops by itself
 OTHERS_PATIENCE: Final = 1.0  # s without a message on that topic
 SAID: Final = 6  # fields that are named
 
@@ -148,6 +149,13 @@ def frame_of(message: Any) -> str:
 def patience(stale_after: float, period: float) -> float:
     """s to wait for a response: as given, or where that is 0 some periods (s), not too few."""
     return stale_after or max(LEAST_PATIENCE, PATIENT_PERIODS * period)
+
+
+def base_stopped(sent: float, period: float) -> bool:
+    """Whether a base has stopped by itself, as no command of a period (s) went out since `sent`
+    (s, monotonic): what moved it before would set it in motion again.
+    """
+    return time.monotonic() - sent > max(BASE_PATIENCE, PATIENT_PERIODS * period)
 
 
 def off_clock(stamp_ns: int, clock: Clock, most: float) -> str:

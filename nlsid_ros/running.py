@@ -7,6 +7,7 @@ import threading
 import traceback
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import rclpy
@@ -23,13 +24,16 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.service import Service
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rclpy.utilities import try_shutdown
 
 from nlsid_core.errors import DataError, NlsidError
 
 CONFIGURE = Transition.TRANSITION_CONFIGURE
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Arguments = Sequence[str] | None  # of a node that shares its process: `--ros-args ...`
 Value = str | float | bool | Sequence[str] | Sequence[float]
 
@@ -132,11 +136,10 @@ class ManagedNode(LifecycleNode):
         """
         label = request.transition.label
         wanted = label == "configure" if label else request.transition.id == CONFIGURE
-        if wanted and self._started_itself:
-            self._started_itself = False
-            self.trigger_deactivate()
-            self.trigger_cleanup()
         try:
+            if wanted and self._started_itself:
+                self.trigger_deactivate()
+                self.trigger_cleanup()
             done: ChangeState.Response = self._change_state(request, answer)
         except RuntimeError as error:
             self.get_logger().error(f"transition refused: {error}")
@@ -165,7 +168,7 @@ class ManagedNode(LifecycleNode):
 
     def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Transition: active to inactive."""
-        self._running = False
+        self._running = self._started_itself = False
         result = self._attempt(self.stop)
         self._destroy_made()
         return result
@@ -217,6 +220,22 @@ class ManagedNode(LifecycleNode):
             return TransitionCallbackReturn.ERROR
         return TransitionCallbackReturn.SUCCESS
 
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """As rclpy does it; what had arrived is let go (see `_let_go`)."""
+        subscription.callback = _let_go
+        return bool(super().destroy_subscription(subscription))
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """As rclpy does it; if it was due, it is no longer."""
+        timer.callback = _let_go
+        return bool(super().destroy_timer(timer))
+
+    def destroy_service(self, service: Service) -> bool:
+        """As rclpy does it; a request that had arrived stays without an answer."""
+        service.callback = _let_go  # type: ignore[assignment]
+        service.send_response = _let_go  # type: ignore[assignment, method-assign]
+        return bool(super().destroy_service(service))
+
     def entities(self) -> list[object]:
         """Everything the node communicates with, and its timers."""
         kinds = (self.publishers, self.subscriptions, self.services, self.timers, self.clients)
@@ -236,13 +255,20 @@ class ManagedNode(LifecycleNode):
                     remove(entity)
 
 
+def _let_go(*_given: object) -> None:
+    """In the place of a destroyed entity's callback: EventsExecutor still calls it for what it had
+    queued before.
+    """
+
+
 def run(make: Callable[[], ManagedNode], args: list[str] | None) -> None:
     """`run_all` of one node, which takes `args`."""
     run_all([make], args)
 
 
 def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) -> None:
-    """Make the nodes, start each that starts itself, and spin until SIGINT or SIGTERM.
+    """Make the nodes, start each that starts itself, and spin until SIGINT, SIGTERM
+    or SIGHUP (a terminal that is closed, unless `nohup` says that it does not matter).
 
     The signals are waited for here and not left to rclpy, which would end all communication before
     the node could send a last command. Raises what made the node fail to start.
@@ -259,9 +285,10 @@ def run_all(makes: Sequence[Callable[[], ManagedNode]], args: list[str] | None) 
         gc.freeze()  # what is here stays: no collection has to look through it in mid-stream
         _spin_until_signalled(nodes, woken)
     finally:
-        for node in nodes:
-            node.destroy_node()
-        try_shutdown()
+        with ExitStack() as ending:  # each is stopped, also if another cannot be
+            ending.callback(try_shutdown)
+            for node in reversed(nodes):
+                ending.callback(node.destroy_node)
 
 
 def _spin_until_signalled(nodes: Sequence[ManagedNode], woken: socket.socket) -> None:
@@ -289,7 +316,8 @@ def _wake_on_signals() -> socket.socket:
     sender.setblocking(False)
     signal.set_wakeup_fd(sender.detach())
     for number in STOP_SIGNALS:
-        signal.signal(number, lambda _number, _frame: None)
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda _number, _frame: None)
     return receiver
 
 

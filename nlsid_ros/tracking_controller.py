@@ -50,6 +50,7 @@ from nlsid_ros.messages import (
     OTHERS,
     ZERO,
     SignalMessage,
+    base_stopped,
     frame_of,
     off_clock,
     patience,
@@ -151,6 +152,7 @@ class TrackingController(ManagedNode):
         self._command: SignalMessage | None = None
         self._input: Any = self._limits.stop_at  # as the command takes it: one number or several
         self._first_ns: int | None = None
+        self._sent = -math.inf  # when the last command went out, s of the wall's time
         self._due: deque[tuple[int, Any]] = deque()  # (stamp ns, input) to be published
         self._ramp = self._limits
         self._stopping = ""
@@ -296,8 +298,9 @@ class TrackingController(ManagedNode):
         return off_clock(stamp_ns, self.get_clock(), self._patient_for)
 
     def _on_due(self) -> None:
-        """Publish every input that is due, and wait for the next."""
+        """Publish every input that is due, and wait for the next; none that is long overdue."""
         self._next.cancel()
+        most_ns = round(self._patient_for * 1e9)
         while self._due:
             stamp_ns, u = self._due[0]
             ahead = stamp_ns - self.get_clock().now().nanoseconds
@@ -305,8 +308,11 @@ class TrackingController(ManagedNode):
                 self._next.timer_period_ns = ahead
                 self._next.reset()
                 return
+            if ahead < -most_ns:
+                self._halt(f"a command is {-ahead * 1e-9:.3g} s late")
+                return
             self._due.popleft()
-            self._input, self._sent = u, time.monotonic()
+            self._input = u
             self._send(stamp_ns)
 
     def _on_margin(self, message: JointState) -> None:
@@ -348,9 +354,15 @@ class TrackingController(ManagedNode):
         return self._watched and tracking and now - self._judged > self._monitor_patience
 
     def _on_step(self) -> None:
-        """One step towards rest; the last says so."""
+        """One step towards rest; the last says so. A base that has stopped by itself, because no
+        command went out, is not moved again on the way.
+        """
         assert self._design is not None
-        self._input = self._ramp.towards_stop(self._input, self._design.period)
+        self._input = (
+            self._limits.stop_at
+            if base_stopped(self._sent, self._design.period)
+            else self._ramp.towards_stop(self._input, self._design.period)
+        )
         self._send(self.get_clock().now().nanoseconds)
         if self._limits.at_rest(self._input):
             self._step.cancel()
@@ -359,6 +371,7 @@ class TrackingController(ManagedNode):
 
     def _send(self, stamp_ns: int) -> None:
         assert self._command is not None
+        self._sent = time.monotonic()
         self._commands.publish(self._command.make(stamp_ns, self._input))
 
     def _halt(self, reason: str) -> None:

@@ -555,9 +555,29 @@ def live(
         for name in WORKFLOWS:
             typer.echo(str(LaunchFile(shipped_file("launch", f"{name}.launch.xml"))))
         raise typer.Exit(2)
+    if workflow not in WORKFLOWS:
+        raise typer.BadParameter(f"no workflow '{workflow}'; there are: {', '.join(WORKFLOWS)}")
     launch = LaunchFile(shipped_file("launch", f"{workflow}.launch.xml"))
     commands = launch.commands(arguments or [])
     raise typer.Exit(run_together([in_one_process(commands)] if one_process else commands))
+
+
+@app.command()
+def call(
+    service: Annotated[
+        str, typer.Argument(help="As /excitation/start; none: lists what there is.")
+    ] = "",
+) -> None:
+    """Call a service of a running node (std_srvs/Trigger), as `ros2 service call` does.
+
+    Status 0: done, 1: refused, 2: nobody answered.
+    """
+    from bags.commands.launching import run_together
+
+    if importlib.util.find_spec("rclpy") is None:
+        raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    given = [service] if service else []
+    raise typer.Exit(run_together([[sys.executable, "-m", "nlsid_ros.calling", *given]]))
 
 
 @app.command()

@@ -96,7 +96,11 @@ def run_together(commands: Sequence[Sequence[str]]) -> int:
     On Linux they also end when this process is killed, by SIGTERM as if each had been asked to.
     """
     asked = threading.Event()
-    before = {number: signal.signal(number, lambda *_: asked.set()) for number in STOP_SIGNALS}
+    before = {
+        number: signal.signal(number, lambda *_: asked.set())
+        for number in STOP_SIGNALS
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN  # nohup
+    }
     running: list[subprocess.Popen[bytes]] = []
     try:
         for command in commands:

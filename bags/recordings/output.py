@@ -45,7 +45,7 @@ class Output:
 
     def __init__(self, path: Path, reserve: Reserve | None = None) -> None:
         self.size = 0
-        self._reserve = reserve
+        self._path, self._reserve = path, reserve
         self._stream = path.open("xb", buffering=0)
         fcntl.flock(self._stream, fcntl.LOCK_EX)  # whoever repairs bags leaves this one alone
 
@@ -83,8 +83,15 @@ class Output:
             raise
         self.size += len(data)
 
+    def refuse_loss(self) -> None:
+        """OSError unless the file is still there under its name, with all that was written."""
+        ours, there = os.fstat(self._stream.fileno()), self._path.stat()
+        if not os.path.samestat(ours, there) or there.st_size != self.size:
+            raise OSError(f"{self._path} was replaced or cut by another program")
+
     def sync(self) -> None:
-        """Wait until the bytes are on the disk."""
+        """Wait until the bytes are on the disk; OSError as `refuse_loss`."""
+        self.refuse_loss()
         os.fsync(self._stream.fileno())
 
     def close(self) -> None:

@@ -132,6 +132,7 @@ class Part:
     def close_chunk(self) -> None:
         """Hand everything written so far to the operating system as a complete chunk."""
         self._mcap.flush()
+        self._output.refuse_loss()
 
     def finish(self) -> None:
         """Write the summary and close the file."""

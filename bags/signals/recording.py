@@ -73,15 +73,17 @@ class Recording:
             self._end(str(error))
 
     def keep_up(self) -> None:
-        """Close the chunk, and the bag if the disk is (nearly) full; to be called regularly."""
+        """Close the chunk, and the bag if it was taken away or the disk is (nearly) full; to be
+        called regularly.
+        """
         if self._closed:
             return
         try:
             self.bag.close_chunk()
+            free = shutil.disk_usage(self.bag.path).free / 1e6
         except OSError as error:
             self._end(str(error))
             return
-        free = shutil.disk_usage(self.bag.path).free / 1e6
         if self.bag.full:
             self._end(self.bag.full)
         elif free < self._least_free:
@@ -97,7 +99,8 @@ class Recording:
             self.bag.annotate(self.counts() | ended)
             self.bag.close()
         except OSError as error:
-            self.ended = (self.ended or f"recording stopped: {error}") + UNFINISHED
+            left = UNFINISHED if self.bag.path.exists() else ""
+            self.ended = (self.ended or f"recording stopped: {error}") + left
             self.bag.abandon()
 
     def counts(self) -> dict[str, str]:

@@ -91,3 +91,10 @@ def test_live_without_a_workflow_lists_every_one_with_its_arguments() -> None:
     assert done.exit_code == 2
     for name in WORKFLOWS:
         assert f"{name}.launch.xml are" in done.output
+
+
+def test_live_with_a_workflow_that_does_not_exist_names_those_that_do() -> None:
+    pytest.importorskip("rclpy")
+    done = CliRunner().invoke(app, ["live", "../monitor"])
+    assert done.exit_code == 2
+    assert "no workflow '../monitor'; there are: monitor" in done.output

@@ -1,6 +1,7 @@
 """What a controller is told wrongly, or no longer told: it says what, and comes to rest."""
 
 import math
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -167,6 +168,24 @@ def test_limits_beyond_the_fitted_range_do_not_let_it_command_more(
     robot.spin_until(lambda: max(robot.commands.values()) >= highest)
     assert max(robot.commands.values()) == highest == pytest.approx(0.4)
     assert min(robot.commands.values()) >= lowest
+
+
+def test_a_controller_that_was_held_up_does_not_set_the_robot_in_motion_again(
+    stack: ExitStack, funnel: Path
+) -> None:
+    """A base that stops when no command comes rests by then."""
+    robot = Driven(stack, funnel)
+    assert robot.call("start").success
+    robot.feed(40)
+    robot.spin_until(lambda: max(robot.commands.values()) > 0.1)
+    robot.controller.send_signal(signal.SIGSTOP)
+    robot.feed(100)
+    before = dict(robot.commands)
+    robot.controller.send_signal(signal.SIGCONT)
+    robot.expect_stop("")
+    robot.spin_until(lambda: len(robot.commands) > len(before))
+    after = robot.commands.keys() - before.keys()
+    assert {robot.commands[stamp] for stamp in after} == {0.0}
 
 
 @pytest.mark.parametrize("margin_at", [-3600.0, -5.0, 3600.0])

@@ -179,5 +179,5 @@ def test_limits_that_would_cut_off_the_plan_are_refused_and_nothing_moves(
     answer = robot.call("start")
     assert not answer.success
     assert "beyond the limits [0, 0.2]" in answer.message
-    assert robot.has_said("idle; not started: the plan's input")
+    robot.spin_until(lambda: robot.has_said("idle; not started: the plan's input"))
     assert robot.commands == []

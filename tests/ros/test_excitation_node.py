@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -134,7 +135,7 @@ def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
     assert np.abs(np.diff(inputs)).max() <= 2.0 * 0.02 * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ended_by_a_signal_it_leaves_the_robot_at_rest(how: signal.Signals) -> None:
     sent: list[float] = []
 
@@ -156,6 +157,72 @@ def test_ended_by_a_signal_it_leaves_the_robot_at_rest(how: signal.Signals) -> N
         spin_until(lambda: running.poll() is not None and sent[-1] == 0.3)
         assert running.returncode == 0
     assert np.abs(np.diff(sent)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+
+
+def test_held_up_for_a_while_it_ends_and_does_not_set_the_robot_in_motion_again() -> None:
+    """What is late is not played on; a base that stops when no command comes rests by then."""
+    sent: list[float] = []
+    said: dict[str, bytes] = {}
+
+    def hear(message: TwistStamped) -> None:
+        sent.append(message.twist.linear.x)
+
+    def hear_status(message: DiagnosticArray) -> None:
+        said[message.status[0].message] = message.status[0].level
+
+    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0}
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(EXCITATION, **(LIMITS | steps)) as running,
+    ):
+        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
+        start = node.create_client(Trigger, "/excitation/start")
+        spin_until(start.service_is_ready)
+        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+        start.call_async(Trigger.Request())
+        spin_until(lambda: bool(sent) and sent[-1] > 0.2)
+        running.send_signal(signal.SIGSTOP)
+        later = time.monotonic() + 1.5
+        spin_until(lambda: time.monotonic() > later)
+        before = len(sent)
+        running.send_signal(signal.SIGCONT)
+        spin_until(lambda: any("before this node's clock; 0.1 s are allowed" in s for s in said))
+        spin_until(lambda: len(sent) > before)
+        assert set(sent[before:]) == {0.0}
+        assert said[next(s for s in said if "s are allowed" in s)] == DiagnosticStatus.ERROR
+        stop(running)
+
+
+def test_a_recorder_that_does_not_answer_is_said(tmp_path: Path) -> None:
+    said: dict[str, bytes] = {}
+
+    def hear(message: DiagnosticArray) -> None:
+        said[message.status[0].message] = message.status[0].level
+
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process("nlsid_ros.trajectory_recorder", topics="[/cmd_vel]", bag=tmp_path / "bag",
+                at_once=False) as recorder,
+        process(EXCITATION, **LIMITS, recorder="trajectory_recorder") as running,
+    ):  # fmt: skip
+        node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
+        start = node.create_client(Trigger, "/excitation/start")
+        spin_until(start.service_is_ready)
+        spin_until(lambda: "waiting for ~/start" in said)
+
+        def started() -> bool:
+            asked = start.call_async(Trigger.Request())
+            spin_until(asked.done)
+            return bool(asked.result().success)
+
+        spin_until(lambda: node.count_clients("/trajectory_recorder/start") == 1)
+        recorder.send_signal(signal.SIGSTOP)
+        spin_until(started)
+        spin_until(lambda: any("has not answered for 10 s" in text for text in said))
+        assert said[next(s for s in said if "has not" in s)] == DiagnosticStatus.ERROR
+        recorder.send_signal(signal.SIGCONT)
+        stop(running)
 
 
 def test_a_recorded_command_is_replayed_within_the_limits() -> None:

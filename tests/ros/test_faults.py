@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,9 +11,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
-from diagnostic_msgs.msg import DiagnosticArray
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -130,6 +133,29 @@ def test_in_simulated_time_a_slow_simulation_is_not_a_silent_robot(robot: Robot)
         stop(monitor)
 
 
+def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
+    robot: Robot,
+) -> None:
+    """A simulation is reset, and its robot does not come back: nothing is due for a long time."""
+    name = "simulated_monitor"
+    with process(MONITOR, use_sim_time=True, stale_after=0.5, __node=name) as monitor:
+        robot.ready(monitors=2)
+        robot.spin_until(lambda: robot.clock.get_subscription_count() >= 1)
+        robot.spin_until(lambda: robot.has_said(" yet", name))
+        robot.drive(GOOD, clock=True)
+        robot.spin_until(lambda: robot.has_said("inside", name))
+        for k in range(80):
+            sec, nanosec = divmod(10**18 - 10**11 + k * PERIOD_NS, 10**9)
+            robot.clock.publish(Clock(clock=Time(sec=sec, nanosec=nanosec)))
+            due = time.monotonic() + PERIOD_NS * 1e-9
+            robot.spin_until(lambda due=due: time.monotonic() > due)  # type: ignore[misc]
+        robot.spin_until(lambda: robot.has_said("this node's clock went back by 100 s", name))
+        robot.said.clear()
+        robot.spin_until(lambda: robot.has_said("", name))
+        assert not robot.has_said("inside", name)
+        stop(monitor)
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
@@ -175,6 +201,18 @@ def test_a_publisher_that_offers_less_than_is_asked_for_is_named_in_the_log(robo
         robot.node.destroy_publisher(unreliable)
     assert "'/odom', offering incompatible QoS" in output
     assert "RELIABILITY" in output
+
+
+def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    robot.said.clear()
+    with process("nlsid_ros.trajectory_recorder", topics="[/odom]", bag=bag) as recorder:
+        robot.spin_until(lambda: robot.has_said("nothing on /odom yet", "trajectory_recorder"))
+        shutil.rmtree(bag)
+        robot.spin_until(lambda: robot.has_said("recording stopped: ", "trajectory_recorder"))
+        assert robot.levels["trajectory_recorder"] == DiagnosticStatus.ERROR
+        stop(recorder)
+    assert not bag.exists()
 
 
 @pytest.mark.parametrize("role", ["response", "excitation"])

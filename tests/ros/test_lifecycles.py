@@ -1,5 +1,6 @@
 """Recorder, excitation and identifier: their lifecycles, and parameters that are refused."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,10 +13,13 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from bags.chain.shipped import config_file
 from bags.recordings.bag import Bag
 from bags.samples import f1tenth
+from nlsid_ros import qos
 from tests.ros.processes import (
     node_here,
     process,
@@ -126,6 +130,47 @@ def test_a_manager_takes_over_a_node_that_started_itself_and_wrong_requests_do_n
         assert asked(name, activate, node, spin_until) == (False, active)
         assert asked(name, configure, node, spin_until) == (False, active)
         assert asked(name, 99, node, spin_until) == (False, active), "there is no such transition"
+        assert "Traceback" not in stop(running)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_node_that_started_itself_is_taken_down_and_brought_up_again(
+    name: str, tmp_path: Path
+) -> None:
+    """As `ros2 lifecycle set` does it, without a manager that configures first."""
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}", **settings_of(name, tmp_path)) as running,
+    ):
+        for transition, state in (*CYCLE[2:], *CYCLE):
+            assert asked(name, transition, node, spin_until) == (True, state)
+        assert "Traceback" not in stop(running)
+
+
+def test_what_is_still_on_its_way_when_a_node_is_deactivated_does_not_end_it() -> None:
+    """Messages and requests that are queued for what the transition destroys."""
+    name = "funnel_monitor"
+    with (
+        node_here("test_manager") as (node, spin_until),
+        process(f"nlsid_ros.{name}") as running,
+    ):
+        design = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
+        restart = node.create_client(Trigger, f"/{name}/restart")
+        manager = node.create_client(ChangeState, f"/{name}/change_state")
+        spin_until(manager.service_is_ready)
+        spin_until(restart.service_is_ready)
+        for _ in range(10):
+            for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+                request = ChangeState.Request(transition=Transition(id=transition))
+                answer = manager.call_async(request)
+                for _ in range(20):
+                    design.publish(String(data="no design"))
+                    restart.call_async(Trigger.Request())
+                spin_until(answer.done)
+                assert answer.result().success
+            settled = time.monotonic() + 0.2
+            spin_until(lambda settled=settled: time.monotonic() > settled)  # type: ignore[misc]
+        assert asked(name, Transition.TRANSITION_DEACTIVATE, node, spin_until)[0]
         assert "Traceback" not in stop(running)
 
 
