@@ -293,6 +293,17 @@ def test_a_browser_shows_the_words_and_takes_inside_back(page: Page, watched: Sc
 
 
 @needs_browser
+def test_a_browser_shows_a_recording_that_is_over_as_it_ended(page: Page, watched: Scene) -> None:
+    watched.end("verdict: inside. 2.9 of 2.9 s judged")
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        page.open(address)
+        page.wait(lambda: page.text("#word").lower() == "recording over")
+        assert page.text("#why").startswith("verdict: inside")
+        assert page.text("#n-age") == "the last"
+        assert page.value("document.body.className") == ""
+
+
+@needs_browser
 def test_a_browser_says_no_connection_when_the_stream_stands_still(
     page: Page, watched: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
