@@ -9,14 +9,20 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from examples.transcription import motion
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design, nominal_through
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    Goal,
+    design,
+    nominal_through,
+    plan_motion,
+)
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.dynamics.taylor import taylor_field
 
 GRAVITY = 9.81  # m/s²
-SECONDS, SEGMENTS = 2.0, (20, 40)
+SECONDS, KNOTS = 2.0, 41
 START, END = np.zeros(6), np.array([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
 RADIUS = np.array([10.0, 10.0, 0.4, 10.0, 10.0, 20.0, 6.0, 100.0])  # around the motion
 Q, R = np.diag([10.0, 10.0, 10.0, 2.0, 2.0, 1.0]), np.diag([0.5, 0.02])
@@ -35,10 +41,10 @@ def truth(x: FloatArray, u: FloatArray) -> FloatArray:
 
 def problem() -> tuple[VectorField, Nominal]:
     """The cubic models of the intervals, with what they leave out, and the motion."""
-    t, x, u = motion(
-        truth, ends=(START, END), u_rest=np.array([GRAVITY, 0.0]), seconds=SECONDS,
-        segments=SEGMENTS,
-    )  # fmt: skip
+    planned = plan_motion(
+        rate, start=START, end=END, seconds=SECONDS, u=[GRAVITY, 0.0], scale=[1.0, 1.0], knots=KNOTS
+    )
+    t, x, u = planned.t, planned.x.ends(), planned.u.ends()
     field = taylor_field(rate, t, x, u, radius=RADIUS)
     return field, nominal_through(t, x, u, field)
 

@@ -10,16 +10,17 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import DocumentError
 
+T = TypeVar("T")
 VERSION = 2  # of every document
 MAX_BYTES = 64 * 2**20  # a proof of hundreds of Gram matrices is a few MB; more is not ours
 
@@ -147,21 +148,28 @@ def named_digests(entries: list[Any], *, source: str) -> list[tuple[str, str]]:
     return pairs
 
 
-def header(
-    document: Json, name: str, *, source: str, kind: str | None = None, version: int = VERSION
-) -> None:
+def header(document: Json, name: str, *, source: str, kind: str | None = None) -> None:
     """Check `format`, `version` and `kind`, if one is wanted; DocumentError says what was found."""
     found = member(document, "format", str, source=source)
     if found != name:
         raise DocumentError(f"{source}: format is '{found}', expected '{name}'")
     given = member(document, "version", int, source=source)
-    if given != version:
+    if given != VERSION:
         raise DocumentError(
-            f"{source}: version {given}; this nlsid reads version {version}. Make it again with "
+            f"{source}: version {given}; this nlsid reads version {VERSION}. Make it again with "
             "the command that wrote it"
         )
     if kind is not None and document.get("kind") != kind:
         raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{kind}'")
+
+
+def of_kind(document: Json, kinds: Mapping[str, T], *, source: str) -> T:
+    """What `kinds` holds for the kind of a funnel or policy; DocumentError if it is not known."""
+    refuse_old_kind(document, source=source)
+    kind = document.get("kind")
+    if not isinstance(kind, str) or kind not in kinds:
+        raise DocumentError(f"{source}: kind is {kind!r}, expected one of {', '.join(kinds)}")
+    return kinds[kind]
 
 
 def refuse_old_kind(document: Json, *, source: str) -> None:

@@ -13,7 +13,7 @@ from nlsid_core.design.continuous.tvlqr import (
 )
 from nlsid_core.design.design import design
 from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
-from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
+from nlsid_core.design.riccati import Feedback, discrete_tvlqr
 from nlsid_core.design.tube import OutputTubeDesign, design_output_tube
 
 __all__ = [

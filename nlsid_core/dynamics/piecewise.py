@@ -11,7 +11,7 @@ from math import comb
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, keep
 from nlsid_core.errors import DataError, ShapeError
 
 MAX_DEGREE = 3  # what the checker restricts to sub-intervals exactly
@@ -45,9 +45,7 @@ class PiecewisePolynomial:
             raise DataError(
                 f"time grid does not increase after knot {k}: {t[k]:.9g} s, then {t[k + 1]:.9g} s"
             )
-        for key, values in (("t", t), ("control", control)):
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        keep(self, {"t": t, "control": control})
 
     @property
     def degree(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
 from nlsid_core.polynomial import Polynomial, trace
 from nlsid_core.polynomial.maps import coefficient_table
@@ -90,9 +90,7 @@ class VectorField:
             for i, p in enumerate(pieces[-1]):
                 if (p.exponents[:, 1 + self.n + self.m :] > 1).any():
                     raise DataError(f"dx{i}/dt is not affine in each uncertain w: {p}")
-        for key, value in (("breaks", breaks), ("uncertain", bounds), ("valid", valid)):
-            value.setflags(write=False)
-            object.__setattr__(self, key, value)
+        keep(self, {"breaks": breaks, "uncertain": bounds, "valid": valid})
         object.__setattr__(self, "pieces", tuple(pieces))
         object.__setattr__(self, "_plans", tuple(_Plan.of(*_table(p, names)) for p in pieces))
 

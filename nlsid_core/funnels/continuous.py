@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, keep
 from nlsid_core.dynamics.piecewise import PiecewisePolynomial, linear_through
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.funnels.factor import STEPS, UNIT, factor_of, rounding_of
@@ -52,9 +52,7 @@ class ContinuousFunnel:
             raise DataError(f"P is not positive definite at knot {k} (eigenvalue {lowest[k]:.3g})")
         if not self.x.is_continuous():
             raise DataError("the nominal states of a funnel should be continuous")
-        for key, values in (("P", P), ("rho", rho)):
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        keep(self, {"P": P, "rho": rho})
 
     @property
     def n(self) -> int:

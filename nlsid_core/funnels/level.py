@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.arrays import FloatArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 
 VALUE, CHANGE = "value", "change"
@@ -64,8 +64,7 @@ class CommandLevel:
             raise ShapeError(f"weights {weights.shape} for {len(self.terms)} terms of a level")
         if not ((weights >= 0.0).all() and (weights.sum(axis=1) > 0.0).all()):
             raise DataError("a level's weights should not be negative, nor all 0")
-        weights.setflags(write=False)
-        object.__setattr__(self, "weights", weights)
+        keep(self, {"weights": weights})
 
     @property
     def inputs(self) -> int:

@@ -1,11 +1,9 @@
 """What funnels of every kind have in common, so that one monitor serves them all."""
 
-from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.errors import DocumentError
 from nlsid_core.funnels import continuous, sampled, tube
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
@@ -43,20 +41,9 @@ class Funnel(Protocol):
 
 def read_funnel(document: Json, *, source: str = "funnel") -> AnyFunnel:
     """The funnel of a document, by its kind; DocumentError says what is wrong with it."""
-    kinds: dict[object, type[AnyFunnel]] = {
+    kinds: dict[str, type[AnyFunnel]] = {
         sampled.KIND: SampledFunnel,
         continuous.KIND: ContinuousFunnel,
         tube.KIND: TubeFunnel,
     }
-    files.refuse_old_kind(document, source=source)
-    kind = document.get("kind")
-    if kind not in kinds:
-        raise DocumentError(
-            f"{source}: kind is {kind!r}, expected one of {', '.join(map(str, kinds))}"
-        )
-    return kinds[kind].from_document(document, source=source)
-
-
-def load_funnel(path: Path | str) -> AnyFunnel:
-    """Read a funnel file of any kind; DocumentError says what is wrong with it."""
-    return read_funnel(files.load_document(path), source=str(path))
+    return files.of_kind(document, kinds, source=source).from_document(document, source=source)

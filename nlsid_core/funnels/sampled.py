@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.arrays import FloatArray, Json, freeze
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.funnels.factor import rounding_of
 from nlsid_core.funnels.tube import FORMAT
 
@@ -68,29 +68,20 @@ class SampledFunnel:
     roots: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        optional = () if self.roots is None else ("roots",)
-        for key in ("S", "A", "tube", "inlet", "half_widths", *optional):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if not np.isfinite(values).all():
-                raise DataError(f"funnel: {key} holds NaN or infinity")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
-        n = self.S.shape[-1] if self.S.ndim == 3 else 0
-        length = len(self.S)
-        parts = (self.S, self.A, self.tube, self.inlet, self.half_widths)
-        shapes = tuple(part.shape for part in parts)
-        if length < 2 or shapes != (
-            (length, n, n),
-            (length - 1, n, n),
-            (length,),
-            (length,),
-            (length, n),
-        ):
-            raise ShapeError(f"funnel: S, A, tube, inlet and half_widths do not fit: {shapes}")
+        freeze(self, "funnel", {"S": (None, None, None)})
+        length, n, _ = self.S.shape
+        if length < 2:
+            raise ShapeError(f"funnel: S has {length} samples; two are the least")
+        freeze(self, "funnel", {
+            "S": (length, n, n), "A": (length - 1, n, n), "tube": (length,), "inlet": (length,),
+            "half_widths": (length, n),
+        })  # fmt: skip
         if (np.tril(self.S, -1) != 0).any() or (np.diagonal(self.S, axis1=1, axis2=2) == 0).any():
             raise DataError("funnel: S should be upper triangular with a nonzero diagonal")
-        if self.roots is not None and (self.roots.shape != (length,) or not (self.roots > 0).all()):
-            raise DataError(f"funnel: roots should be {length} positive radii")
+        if self.roots is not None:
+            freeze(self, "funnel", {"roots": (length,)})
+            if not (self.roots > 0).all():
+                raise DataError(f"funnel: roots should be {length} positive radii")
         if not ((self.tube > 0).all() and (self.inlet > 0).all() and self.tube[0] <= self.inlet[0]):
             raise DataError("funnel: radii should be positive, and the tube start in the inlet")
         if self.assumption.form not in FORMS or self.assumption.bound < 0:
@@ -173,9 +164,7 @@ class SampledFunnel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "funnel") -> "SampledFunnel":
         """Raises DocumentError if the document is not a sampled funnel."""
-        files.header(document, FORMAT, source=source)
-        if document.get("kind") != KIND:
-            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         nested = files.member(document, "assumption", dict, source=source)
         where = f"{source} assumption"
         runs = files.member(nested, "measured_on", list, source=where)

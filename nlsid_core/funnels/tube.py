@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.arrays import FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.factor import factor_of, rounding_of
 from nlsid_core.funnels.level import CommandLevel
@@ -51,18 +51,12 @@ class Tube:
     follows: CommandLevel | None = None
 
     def __post_init__(self) -> None:
-        for key in ("L", "P", "R", "tau", "half_widths"):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
         n, p = len(self.P), len(self.R)
-        shapes = tuple(getattr(self, key).shape for key in ("L", "P", "R", "tau", "half_widths"))
-        if shapes != ((n, p), (n, n), (p, p), (p,), (p,)):
-            raise ShapeError(f"tube: L, P, R, tau, half_widths do not fit: {shapes}")
-        finite = all(np.isfinite(values).all() for values in (self.L, self.P, self.R))
+        shapes = {"L": (n, p), "P": (n, n), "R": (p, p), "tau": (p,), "half_widths": (p,)}
+        freeze(self, "tube", shapes)
         lasting = (self.rho == 1.0) == (self.samples is not None)
         positive = (self.tau > 0).all() and (self.half_widths > 0).all() and self.level > 0
-        if not (finite and lasting and positive and 0 < self.rho <= 1 and self.inlet >= 0):
+        if not (lasting and positive and 0 < self.rho <= 1 and self.inlet >= 0):
             raise DataError(
                 f"tube: rho {self.rho}, samples {self.samples}, level {self.level}, tau "
                 f"{self.tau.tolist()}, half-widths {self.half_widths.tolist()} are not a tube"
@@ -136,11 +130,9 @@ class Response:
     follows: CommandLevel | None = None
 
     def __post_init__(self) -> None:
-        widths = np.array(self.half_widths, dtype=np.float64)
-        if widths.ndim != 1 or not ((widths > 0.0) & np.isfinite(widths)).all():
-            raise DataError(f"response: half-widths {widths.tolist()} should be positive")
-        widths.setflags(write=False)
-        object.__setattr__(self, "half_widths", widths)
+        freeze(self, "response", {"half_widths": (None,)})
+        if not (self.half_widths > 0.0).all():
+            raise DataError(f"response: half-widths {self.half_widths.tolist()} should be positive")
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -169,14 +161,12 @@ class Cusum:
     threshold: float
 
     def __post_init__(self) -> None:
-        deviation = np.array(self.deviation, dtype=np.float64)
-        if deviation.ndim != 1 or not (deviation > 0.0).all() or not self.threshold > 0.0:
+        freeze(self, "cusum", {"deviation": (None,)})
+        if not (self.deviation > 0.0).all() or not self.threshold > 0.0:
             raise DataError(
-                f"cusum: deviation {deviation.tolist()} and threshold {self.threshold} should be "
-                "positive"
+                f"cusum: deviation {self.deviation.tolist()} and threshold {self.threshold} should "
+                "be positive"
             )
-        deviation.setflags(write=False)
-        object.__setattr__(self, "deviation", deviation)
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""

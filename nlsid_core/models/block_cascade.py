@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal
 from nlsid_core.models.spline import Spline
 
@@ -45,14 +45,8 @@ class BlockCascade:
     training: str = ""
 
     def __post_init__(self) -> None:
-        for key, dimensions in (("a1", 1), ("b1", 2), ("a2", 1), ("b2", 2)):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if values.ndim != dimensions:
-                raise ShapeError(f"{key} should have {dimensions} axes; has shape {values.shape}")
-            if not np.isfinite(values).all():
-                raise DataError(f"{key} should be finite")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        row, table = (None,), (None, None)
+        freeze(self, "model", {"a1": row, "b1": table, "a2": row, "b2": table})
         if self.b1.size == 0 or self.b2.size == 0 or len(self.b1) != len(self.b2):
             raise ShapeError(f"b1 {self.b1.shape} and b2 {self.b2.shape} should have equal phases")
         if len(self.b1) > MAX_PHASES:
@@ -138,10 +132,7 @@ class BlockCascade:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "BlockCascade":
         """Raises DocumentError if the document is not a block cascade."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         bags = files.member(document, "bags", list, source=source)
         return cls(
             a1=files.array(document, "a1", (None,), source=source),

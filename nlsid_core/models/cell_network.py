@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
-from nlsid_core.errors import DataError, DocumentError, ShapeError
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze, keep
+from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal, objects, signals
 
 KIND = "cell_network"
@@ -39,11 +39,8 @@ class PiecewiseLinear:
             raise DataError("knots and values should be finite")
         if not (np.diff(knots) > 0).all():
             raise DataError("knots should ascend")
-        for name, array in (
-            ("knots", knots), ("values", values), ("slopes", np.diff(values) / np.diff(knots)),
-        ):  # fmt: skip
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        slopes = np.diff(values) / np.diff(knots)
+        keep(self, {"knots": knots, "values": values, "slopes": slopes})
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """f(x), the shape of x."""
@@ -86,14 +83,7 @@ class CellNetwork:
         shapes = {
             "into": (m, width), "next": (n, width), "output": (len(self.y), width), "start": (n,),
         }  # fmt: skip
-        for key, shape in shapes.items():
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if values.shape != shape:
-                raise ShapeError(f"{key} should be {shape}; is {values.shape}")
-            if not np.isfinite(values).all():
-                raise DataError(f"{key} should be finite")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        freeze(self, "model", shapes)
         if not 1 <= m <= MAX_MAPS or not n or not self.y:
             raise DataError(f"{m} maps, {n} states, {len(self.y)} outputs; 1 to {MAX_MAPS} maps")
         if np.triu(self.into[:, :m]).any():
@@ -210,10 +200,7 @@ class CellNetwork:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "CellNetwork":
         """Raises DocumentError if the document is not a cell network."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         maps = objects(document, "maps", source=source)
         arrays = {
             key: files.array(document, key, (None, None), source=source)

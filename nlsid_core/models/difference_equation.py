@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal
 
@@ -36,14 +36,11 @@ class DifferenceEquation:
     training: str = ""
 
     def __post_init__(self) -> None:
-        for key in ("a", "b"):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
-        if self.a.ndim != 1 or not len(self.a) or self.b.shape != (len(self.a) + 1,):
-            raise ShapeError(f"a should be (n,), b (n+1,); they are {self.a.shape}, {self.b.shape}")
-        numbers = np.concatenate([self.a, self.b, [self.c, self.period, *self.u_range]])
-        if not np.isfinite(numbers).all():
+        freeze(self, "model", {"a": (None,)})
+        freeze(self, "model", {"b": (len(self.a) + 1,)})
+        if not len(self.a):
+            raise ShapeError("a model has at least one lag")
+        if not np.isfinite([self.c, self.period, *self.u_range]).all():
             raise DataError("a model's coefficients should be finite")
         if self.period <= 0 or self.u_range[0] > self.u_range[1]:
             raise DataError(f"period {self.period} s or input range {self.u_range} is not valid")
@@ -145,10 +142,9 @@ class DifferenceEquation:
     def from_document(cls, document: Json, *, source: str = "model") -> "DifferenceEquation":
         """Raises DocumentError if the document is not a difference equation."""
         files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
+        if (kind := document.get("kind")) != KIND:
             raise DocumentError(
-                f"{source}: kind is '{kind}', expected '{KIND}', which `model: linear` identifies"
+                f"{source}: kind is {kind!r}, expected '{KIND}', which `model: linear` identifies"
             )
         a = files.array(document, "a", (None,), source=source)
         lo, hi = files.array(document, "u_range", (2,), source=source)

@@ -281,10 +281,7 @@ class ImplicitModel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "ImplicitModel":
         """Raises DocumentError if the document is not an implicit model."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         states, inputs = (
             files.member(document, key, list, source=source) for key in ("states", "inputs")
         )

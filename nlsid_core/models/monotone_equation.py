@@ -14,7 +14,7 @@ from fractions import Fraction
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal
 
@@ -46,15 +46,9 @@ class MonotoneEquation:
     training: str = ""
 
     def __post_init__(self) -> None:
-        sizes = {"e": 3, "a": None, "b": len(self.window), "u_offset": len(self.u)}
-        for key, size in sizes.items():
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if values.ndim != 1 or size not in (None, len(values)):
-                raise ShapeError(f"{key} should have {size} entries; has shape {values.shape}")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
-        numbers = [*self.e, *self.a, *self.b, *self.u_offset, self.c, self.y_offset, self.period]
-        if not np.isfinite(numbers).all() or self.period <= 0:
+        sizes = {"e": (3,), "a": (None,), "b": (len(self.window),), "u_offset": (len(self.u),)}
+        freeze(self, "model", sizes)
+        if not np.isfinite([self.c, self.y_offset, self.period]).all() or self.period <= 0:
             raise DataError("a model's numbers should be finite and its period positive")
         if not len(self.a):
             raise ShapeError("a monotone equation has at least one lag")
@@ -130,10 +124,7 @@ class MonotoneEquation:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "MonotoneEquation":
         """Raises DocumentError if the document is not a monotone equation."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         signals = files.member(document, "u", list, source=source)
         window = files.array(document, "window", (None, 2), source=source)
         if not all(isinstance(signal, dict) for signal in signals) or (window % 1.0).any():

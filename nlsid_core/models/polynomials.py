@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, IntArray, Json
+from nlsid_core.arrays import FloatArray, IntArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.polynomial.values import monomial_values
 
@@ -26,9 +26,7 @@ class Polynomials:
             raise ShapeError(f"{exponents.shape} exponents for {coefficients.shape} coefficients")
         if (exponents < 0).any() or not np.isfinite(coefficients).all():
             raise DataError("exponents should not be negative, coefficients finite")
-        for name, values in (("exponents", exponents), ("coefficients", coefficients)):
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+        keep(self, {"exponents": exponents, "coefficients": coefficients})
 
     def __call__(self, w: FloatArray) -> FloatArray:
         """(..., *coefficients.shape[1:]) values at w (..., n_w)."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import files
-from nlsid_core.arrays import FloatArray, Json
+from nlsid_core.arrays import FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 
 # Coefficients of 1, s, s², s³ in the four uniform cubic B-splines, times 6.
@@ -35,12 +35,10 @@ class Spline:
     coefficients: FloatArray
 
     def __post_init__(self) -> None:
-        c = np.array(self.coefficients, dtype=np.float64)
-        c.setflags(write=False)
-        object.__setattr__(self, "coefficients", c)
-        if c.ndim != 1 or len(c) < 4:
-            raise ShapeError(f"coefficients should be (K + 3,), K >= 1; have shape {c.shape}")
-        if not (np.isfinite(c).all() and np.isfinite([self.low, self.spacing]).all()):
+        freeze(self, "spline", {"coefficients": (None,)})
+        if len(self.coefficients) < 4:
+            raise ShapeError(f"{len(self.coefficients)} coefficients; should be K + 3, K >= 1")
+        if not np.isfinite([self.low, self.spacing]).all():
             raise DataError("a spline's numbers should be finite")
         if self.spacing <= 0:
             raise DataError(f"knot spacing {self.spacing} should be positive")

@@ -14,7 +14,7 @@ from typing import Literal, cast, get_args
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import FORMAT, Signal, objects, signals
@@ -54,18 +54,10 @@ class StateAffineModel:
         if self.on_out_of_range not in get_args(OutOfRange):
             raise DataError(f"on_out_of_range is '{self.on_out_of_range}'; known: clip, refuse")
         n_y, n_u = len(self.y), len(self.u)
-        for key, shape in (
-            ("y_offset", (n_y,)),
-            ("y_scale", (n_y,)),
-            ("u_offset", (n_u,)),
-            ("u_scale", (n_u,)),
-            ("u_range", (n_u, 2)),
-        ):
-            values = np.array(getattr(self, key), dtype=np.float64)
-            if values.shape != shape or not np.isfinite(values).all():
-                raise ShapeError(f"{key} should be finite with shape {shape}; is {values}")
-            values.setflags(write=False)
-            object.__setattr__(self, key, values)
+        freeze(self, "model", {
+            "y_offset": (n_y,), "y_scale": (n_y,), "u_offset": (n_u,), "u_scale": (n_u,),
+            "u_range": (n_u, 2),
+        })  # fmt: skip
         if (self.y_scale <= 0).any() or (self.u_scale <= 0).any() or not self.period > 0:
             raise DataError("scales and the period should be positive")
         if (self.u_range[:, 0] >= self.u_range[:, 1]).any():
@@ -186,10 +178,7 @@ class StateAffineModel:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "model") -> "StateAffineModel":
         """Raises DocumentError if the document is not a state-affine model."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         y, u = (signals(document, key, source=source) for key in ("y", "u"))
         window = files.array(document, "window", (None, 2), source=source)
         if (window % 1.0).any():

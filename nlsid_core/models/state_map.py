@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, freeze, keep
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.models.signal import FORMAT, Signal, signals
 from nlsid_core.polynomial import Polynomial
@@ -107,8 +107,7 @@ MAX_DEGREE = 15  # of one variable in a file; a larger one would only be there t
 def settle(model: Any, outputs: int) -> None:
     """Check the fields that models of a measured state share, coefficients (m, outputs)."""
     exponents = np.array(model.exponents, dtype=np.int64)
-    exponents.setflags(write=False)
-    object.__setattr__(model, "exponents", exponents)
+    keep(model, {"exponents": exponents})
     n, p = len(model.x), len(model.u)
     shapes = {
         "coefficients": (len(exponents), outputs),
@@ -117,14 +116,7 @@ def settle(model: Any, outputs: int) -> None:
         "noise": (n,),
         "disturbance": (n,),
     }
-    for key, shape in shapes.items():
-        values = np.array(getattr(model, key), dtype=np.float64)
-        if values.shape != shape:
-            raise ShapeError(f"model: {key} should have shape {shape}, has {values.shape}")
-        if not np.isfinite(values).all():
-            raise DataError(f"model: {key} holds NaN or infinity")
-        values.setflags(write=False)
-        object.__setattr__(model, key, values)
+    freeze(model, "model", shapes)
     if exponents.shape != (len(exponents), n + p) or (exponents < 0).any():
         raise ShapeError(f"model: exponents should be (m, {n + p}) and not negative")
     empty = (model.x_range[:, 0] >= model.x_range[:, 1]).any()
@@ -158,10 +150,7 @@ def write_fields(model: Any, kind: str, equation: str) -> Json:
 
 def read_fields(document: Json, expected: str, *, source: str) -> dict[str, Any]:
     """The fields of a model of kind `expected`; DocumentError says what is wrong."""
-    files.header(document, FORMAT, source=source)
-    kind = files.member(document, "kind", str, source=source)
-    if kind != expected:
-        raise DocumentError(f"{source}: kind is '{kind}', expected '{expected}'")
+    files.header(document, FORMAT, source=source, kind=expected)
     x, u = (signals(document, key, source=source) for key in ("x", "u"))
     exponents = files.array(document, "exponents", (None, len(x) + len(u)), source=source)
     if (exponents != np.round(exponents)).any() or (exponents > MAX_DEGREE).any():

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from nlsid_core import files
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
 from nlsid_core.dynamics.piecewise import PiecewisePolynomial
 from nlsid_core.errors import DataError, ShapeError
 
@@ -54,8 +54,7 @@ class ContinuousPolicy:
                 f"{len(limits)} limited inputs make 3^{len(limits)} modes; at most {MAX_LIMITED} "
                 "are decided: keep the others within their limits by rows of the dynamics' valid"
             )
-        limits.setflags(write=False)
-        object.__setattr__(self, "limits", limits)
+        keep(self, {"limits": limits})
 
     @property
     def t(self) -> FloatArray:

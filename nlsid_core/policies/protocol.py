@@ -1,11 +1,9 @@
 """What policies of every kind have in common, so that one controller runs them all."""
 
-from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
-from nlsid_core.errors import DocumentError
 from nlsid_core.policies import continuous, sampled, tube
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.policies.sampled import SampledPolicy
@@ -37,19 +35,9 @@ class Policy(Protocol):
 
 def read_policy(document: Json, *, source: str = "policy") -> AnyPolicy:
     """The policy of a document, by its kind; DocumentError says what is wrong with it."""
-    kinds: dict[object, type[AnyPolicy]] = {
+    kinds: dict[str, type[AnyPolicy]] = {
         tube.KIND: TubePolicy,
         sampled.KIND: SampledPolicy,
         continuous.KIND: ContinuousPolicy,
     }
-    files.refuse_old_kind(document, source=source)
-    kind = document.get("kind")
-    if kind not in kinds:
-        known = ", ".join(map(str, kinds))
-        raise DocumentError(f"{source}: kind is {kind!r}, expected one of {known}")
-    return kinds[kind].from_document(document, source=source)
-
-
-def load_policy(path: Path | str) -> AnyPolicy:
-    """Read a policy file of any kind; DocumentError says what is wrong with it."""
-    return read_policy(files.load_document(path), source=str(path))
+    return files.of_kind(document, kinds, source=source).from_document(document, source=source)

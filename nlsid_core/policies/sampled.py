@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
-from nlsid_core.errors import DocumentError, ShapeError
+from nlsid_core.errors import ShapeError
 from nlsid_core.policies.tube import FORMAT
 
 KIND = "sampled"
@@ -28,15 +28,11 @@ class SampledPolicy:
     model: str
 
     def __post_init__(self) -> None:
-        freeze(self, "policy", ("x", "u", "K", "L"))
-        if self.x.ndim != 2 or self.u.ndim != 2 or not len(self.u):
-            raise ShapeError("policy: x should be (N + 1, n), u (N, p) with N > 0")
+        freeze(self, "policy", {"x": (None, None), "u": (None, None)})
         n, (steps, p) = self.x.shape[1], self.u.shape
-        if len(self.x) != steps + 1 or self.K.shape != (steps, p, n) or self.L.shape != (n, n):
-            raise ShapeError(
-                f"policy: x should be (N + 1, n), u (N, p), K (N, p, n), L (n, n); they are "
-                f"{self.x.shape}, {self.u.shape}, {self.K.shape}, {self.L.shape}"
-            )
+        if not steps:
+            raise ShapeError("policy: u should have one step at least")
+        freeze(self, "policy", {"x": (steps + 1, n), "K": (steps, p, n), "L": (n, n)})
 
     def __len__(self) -> int:
         """The number of steps N."""
@@ -85,9 +81,7 @@ class SampledPolicy:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "policy") -> "SampledPolicy":
         """Raises DocumentError if the document is not a sampled policy."""
-        files.header(document, FORMAT, source=source)
-        if document.get("kind") != KIND:
-            raise DocumentError(f"{source}: kind is {document.get('kind')!r}, expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         u = files.array(document, "u", (None, None), source=source)
         L = files.array(document, "L", (None, None), source=source)
         return cls(

@@ -6,7 +6,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json, freeze
-from nlsid_core.errors import DocumentError, ShapeError
+from nlsid_core.errors import ShapeError
 from nlsid_core.models import DifferenceEquation
 
 FORMAT = "nlsid/policy"
@@ -32,11 +32,10 @@ class TubePolicy:
     model: str
 
     def __post_init__(self) -> None:
-        freeze(self, "policy", ("start", "u", "K", "L"))
-        shapes = [getattr(self, key).shape for key in ("start", "u", "K", "L")]
         n = (len(self.K),)
-        if shapes != [n, (len(self.u),), n, n] or not len(self.u):
-            raise ShapeError(f"policy: start, K and L should be (n,), u (N,); they are {shapes}")
+        freeze(self, "policy", {"start": n, "u": (None,), "K": n, "L": n})
+        if not len(self.u):
+            raise ShapeError("policy: u should have one sample at least")
 
     def __len__(self) -> int:
         """The number of planned samples N."""
@@ -78,10 +77,7 @@ class TubePolicy:
     @classmethod
     def from_document(cls, document: Json, *, source: str = "policy") -> "TubePolicy":
         """Raises DocumentError if the document is not a policy of this kind."""
-        files.header(document, FORMAT, source=source)
-        kind = files.member(document, "kind", str, source=source)
-        if kind != KIND:
-            raise DocumentError(f"{source}: kind is '{kind}', expected '{KIND}'")
+        files.header(document, FORMAT, source=source, kind=KIND)
         K = files.array(document, "K", (1, None), source=source)[0]
         return cls(
             start=files.array(document, "start", (len(K),), source=source),

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, keep
 from nlsid_core.errors import DataError, NotPolynomial, ShapeError
 from nlsid_core.polynomial.operations import OPERATORS, REFUSED
 from nlsid_core.polynomial.values import monomial_values
@@ -59,10 +59,8 @@ class Polynomial:
             coefficients = coefficients.astype(np.float64)
             if not np.isfinite(coefficients).all():
                 raise DataError(f"coefficients should be finite, are {coefficients}")
-        merged = _merge(exponents.astype(np.int64), coefficients)
-        for key, value in zip(("exponents", "coefficients"), merged, strict=True):
-            value.setflags(write=False)
-            object.__setattr__(self, key, value)
+        exponents, coefficients = _merge(exponents.astype(np.int64), coefficients)
+        keep(self, {"exponents": exponents, "coefficients": coefficients})
         object.__setattr__(self, "names", names)
 
     # -- shape -------------------------------------------------------------------------------

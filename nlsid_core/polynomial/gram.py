@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nlsid_core.arrays import IntArray
+from nlsid_core.arrays import IntArray, keep
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial.algebra import Polynomial
 
@@ -40,9 +40,7 @@ class Gram:
             raise DataError(f"Q[{i}, {j}] = {Q[i, j]} differs from Q[{j}, {i}] = {Q[j, i]}")
         if len({tuple(row) for row in basis.tolist()}) != len(basis) or (basis < 0).any():
             raise DataError("a Gram basis should hold distinct monomials")
-        for key, value in (("basis", basis), ("Q", Q)):
-            value.setflags(write=False)
-            object.__setattr__(self, key, value)
+        keep(self, {"basis": basis, "Q": Q})
         object.__setattr__(self, "names", tuple(self.names))
 
     def __len__(self) -> int:

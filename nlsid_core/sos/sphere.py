@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import blas, lapack, qr
 
 from nlsid_core import conic
-from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray
+from nlsid_core.arrays import ArrayLike, BoolArray, FloatArray, IntArray, keep
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials
@@ -110,19 +110,11 @@ class SphereProgram:
             raise SolverError(f"the {len(points)} points are not unisolvent (pivot {info})")
         centre = _sphere_means(factor, V)
         object.__setattr__(self, "chosen", chosen)
-        for key, value in (
-            ("basis", basis),
-            ("weight", weight),
-            ("points", points),
-            ("_V", V),
-            ("_whiten", whiten),
-            ("_unit", moments),
-            ("_unit_root", np.linalg.inv(np.linalg.cholesky(moments))),
-            ("_centre", centre),
-            ("_normal", np.asfortranarray(factor)),
-        ):
-            value.setflags(write=False)
-            object.__setattr__(self, key, value)
+        keep(self, {
+            "basis": basis, "weight": weight, "points": points, "_V": V, "_whiten": whiten,
+            "_unit": moments, "_unit_root": np.linalg.inv(np.linalg.cholesky(moments)),
+            "_centre": centre, "_normal": np.asfortranarray(factor),
+        })  # fmt: skip
 
     def solve(
         self, g: ArrayLike, *, tolerance: float = 1e-8, start: SphereSolution | None = None

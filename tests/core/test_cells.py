@@ -166,7 +166,7 @@ def test_a_written_network_is_read_again_and_a_damaged_one_is_refused() -> None:
         ({"maps": [{"knots": [0.0, 0.0], "values": [0.0, 1.0]}] * 3}, DataError, "ascend"),
         ({"maps": [1, 2, 3]}, DocumentError, "objects"),
         ({"into": [[1.0] * 7] * 3}, DataError, "earlier maps"),
-        ({"next": [[0.0] * 6] * 2}, ShapeError, "next should be"),
+        ({"next": [[0.0] * 6] * 2}, ShapeError, "next should have shape"),
         ({"start_samples": 0}, DataError, "start_samples"),
         ({"period": 0.0}, DataError, "period"),
     ):

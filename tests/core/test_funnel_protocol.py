@@ -11,9 +11,9 @@ from nlsid_core.design import OutputTubeDesign
 from nlsid_core.documents import load
 from nlsid_core.errors import DocumentError
 from nlsid_core.funnels.continuous import ContinuousFunnel
-from nlsid_core.funnels.protocol import Funnel, load_funnel
+from nlsid_core.funnels.protocol import Funnel, read_funnel
 from nlsid_core.funnels.sampled import SampledFunnel
-from nlsid_core.policies.protocol import AnyPolicy, Policy, load_policy
+from nlsid_core.policies.protocol import AnyPolicy, Policy, read_policy
 from tests.continuous_stage import stage
 from tests.tracked import designed
 
@@ -60,17 +60,20 @@ def test_one_load_reads_every_kind_and_refuses_what_is_none(
         assert policy is not None
         files.write_document(tmp_path / "policy.json", policy.document())
         files.write_document(tmp_path / "funnel.json", funnel.document())
-        assert load_policy(tmp_path / "policy.json").document() == policy.document()
-        read = load_funnel(tmp_path / "funnel.json")
+        assert (
+            read_policy(files.load_document(tmp_path / "policy.json")).document()
+            == policy.document()
+        )
+        read = read_funnel(files.load_document(tmp_path / "funnel.json"))
         assert (type(read), read.document()) == (type(funnel), funnel.document())
     files.write_document(tmp_path / "funnel.json", funnel.document() | {"kind": "round"})
     with pytest.raises(DocumentError, match="kind is 'round'"):
-        load_funnel(tmp_path / "funnel.json")
-    for name, reads in (("funnel", load_funnel), ("policy", load_policy)):
-        document = files.load_document(tmp_path / f"{name}.json")
-        files.write_document(tmp_path / f"{name}.json", document | {"kind": "linear"})
-        for reader in (reads, load):
-            with pytest.raises(
-                DocumentError, match=r"is now 'tube'. Make it again with `nlsid fun"
-            ):
-                reader(tmp_path / f"{name}.json")
+        read_funnel(files.load_document(tmp_path / "funnel.json"))
+    for name, reads in (("funnel", read_funnel), ("policy", read_policy)):
+        document = files.load_document(tmp_path / f"{name}.json") | {"kind": "linear"}
+        files.write_document(tmp_path / f"{name}.json", document)
+        gone = r"is now 'tube'. Make it again with `nlsid fun"
+        with pytest.raises(DocumentError, match=gone):
+            reads(document)
+        with pytest.raises(DocumentError, match=gone):
+            load(tmp_path / f"{name}.json")

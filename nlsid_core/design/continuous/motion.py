@@ -48,6 +48,7 @@ def plan_motion(
     u: ArrayLike | None = None,
     m: int | None = None,
     limits: ArrayLike | None = None,
+    scale: ArrayLike | None = None,
     through: ArrayLike | None = None,
     knots: int | None = None,
 ) -> Nominal:
@@ -56,8 +57,10 @@ def plan_motion(
     dynamics: of some of t, x, u, named so; w, of a field, in the centre of its box. u: (m,) the
     input that costs nothing, and that the motion starts and ends with if it keeps both ends at
     rest (None: zeros, for `m` inputs). limits: rows (input, low, high), or one pair an input, that
-    the motion keeps to nine tenths of. through: (P, n) states to guess the path by, equally spaced
-    in time (None: the straight line). knots: of the cubics (None: as many as they need).
+    the motion keeps to nine tenths of. scale: (m,) what is much of each input, by which the cost
+    weighs them (None: half of its range, or |u|, 1 at least). through: (P, n) states to guess the
+    path by, equally spaced in time (None: the straight line). knots: of the cubics (None: as many
+    as they need).
 
     Raises DataError on input that makes no sense, Infeasible if no motion was found.
     """
@@ -78,13 +81,19 @@ def plan_motion(
     for i, low, high in [] if limits is None else limits_of(limits, m).tolist():
         middle, half = (low + high) / 2, KEPT * (high - low) / 2
         box[int(i)] = middle - half, middle + half
+    much = np.ptp(box, axis=1) / 2
+    much = np.where(np.isfinite(much), much, np.maximum(np.abs(rest), 1))
+    if scale is not None:
+        much = np.asarray(scale, dtype=np.float64)
+        if much.shape != (m,) or not (much > 0).all():
+            raise DataError(f"scale should be {m} positive numbers, is {much.tolist()}")
     path = np.stack(ends) if through is None else np.asarray(through, dtype=np.float64)
     t = np.linspace(0.0, seconds, FIRST_KNOTS if knots is None else knots)
     share = np.linspace(0, seconds, len(path))
     x = np.stack([np.interp(t, share, column) for column in path.T], axis=1)
     x[0], x[-1] = ends
     straight = np.hstack([x, np.tile(rest, (len(t), 1))])
-    mesh = _Mesh(rates, t, n, rest, box, _held(rates, ends, rest, seconds, box))
+    mesh = _Mesh(rates, t, n, rest, box, much, _held(rates, ends, rest, seconds, box))
     straight[mesh.held, n:] = rest
     z = mesh.started(straight)
     while True:
@@ -138,6 +147,7 @@ class _Mesh:
     n: int
     rest: FloatArray
     box: FloatArray
+    much: FloatArray
     held: list[int]
 
     def started(self, straight: FloatArray) -> FloatArray:
@@ -182,11 +192,7 @@ class _Mesh:
 
     def sizes(self, z: FloatArray) -> FloatArray:
         """(n + m,) what is a large change of each entry."""
-        spread = np.ptp(z, axis=0)
-        inputs = np.where(np.isfinite(self.box).all(axis=1), np.ptp(self.box, axis=1), np.inf)
-        spread[self.n :] = np.where(
-            np.isfinite(inputs), inputs / 2, np.maximum(np.abs(self.rest), 1)
-        )
+        spread = np.append(np.ptp(z[:, : self.n], axis=0), self.much)
         return np.where(spread > 0, spread, 1.0)
 
     def defects(self, z: FloatArray) -> FloatArray:

@@ -9,8 +9,7 @@ import scipy.sparse as sp
 from nlsid_core import conic, files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.riccati import solve_riccati
-from nlsid_core.design.sampled.riccati import Feedback, discrete_tvlqr
+from nlsid_core.design.riccati import Feedback, discrete_tvlqr, solve_riccati
 from nlsid_core.errors import DataError, Infeasible, ShapeError, SolverError
 from nlsid_core.models.measured_state import MeasuredState
 from nlsid_core.policies.sampled import SampledPolicy
