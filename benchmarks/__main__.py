@@ -80,7 +80,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "robots": Benchmark("robots", data="."),
         "rwse_scaling": Benchmark("rwse_scaling"),
         "satellite": Benchmark("satellite"),
-        "tubes": Benchmark("tubes"),
+        "tubes": Benchmark("tubes", data="."),
         "verified": Benchmark("verified"),
         "wiener_hammerstein": Benchmark("wiener_hammerstein", data="wh2009"),
         "wiener_hammerstein_cascade": Benchmark("wiener_hammerstein_cascade", data="wh2009"),

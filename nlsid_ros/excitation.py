@@ -24,6 +24,8 @@ from rclpy.duration import Duration
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.chain.config import load_config
+from bags.signals.expressions import Expression, factors
 from bags.signals.grid import seconds
 from bags.signals.reader import read_signals
 from bags.signals.signal import SignalPath
@@ -43,6 +45,7 @@ from nlsid_ros.messages import (
 from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, declare_text, run
 
 NAME = "excitation"
+COMMAND = "/cmd_vel:twist.linear.x"
 KINDS = ("multisine", "chirp", "prbs", "steps", "replay")
 BIG = 1e9
 STILL = 1.0  # s of the wall's time without a command while a signal is played
@@ -61,9 +64,7 @@ class Excitation(ManagedNode):
         number = partial(declare_number, self)
         self._kind = declare_text(self, "kind", "multisine", "one of " + ", ".join(KINDS))
         self._command = SignalMessage(
-            SignalPath.parse(
-                declare_text(self, "command", "/cmd_vel:twist.linear.x", "signal published")
-            ),
+            self._signal(),
             declare_text(self, "command_type", "geometry_msgs/msg/TwistStamped", "its type"),
             declare_text(self, "others", ZERO, f"its fields that are not the signal: {OTHERS}"),
         )
@@ -93,6 +94,22 @@ class Excitation(ManagedNode):
             fade=number("fade", 1.0, "s of soft start and stop", between=(0.0, 60.0)),
             rest=number("rest", 0.0, "input of a robot at rest", between=(-BIG, BIG)),
         )
+
+    def _signal(self) -> SignalPath:
+        """What is published: the parameter `command`, else the one excitation of `config`."""
+        command = declare_text(
+            self, "command", "", f"signal published; empty: that of config, else {COMMAND}"
+        )
+        config = declare_text(self, "config", "", "a robot's configuration, whose excitation it is")
+        if command or not config:
+            return SignalPath.parse(command or COMMAND)
+        texts = [signal.path for signal in load_config(Path(config)).signals.excitation]
+        if len(texts) > 1 or len(factors(texts[0])) > 1:
+            raise DataError(
+                f"{config} has the excitations {', '.join(texts)}; name the one to move by the "
+                "parameter command"
+            )
+        return Expression.parse(texts[0]).path
 
     def prepare(self) -> None:
         """Make the whole signal before anything moves."""

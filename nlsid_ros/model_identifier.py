@@ -2,10 +2,12 @@
 
 `~/identify` answers at once whether work began; progress is on /diagnostics; the model comes out on
 ~/model (latched) once it is proved stable, beside the files in `out`. `~/cancel` calls it off.
+Recordings that are not closed yet are left out, and so are those without the configured topics.
 """
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,20 +95,22 @@ class ModelIdentifier(ManagedNode):
         if progress.done:
             self._work.cancel()
             self._work = None
+            for left in progress.left_out:
+                self.get_logger().warning(f"left out: {left}")
             if progress.what == "done":
-                progress = self._publish()
+                progress = self._publish(progress)
         if progress != self._said:
             self._said = progress
             self._report()
 
-    def _publish(self) -> Progress:
+    def _publish(self, progress: Progress) -> Progress:
         try:
             verdict = check(self._out / documents.MODEL_PROOF)
             model = documents.load_model(self._out / documents.MODEL)
         except (NlsidError, OSError) as error:
-            return Progress("failed", 1.0, done=True, error=str(error))
+            return replace(progress, what="failed", error=str(error))
         self._model.publish(String(data=json.dumps(model.document())))
-        return Progress(str(verdict), 1.0, done=True)
+        return replace(progress, what=str(verdict))
 
     def _report(self) -> None:
         said = self._said
@@ -114,6 +118,8 @@ class ModelIdentifier(ManagedNode):
         text = said.what + (f": {said.error}" if said.error else "")
         now = self.get_clock().now().to_msg()
         values = {"progress": f"{said.fraction:.2f}", "out": str(self._out)}
+        if said.left_out:
+            values["left out"] = "; ".join(said.left_out)
         self._diagnostics.publish(status(now, name_of(self), level, text, values))
 
 

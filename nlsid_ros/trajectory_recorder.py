@@ -24,6 +24,7 @@ from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from bags.chain.config import load_config
 from bags.recordings.definitions import Definition, read_definitions
 from bags.recordings.message_types import header_stamp_ns
 from bags.recordings.part import COMPRESSIONS
@@ -100,10 +101,21 @@ class TrajectoryRecorder(ManagedNode):
             "excitation/experiment",
             "topic whose JSON goes into the bag's metadata; empty: none",
         )
-        self._wanted = [Wanted.parse(entry, self.get_namespace()) for entry in topics if entry]
-        if not self._wanted:
-            raise DataError("no topics to record; set the parameter topics, e.g. ['/odom']")
+        config = declare_text(
+            self, "config", "", "a robot's configuration: its signals' topics are recorded too"
+        )
         self._given = [Path(path) for path in given if path]
+        entries = [entry for entry in topics if entry]
+        if config:
+            settings = load_config(Path(config))
+            entries += [self.signal_topic(topic) for topic in settings.signals.topics]
+            self._given += settings.definitions
+        parsed = [Wanted.parse(entry, self.get_namespace()) for entry in entries]
+        self._wanted = list({wanted.topic: wanted for wanted in reversed(parsed)}.values())[::-1]
+        if not self._wanted:
+            raise DataError(
+                "no topics to record; set the parameter topics, e.g. ['/odom'], or config"
+            )
 
     def prepare(self) -> None:
         """Finish what a killed recorder left, and refuse what could not be recorded."""

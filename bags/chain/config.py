@@ -46,6 +46,15 @@ class SignalsConfig(Section):
     response: Annotated[Signals, Key("what is measured and modelled")]
     excitation: Annotated[Signals, Key("what drives the robot")]
 
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """What the signals are read from, each topic once."""
+        return tuple(dict.fromkeys(
+            factor.path.topic
+            for signal in (*self.response, *self.excitation)
+            for factor in parse_factors(signal.path)
+        ))  # fmt: skip
+
 
 class GridConfig(Section):
     """How the numbers in messages become samples (`bags.signals.sampling`)."""
@@ -379,6 +388,14 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"excitation, not by {model} with {said}; leave out `profile` for a tube "
             "around the model's simulation, or use `nlsid track` for a measured state"
         )
+    if config.funnel is not None and config.funnel.profile is not None:
+        for key, value in (("clock", config.clock), ("grid.resample", config.grid.resample)):
+            if value not in ("header", "none"):
+                yield (
+                    f"funnel.profile: a plan is driven by commands that carry the stamps of the "
+                    f"responses they answer, not with `{key}: {value}`; leave out `profile` for a "
+                    "tube around the model's simulation"
+                )
     for key, options in (("input_range", [counts[1]]), ("box", [sum(counts)])):
         given = getattr(config.identification.model_class, key, None)
         if given is not None and len(given) not in options:

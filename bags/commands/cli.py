@@ -563,6 +563,24 @@ def live(
 
 
 @app.command()
+def call(
+    service: Annotated[
+        str, typer.Argument(help="As /excitation/start; none: lists what there is.")
+    ] = "",
+) -> None:
+    """Call a service of a running node (std_srvs/Trigger), as `ros2 service call` does.
+
+    Status 0: done, 1: refused, 2: nobody answered.
+    """
+    from bags.commands.launching import run_together
+
+    if importlib.util.find_spec("rclpy") is None:
+        raise typer.BadParameter("rclpy is not installed (pip install 'nlsid[ros]')")
+    given = [service] if service else []
+    raise typer.Exit(run_together([[sys.executable, "-m", "nlsid_ros.calling", *given]]))
+
+
+@app.command()
 def view(
     bag: Annotated[
         Path | None, typer.Argument(help="A recording to replay; none: the live robot.")

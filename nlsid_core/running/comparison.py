@@ -26,7 +26,7 @@ from nlsid_core.policies.tube import TubePolicy
 from nlsid_core.running.assumption import meter_of
 from nlsid_core.running.held import Held
 from nlsid_core.running.observer import StateObserver
-from nlsid_core.running.reading import Level
+from nlsid_core.running.reading import Level, unsaid
 from nlsid_core.running.tubes import ROUNDING, assuming
 
 COMMAND_TOLERANCE = 1e-9  # relative: rounding between computing a policy's input and recording it
@@ -139,7 +139,7 @@ class PlanComparison:
             return ""
         if not abs(y) < np.inf:
             return f"{self.model.y.name} is {y} at t = {t:g} s"
-        return f"no {self.model.u.name} at t = {t:g} s (it is {u})"
+        return f"no {self.model.u.name} at t = {t:g} s ({unsaid(u)})"
 
     def when(self, k: int, _t: float) -> float:
         """The sample's number."""

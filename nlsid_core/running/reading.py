@@ -72,3 +72,8 @@ class Reading(NamedTuple):
             values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
             values[f"measured[{i}]"] = self.measured[i]
         return values
+
+
+def unsaid(value: object) -> str:
+    """Why a number of a signal is none, for people; NaN stands for one that did not come too."""
+    return "missing, or not a number" if value is None or value != value else f"it is {value}"

@@ -25,7 +25,7 @@ from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
-from nlsid_core.running.reading import Level, Reading, Status
+from nlsid_core.running.reading import Level, Reading, Status, unsaid
 from nlsid_core.running.start import start_in_motion
 from nlsid_core.running.stepping import Stepper
 
@@ -184,7 +184,7 @@ class TubeRun:
         for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
             for value, signal in zip(values.tolist(), signals, strict=True):
                 if not math.isfinite(value):
-                    return f"no {signal.name} at t = {t:g} s (it is {value}): nothing is claimed"
+                    return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
     def _without(self, u: FloatArray, fault: str) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from bags.chain.background import BackgroundIdentification, Progress, last_bags
+from bags.chain.background import BackgroundIdentification, Progress, finished_bags
 from bags.chain.config import load_config
 from bags.chain.shipped import config_file
 from bags.chain.steps import cut
@@ -68,12 +68,22 @@ def recordings(folder: Path) -> None:
     growing.abandon()
 
 
-def test_the_last_recordings_are_those_that_began_last_and_are_finished(tmp_path: Path) -> None:
+def test_recordings_that_are_finished_and_have_the_topics_are_used(tmp_path: Path) -> None:
     recordings(tmp_path)
-    assert last_bags([tmp_path], 1) == [tmp_path / "run_2"]
-    assert last_bags([tmp_path], 3) == [tmp_path / name for name in ("run_10", "run", "run_2")]
-    with pytest.raises(BagError, match="4 recordings are asked for, 3 are finished in"):
-        last_bags([tmp_path], 4)
+    speed_bag(tmp_path / "run_5", [0.0, 0.1], [0.1, 0.1], start_ns=START_NS + 5 * 10**9)
+    bags, left_out = finished_bags([tmp_path], last=1)
+    assert bags == [tmp_path / "run_5"]
+    bags, _ = finished_bags([tmp_path], last=3)
+    assert bags == [tmp_path / name for name in ("run", "run_2", "run_5")]
+    bags, left_out = finished_bags([tmp_path], ["/odom", CMD])
+    assert bags == [tmp_path / name for name in ("run", "run_10", "run_2", "run_5")]
+    assert left_out.keys() == {tmp_path / "run_4", tmp_path / "run_snapshot_1"}
+    assert "not closed" in left_out[tmp_path / "run_4"]
+    assert "snapshot" in left_out[tmp_path / "run_snapshot_1"]
+    with pytest.raises(BagError, match=r"5 recordings are asked for, 4 can be used in .*run_4: it"):
+        finished_bags([tmp_path], last=5)
+    with pytest.raises(BagError, match=r"1 recordings are asked for, 0 .* has nothing on /none"):
+        finished_bags([tmp_path], ["/none"])
 
 
 def test_a_share_of_every_trial_scores_and_the_rest_of_it_is_fitted() -> None:

@@ -56,6 +56,23 @@ def test_a_configuration_that_does_not_fit_its_bags_says_all_at_once(tmp_path: P
     assert len(output.splitlines()) == 3
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"clock": "log"}, "clock: log"),
+        ({"grid": {"period": 0.025, "max_gap": 0.1, "resample": "linear"}}, "resample: linear"),
+    ],
+)
+def test_a_plan_that_no_controller_could_drive_is_refused(
+    tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    output = check(edited(tmp_path / "robot.yaml", **changes), status=1)
+    assert "funnel.profile: a plan is driven by commands that carry the stamps" in output
+    assert said in output
+    unplanned = edited(tmp_path / "b.yaml", **changes, funnel={"safety_factor": 1.5})
+    assert "nothing is wrong" in check(unplanned)
+
+
 def test_a_split_that_scores_nothing_or_trains_on_nothing_is_said(tmp_path: Path) -> None:
     path = edited(tmp_path / "a.yaml", split=None)
     assert "split: nothing to score on" in check(path, *f1tenth(), status=1)

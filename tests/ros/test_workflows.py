@@ -26,6 +26,7 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.recordings.bag import Bag
+from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
@@ -48,11 +49,13 @@ class Operator:
     def __init__(self, node: Node, spin_until: Callable[[Callable[[], bool]], None]) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[str]] = {}
+        self.values: dict[str, dict[str, str]] = {}
         node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, qos.EVENTS)
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self.said.setdefault(status.name, []).append(status.message)
+            self.values[status.name] = {entry.key: entry.value for entry in status.values}
 
     def has_said(self, node: str, text: str) -> bool:
         """Whether `node` has said something with `text`."""
@@ -324,6 +327,64 @@ def test_record_an_excited_robot_then_identify_it_with_what_was_recorded(
         operator.spin_until(lambda: len(models) == 1)
     model = DifferenceEquation.from_document(files.parse_document(models[0].data))
     assert len(model) == 4
+
+
+def test_what_is_recorded_and_excited_is_what_the_configuration_names(
+    operator: Operator, tmp_path: Path
+) -> None:
+    """A robot whose topics have other names, and a recording that goes on while it is identified:
+    the one that is open and the one without a command are left out.
+    """
+    trials = tmp_path / "trials"
+    for k, bag in enumerate(f1tenth()):
+        topics = {"/odom": "/diff/odom", "/cmd_vel": "/diff/cmd_vel"}
+        renamed(bag, trials / bag.name, topics if k else {"/odom": "/diff/odom"})
+    config = tmp_path / "config.yaml"
+    text = (ROOT / "config" / "f1tenth.yaml").read_text()
+    config.write_text(
+        text.replace('"/odom:', '"/diff/odom:').replace('"/cmd_vel:', '"/diff/cmd_vel:')
+    )
+    given = [f"config:={config}", f"trials:={trials}", f"out:={tmp_path / 'out'}"]
+    given += ["excite:=true", "highest:=0.3", "slew:=1.0", "duration:=1.0"]
+    given += [f"bag:={trials / 'trial_new'}"]
+    with live("identify", *given):
+        operator.spin_until(lambda: operator.node.count_publishers("/diff/cmd_vel") == 1)
+        operator.spin_until(lambda: operator.node.count_subscribers("/diff/cmd_vel") == 1)
+        assert operator.node.count_publishers("/cmd_vel") == 0
+        operator.call("/model_identifier/identify")
+        operator.hears("model_identifier", "PROVED")
+        left_out = operator.values["model_identifier"]["left out"]
+        assert "trial_new: it is not closed" in left_out
+        assert "trial_01: it has nothing on /diff/cmd_vel" in left_out
+        assert called("/excitation/start").returncode == 0
+        operator.hears("excitation", "done")
+        operator.waits(0.5)
+        there = called().stdout.split()
+        assert {"/excitation/start", "/model_identifier/identify"} <= set(there)
+        refused = called("/excitation/begin")
+        assert refused.returncode == 2
+        assert "no service /excitation/begin" in refused.stderr
+        assert "/excitation/start" in refused.stderr
+    with Bag(trials / "trial_new") as recorded:
+        assert recorded.count("/diff/cmd_vel") > 30
+        assert "/cmd_vel" not in recorded.topics
+
+
+def called(*service: str) -> "subprocess.CompletedProcess[str]":
+    """`nlsid call`."""
+    command = [sys.executable, "-m", "bags.commands.cli", "call", *service]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
+    """The messages on these topics of a bag, on topics of other names."""
+    with Bag(bag) as source, BagWriter(target) as writer:
+        for message in source.messages():
+            if message.topic in topics:
+                writer.write(
+                    topics[message.topic], message.msgtype, message.data,
+                    log_time_ns=message.log_time_ns, publish_time_ns=message.log_time_ns,
+                )  # fmt: skip
 
 
 def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
