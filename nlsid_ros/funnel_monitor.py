@@ -413,6 +413,17 @@ class FunnelMonitor(ManagedNode):
         message = self._status_message()
         self._diagnostics.publish(message)
         self._events.publish(message)
+        if news and state is not before:
+            self._log(message.status[0])
+
+    def _log(self, said: DiagnosticStatus) -> None:
+        """Into the terminal, for whoever sees nothing else."""
+        if said.level == DiagnosticStatus.OK:
+            self.get_logger().info(said.message, throttle_duration_sec=HEARTBEAT)
+        elif said.level == DiagnosticStatus.ERROR:
+            self.get_logger().error(said.message)
+        else:
+            self.get_logger().warning(said.message, throttle_duration_sec=HEARTBEAT)
 
     def _call_for_help(self) -> None:
         """Have the configured services stop the robot and keep what led here; ask until they do."""

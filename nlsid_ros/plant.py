@@ -21,6 +21,7 @@ from bags.chain import plants
 from bags.chain.joint_bags import COMMANDS, JOINTS, STATES
 from bags.designs.documents import load_model
 from bags.signals.expressions import Expression
+from bags.signals.grid import seconds
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core import files
@@ -35,6 +36,7 @@ from nlsid_ros.running import Arguments, ManagedNode, declare, declare_number, d
 NAME = "plant"
 MUJOCO = {f"mujoco_{name}": robot for name, robot in plants.ROBOTS.items()}
 KINDS = ("model", "vector_field", "pendulum", "satellite", *MUJOCO)
+JUMP = 1.0  # s that the clock may be ahead or behind
 FOR = "for kinds model and vector_field"
 
 
@@ -143,7 +145,6 @@ class PlantNode(ManagedNode):
         self._publisher = self.create_publisher(
             self._response.kind, self.signal_topic(self._response.path.topic), qos.STREAM
         )
-        self._commands: list[tuple[int, FloatArray]] = [(0, np.zeros(self._inputs))]
         self.create_subscription(
             self._command.kind,
             self.signal_topic(self._command.path.topic),
@@ -152,12 +153,17 @@ class PlantNode(ManagedNode):
         )
         self.create_service(Trigger, "~/push", self._on_push)
         self._period_ns = round(self._plant.period * 1e9)
-        self._last_ns: int | None = None
-        self._next_ns = self.get_clock().now().nanoseconds
-        self._push_from_ns = self._push_until_ns = 0
-        self._sent: list[tuple[int, Any]] = []
+        self._begin(self.get_clock().now().nanoseconds)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(min(self._plant.period, 0.005) / 2, self._on_tick, clock=steady)
+
+    def _begin(self, now_ns: int) -> None:
+        """Samples from now on, without a command in force."""
+        self._last_ns: int | None = None
+        self._next_ns = now_ns
+        self._push_from_ns = self._push_until_ns = 0
+        self._commands: list[tuple[int, FloatArray]] = [(0, np.zeros(self._inputs))]
+        self._sent: list[tuple[int, Any]] = []
 
     def _on_command(self, message: Any) -> None:
         try:
@@ -169,8 +175,15 @@ class PlantNode(ManagedNode):
             insort(self._commands, (stamp_ns_of(message), values), key=lambda entry: entry[0])
 
     def _on_tick(self) -> None:
-        """Every sample that is due, and every message whose delay is over."""
+        """Every sample that is due, and every message whose delay is over; anew from now on if the
+        clock jumped, as simulated time does when it begins.
+        """
         now_ns = self.get_clock().now().nanoseconds
+        if abs(now_ns - self._next_ns) > round(JUMP * 1e9) + self._period_ns:
+            self.get_logger().warning(
+                f"this node's clock jumped by {seconds(now_ns, self._next_ns):.3g} s: begun anew"
+            )
+            self._begin(now_ns)
         while self._next_ns <= now_ns:
             self._sample(self._next_ns)
             self._next_ns += self._period_ns

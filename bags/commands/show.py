@@ -251,6 +251,13 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
     for row in catching.rows:
         if row.refused:
             console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    if false := catching.rows[0].funnel.count:
+        console.print(
+            f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "
+            f"{'is' if false == 1 else 'are'} not inside: expect such false alarms on a healthy "
+            "robot; calibrate on more trials like those it will run, or raise safety_factor",
+            soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
+        )  # fmt: skip
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "

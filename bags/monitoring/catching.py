@@ -356,25 +356,29 @@ def _row(
     onsets: Sequence[float],
     detectors: Sequence[Detector],
 ) -> Row:
-    """Counts and delays; an alarm counts from the fault on, or from the first judged sample."""
-    statuses = [run.bad.status for run in runs if run.bad is not None]
+    """Counts and delays; an alarm before the fault, a false one, has not caught it."""
     starts = [
         max(onset, float(run.t[0])) if len(run.t) else onset
         for run, onset in zip(runs, onsets, strict=True)
     ]
-    alarms = [
-        min((r.t for r in (run.bad, run.alarm) if r is not None), default=None) for run in runs
+    said = [
+        [r if r is not None and r.t >= start else None for r in (run.bad, run.alarm)]
+        for run, start in zip(runs, starts, strict=True)
     ]
+    statuses = [bad.status for bad, _ in said if bad is not None]
+    alarms = [min((r.t for r in both if r is not None), default=None) for both in said]
     funnel = Caught(
         statuses.count(Status.OUTSIDE),
         statuses.count(Status.ASSUMPTION_VIOLATED),
         sum(run.lost and run.bad is None and run.alarm is None for run in runs),
         _delay(alarms, starts),
-        sum(run.bad is None and run.alarm is not None for run in runs),
+        sum(bad is None and alarm is not None for bad, alarm in said),
     )
     others = {}
     for detector in detectors:
         times = [_alarm(detector, run) for run in runs]
+        times = [t if t is not None and t >= start else None
+                 for t, start in zip(times, starts, strict=True)]  # fmt: skip
         caught = sum(t is not None for t in times)
         others[detector.name] = Caught(violated=caught, after=_delay(times, starts))
     return Row(fault, funnel, others)

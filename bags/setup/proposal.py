@@ -48,6 +48,8 @@ SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
 RELATED: Final = 0.3  # correlation below which command and response may be unrelated
+STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
+ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
@@ -167,7 +169,11 @@ def propose(
 
 @dataclass(frozen=True)
 class _Read:
-    """What the chosen signals of all bags show: the responses' steps, the commands' ages."""
+    """What the chosen signals of all bags show: the responses' steps, the commands' ages.
+
+    longest_tail: s of responses after the last command, where those have come to an end and the
+    last is not held.
+    """
 
     period: float
     on_grid: float
@@ -176,6 +182,7 @@ class _Read:
     band: float
     command_period: float
     longest_held: float
+    longest_tail: float
     u_ranges: tuple[tuple[float, float], ...]
     topics: int
 
@@ -304,7 +311,7 @@ def _read(
     y_paths = [signal.path for signal in chosen["response"]]
     drives = [factors(signal.path) for signal in chosen["excitation"]]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
-    steps, held, bands, ranges, u_steps = [], [], [], [], []
+    steps, held, tails, bands, ranges, u_steps = [], [], [], [], [], []
     repeated = 0
     for path in bags:
         read = read_signals(
@@ -319,8 +326,12 @@ def _read(
         last = max(int(read[name].stamp_ns[-1]) for name in y_paths)
         for name in u_paths:
             stamps = read[name].stamp_ns
-            ages = np.diff(np.append(stamps[stamps < last], last)) / 1e9
-            held.append(float(ages.max(initial=0.0)))
+            intervals = np.diff(stamps[stamps < last]) / 1e9
+            between = float(intervals.max(initial=0.0))
+            tail = max((last - int(stamps[-1])) / 1e9, 0.0)
+            ended = len(intervals) >= STREAMED and tail > ENDED * between
+            tails.append(tail if ended else 0.0)
+            held.append(between if ended else max(between, tail))
             u_steps.append(np.diff(stamps) / 1e9)
         ranges.append([_range([read[name] for name in parts]) for parts in drives])
     every, u_every = np.concatenate(steps), np.concatenate(u_steps)
@@ -337,6 +348,7 @@ def _read(
         band=float(np.median([b for b in bands if b > 0] or [0.0])),
         command_period=float(np.median(u_every)) if len(u_every) else math.inf,
         longest_held=max(held),
+        longest_tail=max(tails),
         u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
         topics=len({name.partition(":")[0] for name in y_paths}),
     )
@@ -420,6 +432,13 @@ def _say_grid(proposal: Proposal, read: _Read) -> None:
                 f"commands are held for up to {read.longest_held:.3g} s: a lost one is not noticed "
                 "before"
             )
+    if read.longest_tail > grid.get("hold", grid["max_gap"]):
+        grid["split_gaps"] = True
+        why.setdefault("split_gaps", "what comes after the last command is not fitted")
+        walls.append(
+            f"commands end up to {read.longest_tail:.3g} s before the responses do: what the robot "
+            "does there is not fitted, as nothing says what it was told"
+        )
     proposal.content["grid"] = grid
     if read.repeated:
         walls.append(

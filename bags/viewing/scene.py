@@ -5,6 +5,7 @@ nothing: it repeats the monitor's word, and takes it back when the word or the s
 """
 
 import math
+import re
 import threading
 import time
 import unicodedata
@@ -23,7 +24,13 @@ MOST_EVENTS: Final = 200
 MOST_NODES: Final = 32
 LONGEST_TEXT: Final = 300  # characters of anything that came from outside
 WORDS: Final = ("inside", "warning", "unknown", "assumption violated", "outside")
+_NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 MONITORING: Final = ("margin", "assumption", "time_to_exit", "latency")
+
+
+def _cause(text: str) -> str:
+    """A status without its numbers: a cause that lasts is one event, whatever time it names."""
+    return _NUMBER.sub("#", text)
 
 
 class Sample(NamedTuple):
@@ -119,7 +126,7 @@ class Scene:
             self._nodes[node] = Said(level, text, time.monotonic())
             if node == self.monitor and names:
                 self._names = tuple(clean(name) for name in names)
-            if before is None or (before.level, before.text) != (level, text):
+            if before is None or (before.level, _cause(before.text)) != (level, _cause(text)):
                 self._events.append(Event(stamp_ns, level, node, text))
                 self._told += 1
 

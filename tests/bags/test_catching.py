@@ -252,3 +252,23 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert "on average" in width.said
     (errors,), _ = (part.axes for part in draw(found).subfigs)
     assert len(errors.collections) == found.trials
+
+
+def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
+    design: OutputTubeDesign, train: Dataset, held_back: Dataset
+) -> None:
+    """Trials whose sensor jumps at their beginning, long before the sabotage."""
+    jumped = []
+    for trial in held_back:
+        y = trial.y.copy()
+        y[8] += 1.0
+        jumped.append(replace(trial, y=y))
+    found = catches(design, train, Dataset(tuple(jumped)))
+    assert row(found, UNTOUCHED).funnel.count == len(jumped)
+    zero = [r for r in found.rows if r.fault != UNTOUCHED]
+    for caught in (c for r in zero for c in (r.funnel, *r.others.values())):
+        assert not caught.after < 0.0
+    console = Console(record=True, width=100)
+    show.say_catching(console, found, None)
+    said = " ".join(console.export_text().split())
+    assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said

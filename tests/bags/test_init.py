@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
+from bags.chain.training import decoded
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.recordings.bag import Bag
@@ -351,6 +352,34 @@ def thrusters(folder: Path, *, trials: int = 6) -> Path:
                     data = bytes(standard_types().serialize_cdr(number(float(value)), kind))
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
     return folder
+
+
+def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
+    """A base that stops by itself 0.5 s after the last command of a stream, at the bag's end."""
+    bags, config = tmp_path / "bags", tmp_path / "robot.yaml"
+    kind = "std_msgs/msg/Float64"
+    number = standard_types().types[kind]
+    for trial in range(4):
+        rng = np.random.default_rng(trial)
+        command = speed = 0.0
+        with BagWriter(bags / f"run_{trial}") as writer:
+            for k in range(250):
+                command = float(rng.uniform(0.5, 1.0)) if k % 20 == 0 else command
+                command = 0.0 if k > 205 else command
+                speed += 0.2 * (command - speed)
+                values = {"/speed": speed} if k > 200 else {"/speed": speed, "/cmd": command}
+                for topic, value in values.items():
+                    data = bytes(standard_types().serialize_cdr(number(value), kind))
+                    stamp = START_NS + k * 100_000_000
+                    writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    said = nlsid("init", bags, "--out", config, "-u", "/cmd:data", "-y", "/speed:data")
+    assert "commands end up to 4.9 s before the responses do" in said
+    grid = load_config(config).grid
+    assert grid.hold is None
+    assert grid.split_gaps
+    nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
+    trained = decoded((tmp_path / "out" / documents.TRAINING).read_bytes(), source="it")["training"]
+    assert all(trial.u.min() > 0.4 for trial in trained)
 
 
 def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(

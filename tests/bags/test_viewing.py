@@ -128,6 +128,16 @@ def test_another_node_cannot_speak_for_the_monitor() -> None:
     assert shown.verdict().word == "inside", "a crowd does not keep the monitor out"
 
 
+def test_a_cause_that_lasts_is_one_event_whatever_time_it_names(watched: Scene) -> None:
+    told, _ = watched.events_after(0)
+    for t in ("0.3", "1.3", "1e-05", "-2.5"):
+        watched.say(2 * 10**9, "monitor", STALE, f"unknown: speed is nan at t = {t} s")
+    assert watched.events_after(told)[0] == told + 1
+    assert watched.nodes()["monitor"].text.endswith("-2.5 s"), "the newest is what is said"
+    watched.say(3 * 10**9, "monitor", STALE, "unknown: no speed for 0.1 s")
+    assert watched.events_after(told)[0] == told + 2
+
+
 def test_of_too_many_samples_the_worst_are_kept() -> None:
     shown = Scene("a robot", "monitor")
     margins = [0.5] * 1000
@@ -290,6 +300,17 @@ def test_a_browser_shows_the_words_and_takes_inside_back(page: Page, watched: Sc
         assert page.text("#n-margin") == "unknown"
     page.wait(lambda: word() == "no connection")
     assert "what is shown is old" in page.text("#why")
+
+
+@needs_browser
+def test_a_browser_shows_a_recording_that_is_over_as_it_ended(page: Page, watched: Scene) -> None:
+    watched.end("verdict: inside. 2.9 of 2.9 s judged")
+    with serve_page(watched, host=LOCAL, port=0) as address:
+        page.open(address)
+        page.wait(lambda: page.text("#word").lower() == "recording over")
+        assert page.text("#why").startswith("verdict: inside")
+        assert page.text("#n-age") == "the last"
+        assert page.value("document.body.className") == ""
 
 
 @needs_browser

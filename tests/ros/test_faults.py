@@ -72,6 +72,20 @@ def test_a_state_that_cannot_be_trusted_is_named_and_only_a_new_run_is_inside(
         robot.spin_until(lambda: robot.has_said("inside"))
 
 
+def test_the_terminal_says_when_the_robot_leaves(robot: Robot) -> None:
+    with process(MONITOR, __node="talking_monitor", allow_old_stamps=True) as monitor:
+        robot.ready(monitors=2)
+        robot.spin_until(lambda: robot.has_said(" yet", "talking_monitor"))
+        robot.drive(GOOD)
+        robot.spin_until(lambda: robot.has_said("inside", "talking_monitor"))
+        robot.drive([10, 11], speed=1e300)
+        robot.spin_until(lambda: robot.has_said("outside", "talking_monitor"))
+        output = stop(monitor)
+    assert "[INFO]" in next(line for line in output.splitlines() if line.endswith(": inside"))
+    [outside] = [line for line in output.splitlines() if "outside" in line]
+    assert outside.startswith("[ERROR]")
+
+
 def test_messages_that_come_twice_count_once(robot: Robot) -> None:
     robot.restart()
     robot.drive([k for k in range(12) for _ in range(2)], slower=0.5)

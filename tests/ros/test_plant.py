@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -10,12 +11,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
+from builtin_interfaces.msg import Time
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from nlsid_core.arrays import FloatArray
 from nlsid_ros import qos
-from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
 
 pytestmark = ros_test
 MUJOCO = pytest.mark.skipif(
@@ -70,6 +73,30 @@ def heard(
         before = len(ear.t)
         spin_until(lambda: len(ear.t) >= before + samples)
     return ear
+
+
+def test_in_simulated_time_it_begins_when_the_clock_does_and_again_when_it_jumps() -> None:
+    ear = Ear()
+    with (
+        node_here("test_clock") as (node, spin_until),
+        process("nlsid_ros.plant", kind="pendulum", use_sim_time=True) as running,
+    ):
+        clock = node.create_publisher(Clock, "/clock", qos.STREAM)
+        node.create_subscription(JointState, "/joint_states", lambda m: ear.hear(m, 0), qos.STREAM)
+        spin_until(lambda: clock.get_subscription_count() == 1)
+        spin_until(lambda: node.count_publishers("/joint_states") == 1)
+        for start in (10**9, 2 * 10**9, 10**9):
+            sent, count = iter(range(10**6)), len(ear.t)
+
+            def ticks(start: int = start, sent: Iterator[int] = sent, count: int = count) -> bool:
+                sec, centis = divmod(next(sent), 100)
+                clock.publish(Clock(clock=Time(sec=start + sec, nanosec=centis * 10**7)))
+                return len(ear.t) > count + 20
+
+            spin_until(ticks)
+            assert start <= ear.t[-1] < start + 1000
+        stop(running)
+    assert len(ear.t) < 1000, "nothing was made up for in between"
 
 
 def test_a_pendulum_runs_on_an_exact_grid_in_real_time_and_answers_a_torque() -> None:
