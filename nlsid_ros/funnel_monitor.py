@@ -193,6 +193,8 @@ class FunnelMonitor(ManagedNode):
         self._deadlines.clear()
         self._tell(f"no {design.name} yet")
         self.get_logger().info(f"watching {watch.pairing}")
+        if self._forecast and not watch.monitor.goes_on:
+            self.get_logger().warning("no forecasts: they are of tubes around a simulation")
         self._begin()
 
     def _on_news(self) -> None:

@@ -238,9 +238,9 @@ class Watch:
     def forecast(self, steps: int) -> tuple[int, Forecast] | None:
         """The newest judged sample's stamp (ns), and the forecast while its command is held.
 
-        None where there is no sample, or its command is not known.
+        None where there is no sample, its command is not known, or the funnel gives no forecast.
         """
-        if self._held is None:
+        if self._held is None or not self.monitor.goes_on:
             return None
         stamp_ns, u = self._held
         held = np.atleast_1d(np.asarray(u, dtype=np.float64))

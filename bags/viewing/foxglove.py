@@ -102,7 +102,7 @@ def _send(scene: Scene, context: Any, first: threading.Event, closing: threading
         for topic, properties in SCHEMAS.items()
     }
     log = LogChannel(EVENTS, context=context)
-    sampled = told = tick = foreseen_ns = 0
+    sampled = told = tick = foreseen = 0
     newest_ns, before = 0, None
     while not closing.wait(TICK):
         if first.is_set():
@@ -114,8 +114,8 @@ def _send(scene: Scene, context: Any, first: threading.Event, closing: threading
             newest_ns = max(newest_ns, sample.stamp_ns)
             channels[MARGIN].log(_margin(sample), log_time=sample.stamp_ns)
             channels[SIGNALS].log(_signals(sample, scene.names), log_time=sample.stamp_ns)
-        for each in scene.forecasts_after(foreseen_ns):
-            foreseen_ns = max(foreseen_ns, each.stamp_ns)
+        foreseen, forecasts = scene.forecasts_after(foreseen)
+        for each in forecasts:
             ahead = each.numbers.get("ahead", 0.0)
             made_ns = each.stamp_ns - round(ahead * 1e9)
             said_ahead = {"ahead": ahead, "signals": _ends(each, scene.names)}

@@ -106,11 +106,10 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _news(scene: Scene, closing: threading.Event) -> Iterator[dict[str, Any]]:
     """What changed, every TICK; first what is known of the past."""
-    sampled = told = foreseen_ns = 0
+    sampled = told = foreseen = 0
     most, wait = PER_START, 0.0
     while not closing.wait(wait):
-        forecasts = scene.forecasts_after(foreseen_ns)
-        foreseen_ns = max([foreseen_ns, *(each.stamp_ns for each in forecasts)])
+        foreseen, forecasts = scene.forecasts_after(foreseen)
         sampled, samples = scene.samples_after(sampled, most)
         told, events = scene.events_after(told)
         verdict, now = scene.verdict(), time.monotonic()

@@ -93,7 +93,8 @@ class Scene:
         self._nodes: dict[str, Said] = {}
         self._names: tuple[str, ...] = ()
         self._ended = ""
-        self._sampled = self._told = 0  # how many samples and events there have been
+        # How many samples, forecasts and events there have been.
+        self._sampled = self._foreseen = self._told = 0
 
     def sample(self, stamp_ns: int, numbers: Mapping[str, float]) -> None:
         """A sample was judged."""
@@ -105,11 +106,13 @@ class Scene:
         """Said of a sample that has not come yet."""
         with self._lock:
             self._forecasts.append(Sample(stamp_ns, time.monotonic(), dict(numbers)))
+            self._foreseen += 1
 
-    def forecasts_after(self, stamp_ns: int) -> list[Sample]:
-        """Those about a later stamp."""
+    def forecasts_after(self, seen: int) -> tuple[int, list[Sample]]:
+        """How many there have been, and those after the first `seen` ones that are still kept."""
         with self._lock:
-            return [each for each in self._forecasts if each.stamp_ns > stamp_ns]
+            fresh = min(self._foreseen - seen, len(self._forecasts))
+            return self._foreseen, list(self._forecasts)[len(self._forecasts) - fresh :]
 
     def say(
         self, stamp_ns: int, node: str, level: int, text: str, *, names: Sequence[str] = ()

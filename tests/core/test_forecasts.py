@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.design import OutputTubeDesign
+from nlsid_core.errors import DataError
 from nlsid_core.funnels.level import LevelMeter
 from nlsid_core.funnels.tube import TubeFunnel
+from nlsid_core.running.comparison import Centre
 from nlsid_core.running.forecast import Forecast, linear_form, reach
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
@@ -203,3 +206,16 @@ def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:
     for k in range(20):
         monitor.update(k * model.period, np.zeros(1), np.zeros(1))
     assert "outside the box" in monitor.forecast(np.full((3, 1), 50.0)).reason
+
+
+def test_around_a_plan_there_is_no_forecast(planned: OutputTubeDesign) -> None:
+    monitor = Monitor(planned.model, planned.policy, planned.funnel, centre=Centre.PROFILE)
+    with pytest.raises(DataError, match="around the model's simulation"):
+        monitor.ahead()
+
+
+@pytest.fixture
+def planned(request: pytest.FixtureRequest) -> OutputTubeDesign:
+    """The tube around a plan that `tests/conftest.py` designs."""
+    found: OutputTubeDesign = request.getfixturevalue("design")
+    return found
