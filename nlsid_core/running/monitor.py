@@ -84,7 +84,8 @@ class Monitor:
     ) -> "Monitor":
         """One robot against several funnels of tubes of its model at once; see `readings`.
 
-        Ten cost little more than one.
+        Ten cost little more than one. In motion (`Centre.MOTION`) they begin together, once the
+        start that fades most slowly has faded.
         """
         if not pairs:
             raise DataError("no funnel to hold the state against")

@@ -8,6 +8,7 @@ from nlsid_core.errors import CertificateMismatch, DataError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from tests.conftest import synthetic_dataset
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def designs(design: OutputTubeDesign, train: Dataset) -> list[OutputTubeDesign]:
     ]
 
 
-@pytest.mark.parametrize("centre", list(Centre))
+@pytest.mark.parametrize("centre", [centre for centre in Centre if centre is not Centre.MOTION])
 @pytest.mark.parametrize("scale", [1.0, 0.6])
 def test_a_bank_reads_bit_for_bit_what_each_monitor_reads_alone(
     designs: list[OutputTubeDesign], train: Dataset, centre: Centre, scale: float
@@ -48,6 +49,26 @@ def test_a_bank_reads_bit_for_bit_what_each_monitor_reads_alone(
             seen |= {reading.status for reading in together}
     assert Status.UNKNOWN in seen, "samples that start a run"
     assert len(seen) >= 2
+
+
+def test_a_bank_of_a_robot_in_motion_begins_when_the_slowest_start_has_faded(
+    designs: list[OutputTubeDesign],
+) -> None:
+    [trial] = synthetic_dataset(0.01, trials=1, samples=400)
+    bank = Monitor.of_several(
+        designs[0].model, [(d.policy, d.funnel) for d in designs], centre=Centre.MOTION
+    )
+    alone = [Monitor(d.model, d.policy, d.funnel, centre=Centre.MOTION) for d in designs]
+    samples = list(zip(trial.t, trial.y[:, 0], trial.u[:, 0], strict=True))
+    begun = [
+        next(k for k, sample in enumerate(samples)
+             if monitor.update(*sample).status is not Status.UNKNOWN)
+        for monitor in alone
+    ]  # fmt: skip
+    assert min(begun) < max(begun)
+    for k, sample in enumerate(samples):
+        unknown = {reading.status is Status.UNKNOWN for reading in bank.readings(*sample)}
+        assert unknown == {k < max(begun)}
 
 
 def test_a_bank_refuses_no_funnel_and_another_models_funnel(
