@@ -75,5 +75,5 @@ class Reading(NamedTuple):
 
 
 def unsaid(value: object) -> str:
-    """Why a number of a signal is none, for people; NaN stands for one that did not come too."""
+    """Why an input is none, for people; NaN stands for one that did not come too."""
     return "missing, or not a number" if value is None or value != value else f"it is {value}"

@@ -181,10 +181,11 @@ class TubeRun:
             return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
         if all(map(math.isfinite, (*y.tolist(), *u.tolist()))):
             return ""
-        for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
+        for values, signals, why in ((y, self._stepper.y, "it is {}".format),
+                                     (u, self._stepper.u, unsaid)):  # fmt: skip
             for value, signal in zip(values.tolist(), signals, strict=True):
                 if not math.isfinite(value):
-                    return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
+                    return f"no {signal.name} at t = {t:g} s ({why(value)}): nothing is claimed"
         return ""
 
     def _without(self, u: FloatArray, fault: str) -> str:
