@@ -222,9 +222,9 @@ def test_a_type_that_the_bag_does_not_define_is_read_from_its_msg_file(tmp_path:
     assert values.tolist() == np.arange(50.0).tolist()
 
 
+@pytest.mark.pictures
 @pytest.mark.parametrize("name", ["a.png", "a.html", "a.svg"])
 def test_a_plot_is_a_picture(bag: Path, tmp_path: Path, name: str) -> None:
-    pytest.importorskip("matplotlib")
     run("plot", bag, "--out", tmp_path / name, "-s", SPEED, "-s", f"{SPEED}|derivative(0.2 s)")
     content = (tmp_path / name).read_bytes()
     assert content.startswith(b"\x89PNG" if name.endswith("png") else b"<")
