@@ -17,6 +17,7 @@ from nlsid_core.models import DifferenceEquation
 
 # A shell's background jobs ignore interrupts, and so would every process the tests start from one.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and under nohup those that a closed terminal sends
 
 # Tests in which pages and pictures are drawn. In others the commands find no matplotlib, as where
 # it is not installed: drawing takes half of their time.
