@@ -16,7 +16,7 @@ from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
-from bags.signals.grid import read_dataset, skipped_samples
+from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
@@ -36,9 +36,10 @@ LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """The bags' trials by what they are for, and how many samples were skipped in gaps.
+    """The bags' trials by what they are for.
 
-    absent: names in the configuration's split that none of the bags has.
+    skipped: samples that were left out in gaps; filled: those nobody measured. absent: names
+    in the configuration's split that none of the bags has.
     """
 
     train: Dataset
@@ -46,6 +47,7 @@ class Trials:
     validation: Dataset | None = None
     calibration: Dataset | None = None
     skipped: int = 0
+    filled: int = 0
     absent: tuple[str, ...] = ()
 
     @property
@@ -212,7 +214,8 @@ def by_use(labelled: Dataset, config: Config) -> Trials:
         )
     named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
-    return replace(trials, skipped=skipped_samples(labelled), absent=absent)
+    skipped, filled = skipped_samples(labelled), filled_samples(labelled)
+    return replace(trials, skipped=skipped, filled=filled, absent=absent)
 
 
 def _labelled(

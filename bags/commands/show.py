@@ -18,6 +18,7 @@ from bags.monitoring.catching import WIDE, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.signals.sampling import said_filled
 from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
@@ -92,6 +93,8 @@ def notes(result: Identified) -> list[str]:
         lines += str(scores).splitlines()
     if result.trials.skipped:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
+    if said := said_filled(result.trials.filled, sum(map(len, result.trials.every))):
+        lines.append(said)
     lines += result.trials.apart
     if result.trials.absent:
         lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")

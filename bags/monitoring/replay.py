@@ -14,6 +14,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
+from bags.signals.sampling import FILLED, MOST_FILLED, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -63,12 +64,28 @@ class Replay:
         return found
 
     @property
+    def filled(self) -> int:
+        """How many samples nobody measured: they are filled in between others, and not judged."""
+        return sum(map(_filled, self.readings))
+
+    @property
+    def said_filled(self) -> str:
+        """The same in words, of how many; empty if there is none."""
+        count = sum(not _starting(reading) for reading in self.readings)
+        return said_filled(self.filled, count)
+
+    @property
     def unjudged(self) -> tuple[Reading, ...]:
         """The first reading of every stretch that was not judged, starts left out.
 
-        Of samples that never came, one that says so.
+        Of samples that never came, one that says so; of filled ones, one where they are more than
+        MOST_FILLED of all.
         """
         said, found = "", []
+        if self.filled > MOST_FILLED * len(self.readings):
+            first = next(filter(_filled, self.readings))
+            reason = f"{self.said_filled}: more than {100 * MOST_FILLED:g} %"
+            found.append(first._replace(reason=reason))
         before: Reading | None = None
         for reading in self.readings:
             starts = before is not None and _starting(before) and _starting(reading)
@@ -114,7 +131,8 @@ class Replay:
     def verdict(self) -> str:
         """The status at the first bad sample, else inside, else unknown.
 
-        Inside says that every sample was judged; those that start a run are not counted.
+        Inside says that every sample was judged; those that start a run are not counted, nor up to
+        MOST_FILLED that are filled in.
         """
         if self.first_bad is not None:
             return self.first_bad.status.value
@@ -135,8 +153,12 @@ def _starting(reading: Reading) -> bool:
     return reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
 
 
+def _filled(reading: Reading) -> bool:
+    return reading.reason.startswith(FILLED)
+
+
 def _unjudged(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and not _starting(reading)
+    return reading.status is Status.UNKNOWN and not _starting(reading) and not _filled(reading)
 
 
 def replay_bag(

@@ -58,7 +58,8 @@ class Watch:
     A run begins with the first complete sample, or, if `announced`, at the stamp given to `begin`;
     the samples before it then give the observer its state, and runs may follow each other. Time in
     the readings is s since the run's first sample or announced start. steps: samples that a
-    forecast is followed for before the next one, in `forecasts`; 0: none is made. `pairing.check`
+    forecast is followed for before the next one, in `forecasts`; 0: none is made. samples: of the
+    run so far; filled: those of them that nobody measured (`Sample.filled`). `pairing.check`
     says whether messages have the signals, `pairing.stamp` which of their times is the stamp.
     """
 
@@ -93,6 +94,7 @@ class Watch:
         self.monitor.restart()
         self._alarm.restart()
         self.origin_ns: int | None = None
+        self.samples = self.filled = 0
         self._newest_ns = 0
         self._newest: dict[str, tuple[int, tuple[float, ...]]] = {}  # of each response topic
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
@@ -213,7 +215,13 @@ class Watch:
             ):
                 reading = self.monitor.missing(t, sample.missing)
             else:
-                reading = self.monitor.update(t, y, u)
+                reading = (
+                    self.monitor.unmeasured(t, u, sample.filled)
+                    if sample.filled
+                    else self.monitor.update(t, y, u)
+                )
+                self.samples += 1
+                self.filled += bool(sample.filled)
                 self._held = sample.stamp_ns, u
                 if self._steps:
                     self._look_ahead(reading, np.atleast_1d(u))

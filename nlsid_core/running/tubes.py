@@ -149,6 +149,12 @@ class TubeRun:
             self._begin(reason)
         return Reading(t, Status.UNKNOWN, reason=reason)
 
+    def unmeasured(self, t: float, u: Any, reason: str) -> Reading:
+        """The reading at t (s) where nobody measured the outputs: a step with e = 0 under u."""
+        nothing = np.full(len(self._names), np.nan)
+        fault = self._take(t) or self._without(np.array(u, dtype=np.float64, ndmin=1), reason)
+        return self._unknown(t, nothing, fault or reason)[0]
+
     def _take(self, t: float) -> str:
         """Count the sample stamped t; a new run starts where some before it did not come."""
         if not math.isfinite(t):
