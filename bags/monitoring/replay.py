@@ -18,7 +18,7 @@ from bags.signals.sampling import FILLED, MOST_FILLED, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading, Status, cause
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -95,7 +95,7 @@ class Replay:
                     reason = f"{lost} samples are missing"
                     t = before.t + self.period
                     found.append(Reading(t, Status.UNKNOWN, reason=reason))
-            again, said = said, reading.reason if _unjudged(reading) else ""
+            again, said = said, cause(reading.reason) if _unjudged(reading) else ""
             if said and said != again:
                 found.append(reading)
             before = reading

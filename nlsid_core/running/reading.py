@@ -1,9 +1,12 @@
 """`Reading`: what a monitor says of one sample, whatever the kind of funnel."""
 
 import math
+import re
 from collections.abc import Sequence
 from enum import Enum
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+_NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 
 
 class Status(Enum):
@@ -72,6 +75,11 @@ class Reading(NamedTuple):
             values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
             values[f"measured[{i}]"] = self.measured[i]
         return values
+
+
+def cause(text: str) -> str:
+    """A reason without its numbers: a cause that lasts is one, whatever time it names."""
+    return _NUMBER.sub("#", text)
 
 
 def unsaid(value: object) -> str:

@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bags.designs.design import WiredDesign
-from bags.monitoring.replay import replay_messages
+from bags.monitoring.replay import Replay, replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
-from bags.signals.grid import read_dataset
+from bags.signals.grid import filled_samples, read_dataset
 from bags.signals.reader import read_signals
 from bags.signals.sampling import Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
@@ -37,6 +37,7 @@ from tests.bag_messages import (
     header,
     odometry,
     serialised,
+    speed_bag,
     twist,
 )
 
@@ -69,6 +70,13 @@ def brute(signal: str, values: Series, at: int) -> float:
     if not after or after[0][0] - t0 > round(rule.window * 1e9):
         return math.nan
     return v0 + (after[0][1] - v0) * ((at - t0) / (after[0][0] - t0))
+
+
+def is_bridged(values: Series, at: int, period_ns: int) -> bool:
+    """Whether `at` is on no message, and those around it are more than 1.5 periods apart."""
+    before = [stamp for stamp, _ in values if stamp <= at]
+    after = [stamp for stamp, _ in values if stamp > at]
+    return before[-1] != at and 2 * (after[0] - before[-1]) > 3 * period_ns
 
 
 def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Sample]:
@@ -109,6 +117,9 @@ def test_samples_are_what_the_rule_says_in_any_order_of_arrival(seed: int, rule:
     for sample, (_, values) in zip(given, truth, strict=True):
         assert np.array_equal([*sample.y, *sample.u], values, equal_nan=True)
         assert bool(sample.missing) is not bool(np.isfinite(values).all())
+        known = rule != "none" and not sample.missing
+        bridged = [known and is_bridged(c, sample.stamp_ns, 10 * MS) for c in columns[:-1]]
+        assert bool(sample.filled) is any(bridged)
 
 
 @settings(max_examples=40, deadline=None)
@@ -344,6 +355,45 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     trial = data.trajectories[0]
     assert [list(entry.reading.measured) for entry in said] == trial.y.tolist()
     assert {entry.reading.status for entry in said[4:388]} == {Status.INSIDE}
+
+
+@pytest.mark.parametrize(
+    ("lost", "verdict"), [((50,), Status.INSIDE), (range(50, 120, 2), Status.UNKNOWN)]
+)
+def test_samples_that_nobody_measured_are_counted_and_not_judged(
+    tmp_path: Path, lost: Sequence[int], verdict: Status
+) -> None:
+    """By identification and by the monitor alike; the rest of the run is judged as before."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 40), 10)
+    y = np.zeros_like(u)
+    for k in range(len(u) - 1):
+        y[k + 1] = 0.8 * y[k] + 0.2 * u[k] + 1e-3 * rng.standard_normal()
+    whole, lossy = tmp_path / "whole", tmp_path / "lossy"
+    speed_bag(whole, y, u)
+    speed_bag(lossy, y, u, lost=lost)
+    data, gappy = (
+        read_dataset(
+            [bag], responses=[SPEED], excitations=[COMMAND], max_gap=0.08, resample="linear"
+        )
+        for bag in (whole, lossy)
+    )
+    assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
+    model = replace(identify(data, LinearClass(1)).model, training="sha256:0")
+    made = design_output_tube(model, data)
+    design = WiredDesign(made.model, made.policy, made.funnel)
+    before, after = (replay_messages(design, bag) for bag in (whole, lossy))
+    assert len(before) == len(after) == len(u)
+    assert [entry.reading for entry in after[:50]] == [entry.reading for entry in before[:50]]
+    unmeasured = {k for k, e in enumerate(after) if e.reading.reason.startswith("filled in: /odom")}
+    assert unmeasured == set(lost)
+    assert {after[k].reading.status for k in unmeasured} == {Status.UNKNOWN}
+    judged = [e.reading.status for k, e in enumerate(after) if k > 0 and k not in unmeasured]
+    assert set(judged) == {Status.INSIDE}
+    readings = tuple(entry.reading for entry in after)
+    replay = Replay("lossy", readings, (), "speed", "m/s", 1.0, period=0.025)
+    assert (replay.filled, replay.verdict) == (len(lost), verdict.value)
+    assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
 
 
 def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
