@@ -57,10 +57,11 @@ class Watch:
 
     A run begins with the first complete sample, or, if `announced`, at the stamp given to `begin`;
     the samples before it then give the observer its state, and runs may follow each other. Time in
-    the readings is s since the run's first sample or announced start. steps: samples that a
-    forecast is followed for before the next one, in `forecasts`; 0: none is made. samples: of the
-    run so far; filled: those of them that nobody measured (`Sample.filled`). `pairing.check`
-    says whether messages have the signals, `pairing.stamp` which of their times is the stamp.
+    the readings is s since the run's first sample or announced start. samples: of the
+    run so far; filled: those of them that are filled in, and so not judged (`Sample.filled`).
+    steps: samples that a forecast is followed for before the next one, in `forecasts`; 0: none is
+    made. `pairing.check` says whether messages have the signals, `pairing.stamp` which of their
+    times is the stamp.
     """
 
     def __init__(

@@ -258,13 +258,16 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
 
 
 def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
-    unstamped = []
+    unstamped: dict[str, str] = {}
     for signals in chosen.values():
         for expression in (e for signal in signals for e in parse_factors(signal.path)):
             msgtype, types = bag.types_on(expression.path.topic)
             expression.path.check(msgtype, types)
+            named = f"{expression.path.topic} ({msgtype})"
             if not is_stamped(msgtype, types) and msgtype != "tf2_msgs/msg/TFMessage":
-                unstamped.append(f"{expression.path.topic} ({msgtype})")
+                unstamped[named] = "has no header stamp"
+            elif _stamps_are_zero(bag, expression.path):
+                unstamped[named] = "has header stamps that are all 0"
             if msgtype not in standard_types().fielddefs:
                 proposal.walls.append(
                     f"{expression.path.topic} is of type {msgtype}: live, its package has to be "
@@ -272,10 +275,10 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
                 )
     proposal.content["clock"] = "log" if unstamped else "header"
     if unstamped:
-        names = ", ".join(dict.fromkeys(unstamped))
-        proposal.why["clock"] = f"{names} has no header stamp"
+        said = ", ".join(f"{name} {why}" for name, why in unstamped.items())
+        proposal.why["clock"] = said
         proposal.walls.append(
-            f"{names} has no header stamp: samples are paired by the times of logging, live of "
+            f"{said}: samples are paired by the times of logging, live of "
             "arrival, whose jitter becomes part of the model's error"
         )
         pace = _pace(bag)
@@ -286,6 +289,12 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
                 "use_sim_time goes by the simulated one; record with `ros2 bag record "
                 "--use-sim-time`, or give commands a header"
             )
+
+
+def _stamps_are_zero(bag: Bag, path: SignalPath) -> bool:
+    """Whether the publisher of a signal does not fill its header stamps in."""
+    stamps = read_columns(bag, {str(path): path})[path.topic].stamp_ns
+    return stamps is not None and len(stamps) > 0 and not stamps.any()
 
 
 def _pace(bag: Bag) -> float:

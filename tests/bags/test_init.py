@@ -382,6 +382,19 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     assert all(trial.u.min() > 0.4 for trial in trained)
 
 
+def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
+    """A publisher that does not fill them in: identification would refuse them."""
+    rng = np.random.default_rng(4)
+    for name in ("a", "b"):
+        u = np.repeat(rng.uniform(-1.0, 1.0, 20), 10)
+        y = np.convolve(u, 0.2 * 0.8 ** np.arange(60))[: len(u)]
+        speed_bag(tmp_path / name, y, u, stamps_ns=[0] * len(u))
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", CMD, "-y", SPEED, "--out", config)
+    assert load_config(config).clock == "log"
+    assert "/odom (nav_msgs/msg/Odometry) has header stamps that are all 0" in said
+
+
 def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(
     tmp_path: Path,
 ) -> None:
