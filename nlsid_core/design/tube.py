@@ -207,7 +207,7 @@ def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: in
         spent, single = energy(e, tube), np.einsum("ti,ij,tj->t", e, tube.R, e)
         if tube.follows is not None:
             g = tube.follows.along(trial.u)[settling:, 0]
-            spent, single = spent / g, single / g
+            spent, single = spent / g, single / np.maximum(g, 1.0)
         measured = max(measured, float(spent[: tube.samples].max()))
         largest = max(largest, float(single.max()))
     measured, largest = _above(measured), _above(largest)

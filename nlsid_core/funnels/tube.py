@@ -22,7 +22,7 @@ KIND = "tube"
 
 @dataclass(frozen=True)
 class Peak:
-    """e'R e <= level g at every sample, g that of the tube's own level.
+    """e'R e <= level max(1, g) at every sample, g that of the tube's own level.
 
     level = safety_factor² · measured, the largest on the trials and with the factor of its tube.
     """
@@ -103,7 +103,8 @@ class Tube:
         if self.samples is not None:
             return f"Σ {energy} ≤ {self.level:.4g} over {self.samples} samples"
         g, where = (" g", ", g of the commands") if self.follows is not None else ("", "")
-        peak = "" if self.peak is None else f", {energy} ≤ {self.peak.level:.4g}{g}"
+        most = " max(1, g)" if g else ""
+        peak = "" if self.peak is None else f", {energy} ≤ {self.peak.level:.4g}{most}"
         return f"E ≤ {self.level:.4g}{g}, E⁺ = {self.rho:.4g} E + {energy}{peak}{where}"
 
     def document(self) -> Json:

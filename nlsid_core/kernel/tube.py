@@ -31,7 +31,7 @@ MAX_PLAN = 10**6  # samples of a plan
 class Assumption:
     """E <= level g, with what measured it. samples: None is for ever, else an energy's (ρ = 1).
 
-    follows: g, 1 if it is None. peak: e'Re <= peak g at every sample, and what measured it.
+    follows: g, 1 if it is None. peak: e'Re <= peak max(1, g), and what measured it.
     """
 
     level: Fraction
@@ -347,7 +347,7 @@ def _assumed(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own:
     said = [f"innovation energy{whose}: {bound} ({calibration(assumed.measured, fitted_to)})"]
     if assumed.peak is not None:
         peak, measured = assumed.peak
-        room = " g" if assumed.follows else ""
+        room = " max(1, g)" if assumed.follows else ""
         most = Signal("", unit).quantity(text.below(peak))
         bound = f"{energy} <= {most}{room} at every sample"
         said.append(f"innovation peak{whose}: {bound} ({calibration(measured, fitted_to)})")

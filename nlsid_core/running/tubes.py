@@ -279,7 +279,7 @@ class TubeRun:
             self._spent = self._rho * self._spent + used
             sizes = np.abs(deviation) / widths
             spent = (self._spent / level).tolist()
-            peaks = (used / (self._peak * g)).tolist()
+            peaks = (used / (self._peak * np.maximum(g, 1.0))).tolist()
         self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         nominal = tuple(simulated.tolist())
@@ -441,7 +441,7 @@ class Ahead:
         left = run._level * g * (1.0 + OUTWARD) - run._rho**self.steps * self._spent * (
             1.0 - OUTWARD
         )
-        self._total = run._rho * self._total + g
+        self._total = run._rho * self._total + np.maximum(g, 1.0)
         left = np.minimum(left, run._peak * self._total * (1.0 + OUTWARD))
         lasting = run._lasting(self._funnel, self._k + self.steps)
         if not lasting or not (left[lasting] >= 0.0).all():

@@ -58,7 +58,7 @@ def attack(
         direction = away if kind == "sign" else rng.normal(size=p)
         part = {"spent": float(rng.random() < 0.1), "random": rng.random(), "sign": 1.0}[kind]
         if tube.peak is not None:
-            left = min(left, tube.peak.level * level / tube.level * (1.0 - 1e-9))
+            left = min(left, tube.peak.level * max(1.0, level / tube.level) * (1.0 - 1e-9))
         e = direction * np.sqrt(part * left / (direction @ tube.R @ direction))
         spent = tube.rho * spent + float(e @ tube.R @ e)
         y[k], x[0] = outputs[0] + e, x[0] + tube.L @ e
@@ -167,7 +167,7 @@ def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: s
     assert (with_peak.high <= without.high).all()
     (predicted,), _ = stepper.advance(x, u[lags + 1])
     g = 1.0 if tube.follows is None else float(tube.follows.along(u)[lags + 1, 0])
-    most = np.sqrt(g * tube.peak.level * np.diag(np.linalg.inv(tube.R)))
+    most = np.sqrt(max(g, 1.0) * tube.peak.level * np.diag(np.linalg.inv(tube.R)))
     least = np.minimum(most, np.sqrt(g) * tube.half_widths)
     assert (with_peak.high[0] >= predicted + (1.0 - 1e-7) * least).all()
     assert (with_peak.high[0] <= predicted + (1.0 + 1e-7) * most).all()

@@ -69,7 +69,7 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
     g: FloatArray = np.ones(len(E))
     if tube.follows is not None:
         g = tube.follows.along(trial.u)[settling:, 0]
-    peaks = np.einsum("ti,ij,tj->t", e, tube.R, e) / tube.peak.level / g
+    peaks = np.einsum("ti,ij,tj->t", e, tube.R, e) / tube.peak.level / np.maximum(g, 1.0)
     error = innovations(made.model, 0 * tube.L[None], trial, settling)[:, 0]
     response = made.funnel.response
     assert response is not None
@@ -101,7 +101,7 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
         made.funnel, tubes=(replace(tube, level=100.0 * tube.level),), response=None, cusum=None
     )
     innovation = np.array(run(monitor_of(name), trial)[k].deviation[-len(tube.R) :])
-    g = 1.0 if tube.follows is None else float(tube.follows.along(trial.u)[k, 0])
+    g = 1.0 if tube.follows is None else max(1.0, float(tube.follows.along(trial.u)[k, 0]))
     direction = np.arange(1.0, 1.0 + len(tube.R))
     most = direction * np.sqrt(tube.peak.level * g / (direction @ tube.R @ direction))
     for part, status in ((0.99, Status.INSIDE), (1.01, Status.ASSUMPTION_VIOLATED)):
