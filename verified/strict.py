@@ -329,7 +329,7 @@ MEASURED = "measured safety_factor designed_on measured_on"
 
 def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
     """One tube."""
-    members(value, where, TUBE, "" if planned else "follows")
+    members(value, where, TUBE, "peak" if planned else "follows peak")
     n, p = sizes.n, sizes.p
     for name, rows, columns in (("L", n, p), ("P", n, n), ("R", p, p)):
         matrix(value[name], f"{where}.{name}", rows, columns)
@@ -347,6 +347,10 @@ def tube(value: Any, where: str, sizes: Sizes, planned: bool) -> None:
     need((rho == 1) == (kind == "energy"), f"{where}: rho is 1 exactly for an energy")
     found, factor = measured(given, f"{where}.assumption")
     need(level >= factor**2 * found, f"{where}: the level is below what was measured")
+    if "peak" in value:
+        peak = members(value["peak"], f"{where}.peak", "level measured")
+        most, largest = (real(peak[name], f"{where}.peak.{name}") for name in ("level", "measured"))
+        need(0 <= factor**2 * largest <= most, f"{where}: the peak is below what was measured")
     if "follows" in value:
         need(kind == "fading" and inlet == 0, f"{where}: only a fading level follows commands")
         follows(value["follows"], f"{where}.follows", sizes.inputs, 1)

@@ -30,7 +30,7 @@ from nlsid_core.design.tube_program import Found, gramian, solved
 from nlsid_core.designs import Design
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
 from nlsid_core.funnels.factor import refuse_unmonitorable
-from nlsid_core.funnels.tube import Cusum, Response, Tube, TubeFunnel
+from nlsid_core.funnels.tube import Cusum, Peak, Response, Tube, TubeFunnel
 from nlsid_core.kernel import Rejected
 from nlsid_core.models import BlockCascade, DifferenceEquation, ImplicitModel, StableModel
 from nlsid_core.policies.tube import TubePolicy
@@ -152,7 +152,7 @@ def design_output_tube(
             tube = replace(tube, follows=followed(spent, u, always=level == "commands"))
         tubes.append(scaled_to(tube, model, trials.calibration, settling))
     if profile is not None:  # what is assumed around a plan is what is held there
-        return proved(tubes, found)
+        return proved([replace(tube, peak=None) for tube in tubes], found)
     errors = [innovations(model, np.zeros((1, *gains[0].shape)), t, settling)[:, 0] for t in train]
     response = Response(
         np.ones(len(amplitudes)), 0.0, safety_factor, trials.designed_on, trials.measured_on,
@@ -200,18 +200,22 @@ def least_window(model: StableModel, train: Dataset, horizon: float | None = Non
 
 
 def scaled_to(tube: Tube, model: StableModel, calibration: Dataset, settling: int) -> Tube:
-    """The tube with its level and half-widths from these trials, rounded up."""
-    measured = 0.0
+    """The tube with its level, half-widths and, if it lasts, peak from these trials, rounded up."""
+    measured = largest = float(np.finfo(float).tiny)
     for trial in calibration:
-        spent = energy(innovations(model, tube.L[None], trial, settling)[:, 0], tube)
+        e = innovations(model, tube.L[None], trial, settling)[:, 0]
+        spent, single = energy(e, tube), np.einsum("ti,ij,tj->t", e, tube.R, e)
         if tube.follows is not None:
-            spent = spent / tube.follows.along(trial.u)[settling:, 0]
+            g = tube.follows.along(trial.u)[settling:, 0]
+            spent, single = spent / g, single / np.maximum(g, 1.0)
         measured = max(measured, float(spent[: tube.samples].max()))
-    measured = _above(max(measured, float(np.finfo(float).tiny)))
+        largest = max(largest, float(single.max()))
+    measured, largest = _above(measured), _above(largest)
     level = _above(tube.safety_factor**2 * measured)
+    peak = Peak(_above(tube.safety_factor**2 * largest), largest)
     widths = np.sqrt((level + tube.rho * tube.inlet) / tube.tau)
     return replace(
-        tube, measured=measured, level=level,
+        tube, measured=measured, level=level, peak=peak if tube.samples is None else None,
         half_widths=np.array([_rounded_up(float(width)) for width in widths]),
     )  # fmt: skip
 

@@ -20,6 +20,21 @@ FORMAT = "nlsid/funnel"
 KIND = "tube"
 
 
+@dataclass(frozen=True)
+class Peak:
+    """e'R e <= level max(1, g) at every sample, g that of the tube's own level.
+
+    level = safety_factor² · measured, the largest on the trials and with the factor of its tube.
+    """
+
+    level: float
+    measured: float
+
+    def __post_init__(self) -> None:
+        if not self.level > 0.0:
+            raise DataError(f"the level of a peak is {self.level}; it should be positive")
+
+
 @dataclass(frozen=True, eq=False)
 class Tube:
     """|y_j - y°_j| <= half_widths_j while E <= level, E+ = rho E + e'R e from 0.
@@ -30,7 +45,8 @@ class Tube:
     safety_factor² · measured, the largest E on the trials `measured_on`; `designed_on` are those
     that L, rho, P, R were chosen on; each (name, digest). inlet: V = x̄'Px̄ that the start may have.
     With `follows`, level is multiplied at every sample by g, its one row; half_widths are those
-    where g = 1, which it is on average over the trials of the design.
+    where g = 1, which it is on average over the trials of the design. peak: what else is assumed,
+    of single samples.
 
     Raises ShapeError or DataError on numbers that do not fit.
     """
@@ -49,6 +65,7 @@ class Tube:
     samples: int | None = None
     inlet: float = 0.0
     follows: CommandLevel | None = None
+    peak: Peak | None = None
 
     def __post_init__(self) -> None:
         n, p = len(self.P), len(self.R)
@@ -85,16 +102,20 @@ class Tube:
         energy = "e'Re" if len(self.R) > 1 else "e²"
         if self.samples is not None:
             return f"Σ {energy} ≤ {self.level:.4g} over {self.samples} samples"
-        room = " g, g of the commands" if self.follows is not None else ""
-        return f"E ≤ {self.level:.4g}{room}, E⁺ = {self.rho:.4g} E + {energy}"
+        g, where = (" g", ", g of the commands") if self.follows is not None else ("", "")
+        most = " max(1, g)" if g else ""
+        peak = "" if self.peak is None else f", {energy} ≤ {self.peak.level:.4g}{most}"
+        return f"E ≤ {self.level:.4g}{g}, E⁺ = {self.rho:.4g} E + {energy}{peak}{where}"
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
         kind: Json = {"kind": "fading"}
         if self.samples is not None:
             kind = {"kind": "energy", "samples": self.samples}
-        follows: Json = {} if self.follows is None else {"follows": self.follows.document()}
-        return follows | {
+        beside: Json = {} if self.follows is None else {"follows": self.follows.document()}
+        if self.peak is not None:
+            beside["peak"] = {"level": self.peak.level, "measured": self.peak.measured}
+        return beside | {
             "rho": self.rho,
             "level": self.level,
             "inlet": self.inlet,
@@ -301,6 +322,16 @@ def _tube(document: Any, source: str) -> Tube:
         samples=samples,
         inlet=files.number(document, "inlet", source=source),
         follows=_follows(document, source),
+        peak=_peak(document, source),
+    )
+
+
+def _peak(document: Json, source: str) -> Peak | None:
+    if "peak" not in document:
+        return None
+    given = files.member(document, "peak", dict, source=source)
+    return Peak(
+        *(files.number(given, key, source=f"{source} peak") for key in ("level", "measured"))
     )
 
 

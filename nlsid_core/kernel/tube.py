@@ -31,13 +31,14 @@ MAX_PLAN = 10**6  # samples of a plan
 class Assumption:
     """E <= level g, with what measured it. samples: None is for ever, else an energy's (ρ = 1).
 
-    follows: g, 1 if it is None.
+    follows: g, 1 if it is None. peak: e'Re <= peak max(1, g), and what measured it.
     """
 
     level: Fraction
     samples: int | None
     measured: Measured
     follows: CommandLevel | None
+    peak: tuple[Fraction, Measured] | None
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         assumptions.append(_inside(model, funnel["box"]))
     for i, tube in enumerate(tubes, 1):
         label = f"({i}) " if len(tubes) > 1 else ""
-        assumptions.append(label + _assumption(model, tube, fitted, own=_several(tubes)))
+        said = _assumed(model, tube, fitted, own=_several(tubes))
+        assumptions += [label + line for line in said]
     if "response" in funnel:
         assumptions += _response(model, funnel["response"], fitted)
     if "cusum" in funnel:
@@ -155,7 +157,7 @@ def _forms(model: Model, tube: Tube, mode: str) -> list[tuple[str, Matrix]]:
 
 def _read(node: Node, model: Model) -> Tube:
     n, p = model.states, len(model.H)
-    parts = node.members("rho L P R tau half_widths level inlet assumption", "follows")
+    parts = node.members("rho L P R tau half_widths level inlet assumption", "follows peak")
     rho = parts["rho"].number()
     tube = Tube(
         rho=rho, L=parts["L"].array(n, p), P=parts["P"].array(n, n), R=parts["R"].array(p, p),
@@ -172,7 +174,7 @@ def _read(node: Node, model: Model) -> Tube:
 
 
 def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assumption:
-    """level, assumption and follows of a tube's members."""
+    """level, assumption, follows and peak of a tube's members."""
     given = parts["assumption"].members(f"kind {MEASURED}", "samples")
     kind = given["kind"].text()
     if kind not in ("fading", "energy"):
@@ -181,15 +183,32 @@ def _read_assumption(parts: dict[str, Node], rho: Fraction, inputs: int) -> Assu
         raise Rejected("the assumption energy is for a number of samples, fading for ever")
     if not 0 < rho <= 1 or (kind == "energy") != (rho == 1):
         raise Rejected("rho should be 1 for the assumption energy, between 0 and 1 for fading")
-    assumed = Assumption(
-        level=parts["level"].number(),
+    measured = read_measured(given, "tube")
+    return Assumption(
+        level=_level(parts, measured, "the level"),
         samples=given["samples"].whole(1, MAX_SAMPLES) if "samples" in given else None,
-        measured=read_measured(given, "tube"),
+        measured=measured,
         follows=read_level(parts["follows"], inputs, 1) if "follows" in parts else None,
+        peak=_read_peak(parts["peak"], measured) if "peak" in parts else None,
     )
-    least = assumed.measured.factor**2 * assumed.measured.value
-    at_most(least, assumed.level, "the level is below safety_factor^2 x measured")
-    return assumed
+
+
+def _read_peak(node: Node, energy: Measured) -> tuple[Fraction, Measured]:
+    """The level of a peak, measured on the trials of the energy, with its safety factor."""
+    parts = node.members("level measured")
+    measured = replace(energy, value=parts["measured"].number())
+    if measured.value < 0:
+        raise Rejected("a measured peak should be 0 or more")
+    return _level(parts, measured, "the level of the peak"), measured
+
+
+def _level(parts: dict[str, Node], measured: Measured, what: str) -> Fraction:
+    """A level of squares that is not below what was measured."""
+    level = parts["level"].number()
+    at_most(
+        measured.factor**2 * measured.value, level, f"{what} is below safety_factor^2 x measured"
+    )
+    return level
 
 
 def _read_policy(node: Node, model: Model, made_for: str) -> Policy:
@@ -309,8 +328,8 @@ def _inside(model: Model, box: Node) -> str:
     return f"the inputs, and the outputs and states of simulation and observer, stay in {shown}"
 
 
-def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own: bool) -> str:
-    """own: whether other tubes have other observers."""
+def _assumed(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own: bool) -> list[str]:
+    """What is assumed of the innovations. own: whether other tubes have other observers."""
     # One output and R = 1: V and E carry its unit squared.
     unit, energy, assumed = "", "e'Re", tube.assumed
     if len(model.y) == 1:
@@ -324,6 +343,12 @@ def _assumption(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, o
         bound = f"E <= {level} g after every sample, {growth}, g = {g}"
     if assumed.samples is not None:
         bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
-    worth = calibration(assumed.measured, fitted_to)
     whose = " of its own observer" if own else ""
-    return f"innovation energy{whose}: {bound} ({worth})"
+    said = [f"innovation energy{whose}: {bound} ({calibration(assumed.measured, fitted_to)})"]
+    if assumed.peak is not None:
+        peak, measured = assumed.peak
+        room = " max(1, g)" if assumed.follows else ""
+        most = Signal("", unit).quantity(text.below(peak))
+        bound = f"{energy} <= {most}{room} at every sample"
+        said.append(f"innovation peak{whose}: {bound} ({calibration(measured, fitted_to)})")
+    return said

@@ -73,7 +73,10 @@ class TubeRun:
         self._single_R = self._R[:, 0, 0] * self._up if p == 1 else None
         self._L = np.array([tube.L for tube in tubes])
         self._level = np.array([tube.level for tube in tubes]) * (1.0 - ROUNDING)
+        peaks = [math.inf if tube.peak is None else tube.peak.level for tube in tubes]
+        self._peak = np.array(peaks) * (1.0 - ROUNDING)
         self._widths = np.array([tube.half_widths for tube in tubes]) * (1.0 - ROUNDING)
+        self._unmoved = np.ones(len(tubes))
         self._samples = [tube.samples for tube in tubes]
         follow: dict[int, CommandLevel] = {
             j: tube.follows for j, tube in enumerate(tubes) if tube.follows is not None
@@ -270,7 +273,8 @@ class TubeRun:
         e = y - outputs[:-1]
         simulated = outputs[-1]
         deviation = y - simulated
-        level, widths = self._followed(self._g)
+        g, widths = self._followed(self._g)
+        level = self._level * g
         with np.errstate(over="ignore", invalid="ignore"):  # looked at below
             if self._single_R is not None:
                 used = self._single_R * (e[:, 0] * e[:, 0])
@@ -281,6 +285,7 @@ class TubeRun:
             self._spent = self._rho * self._spent + used
             sizes = np.abs(deviation) / widths
             spent = (self._spent / level).tolist()
+            peaks = (used / (self._peak * np.maximum(g, 1.0))).tolist()
         self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         nominal = tuple(simulated.tolist())
@@ -298,16 +303,16 @@ class TubeRun:
             return self._unknown(t, y, reason)
         measured = tuple(y.tolist())
         away, innovations = deviation.tolist(), e.tolist()
-        judged = _Judged(t, sizes.tolist(), spent, level, widths, nominal, measured, away)
+        judged = _Judged(t, sizes.tolist(), spent, peaks, level, widths, nominal, measured, away)
         return [self._reading(i, judged, innovations[rows[0]]) for i, rows in enumerate(self._rows)]
 
     def _followed(self, g: dict[int, list[float]]) -> tuple[FloatArray, FloatArray]:
-        """Levels (tubes,) and half-widths (tubes, p) at a sample with this g."""
+        """By what levels are multiplied (tubes,), and half-widths (tubes, p), where g is this."""
         if not g:
-            return self._level, self._widths
+            return self._unmoved, self._widths
         room = np.array([max(g[j][0], TINY) if j in g else 1.0
                          for j in range(len(self._tubes))])  # fmt: skip
-        return self._level * room, self._widths * np.sqrt(room)[:, None]
+        return room, self._widths * np.sqrt(room)[:, None]
 
     def _response(self, i: int, away: list[float]) -> tuple[float, str]:
         """The most of what is assumed of funnel i's output error that is used, and of which."""
@@ -345,7 +350,7 @@ class TubeRun:
 
         innovation: of the funnel's first observer.
         """
-        t, sizes, spent, level, widths, nominal, measured, away = judged
+        t, sizes, spent, peaks, level, widths, nominal, measured, away = judged
         alarm = self._alarm(i, innovation)
         lasting = self._lasting(i, self._k)
         if not lasting:
@@ -358,6 +363,7 @@ class TubeRun:
         size = max(row)
         margin = 1.0 - size
         most = max(lasting, key=spent.__getitem__)
+        sharpest = max(lasting, key=peaks.__getitem__)
         response, exceeded = self._response(i, away)
         reason = ""
         status = Status.INSIDE
@@ -367,14 +373,21 @@ class TubeRun:
                 f"innovation energy {self._spent[most]:.4g} above the level "
                 f"{level[most]:.4g} at t = {t:g} s"
             )
+        elif not peaks[sharpest] <= 1.0:
+            status = Status.ASSUMPTION_VIOLATED
+            reason = (
+                f"one sample's innovation energy is {peaks[sharpest]:.4g} times what is assumed, "
+                f"at t = {t:g} s"
+            )
         elif exceeded:
             status, reason = Status.ASSUMPTION_VIOLATED, f"{exceeded}, at t = {t:g} s"
         if not size <= 1.0:
             status = Status.OUTSIDE
             kept = "although the assumption was kept: what runs is not what was proved"
             reason = f"outside the tube; {reason}" if reason else f"outside {kept}"
+        used = max(spent[most], peaks[sharpest], response)
         return Reading(
-            t, status, margin, max(spent[most], response), self._exit(i, t, margin),
+            t, status, margin, used, self._exit(i, t, margin),
             self._names[row.index(size)], nominal, measured,
             Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i],
             away + innovation, alarm,
@@ -416,7 +429,7 @@ class Ahead:
         self._run, self._funnel = run, funnel
         self._x, self._k, self._spent, self._g = run._x, run._k, run._spent, run._g
         self._stepper, self._meters = run._stepper.ahead(), copy.deepcopy(run._meters)
-        self.steps = 0
+        self.steps, self._total = 0, np.zeros(len(run._rho))
         self.ended = "no run has begun" if self._x is None else ""
 
     def step(self, u: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -430,8 +443,12 @@ class Ahead:
         outputs, self._x, self.ended = run._advance(self._stepper, self._x, u)
         self.steps += 1
         self._g = {j: meter.update(u.tolist()) for j, meter in self._meters.items()}
-        level, widths = run._followed(self._g)
-        left = level * (1.0 + OUTWARD) - run._rho**self.steps * self._spent * (1.0 - OUTWARD)
+        g, widths = run._followed(self._g)
+        left = run._level * g * (1.0 + OUTWARD) - run._rho**self.steps * self._spent * (
+            1.0 - OUTWARD
+        )
+        self._total = run._rho * self._total + np.maximum(g, 1.0)
+        left = np.minimum(left, run._peak * self._total * (1.0 + OUTWARD))
         lasting = run._lasting(self._funnel, self._k + self.steps)
         if not lasting or not (left[lasting] >= 0.0).all():
             self.ended = self.ended or "what the tube assumes is broken, or over"
@@ -446,12 +463,13 @@ class Ahead:
 class _Judged(NamedTuple):
     """One sample against all tubes. sizes, widths: of each tube's outputs; spent, level: of it.
 
-    away: the output error.
+    peaks: the sample's own energy as a part of the tube's peak. away: the output error.
     """
 
     t: float
     sizes: list[list[float]]
     spent: list[float]
+    peaks: list[float]
     level: FloatArray
     widths: FloatArray
     nominal: tuple[float, ...]

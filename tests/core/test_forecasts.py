@@ -25,10 +25,11 @@ AHEAD = 12
 EVERY = pytest.mark.parametrize("name", MODELS)
 
 
-def alone(name: str, i: int = 0) -> tuple[Any, TubeFunnel]:
-    """A model and a funnel of its tube i only."""
+def alone(name: str, i: int = 0, *, peak: bool = True) -> tuple[Any, TubeFunnel]:
+    """A model and a funnel of its tube i only, with or without what is assumed of its peak."""
     made = design(name)
-    return made.model, replace(made.funnel, tubes=(made.funnel.tubes[i],))
+    tube = made.funnel.tubes[i]
+    return made.model, replace(made.funnel, tubes=(tube if peak else replace(tube, peak=None),))
 
 
 def attack(
@@ -56,6 +57,8 @@ def attack(
         away = np.sign(outputs[0] - outputs[1] + 1e-12 * rng.normal(size=p)) * rng.random(p)
         direction = away if kind == "sign" else rng.normal(size=p)
         part = {"spent": float(rng.random() < 0.1), "random": rng.random(), "sign": 1.0}[kind]
+        if tube.peak is not None:
+            left = min(left, tube.peak.level * max(1.0, level / tube.level) * (1.0 - 1e-9))
         e = direction * np.sqrt(part * left / (direction @ tube.R @ direction))
         spent = tube.rho * spent + float(e @ tube.R @ e)
         y[k], x[0] = outputs[0] + e, x[0] + tube.L @ e
@@ -99,8 +102,9 @@ def test_no_output_that_keeps_the_assumption_leaves_its_forecast(name: str) -> N
 
 @pytest.mark.slow
 @EVERY
-def test_no_output_of_thousands_leaves_its_forecast(name: str) -> None:
-    model, funnel = alone(name)
+@pytest.mark.parametrize("peak", [True, False])
+def test_no_output_of_thousands_leaves_its_forecast(name: str, peak: bool) -> None:
+    model, funnel = alone(name, peak=peak)
     most, count = 0.0, 0
     for kind in ("spent", "random", "sign"):
         y, u = attack(model, funnel, kind, 3000, seed=2)
@@ -113,7 +117,7 @@ def test_no_output_of_thousands_leaves_its_forecast(name: str) -> None:
 
 def test_a_linear_forecast_is_reached_at_every_sample() -> None:
     """The worst innovations by Cauchy and Schwarz: e_q = B ρ^-(h-1-q) R⁻¹ c_q' / reach."""
-    model, funnel = alone("linear")
+    model, funnel = alone("linear", peak=False)
     tube, linear = funnel.tubes[0], linear_form(model)
     assert linear is not None
     A, C = linear.A, linear.C[0]
@@ -139,6 +143,34 @@ def test_a_linear_forecast_is_reached_at_every_sample() -> None:
             y = predicted[0] + e[q]
             x = x + tube.L[:, 0] * e[q]
         assert 0.0 <= forecast.high[h - 1, 0] - y[0] < 1e-6 * tube.half_widths[0]
+
+
+@EVERY
+def test_a_peak_bounds_the_next_output_and_is_reached_where_there_is_one(name: str) -> None:
+    model, funnel = alone(name)
+    tube = funnel.tubes[0]
+    assert tube.peak is not None
+    p, lags = len(tube.R), funnel.settling
+    u = np.zeros((lags + 3, len(Stepper(model).u)))
+    monitors = [Monitor(model, None, f) for f in (funnel, alone(name, peak=False)[1])]
+    stepper = Stepper(model)
+    x = stepper.begin(np.zeros((lags, p)), u[:lags])[None]
+    for k in range(lags + 1):
+        y = np.zeros(p)
+        if k == lags:
+            predicted, x = stepper.advance(x, u[k])
+            y = predicted[0]
+        for monitor in monitors:
+            monitor.update(k * model.period, y, u[k])
+    (with_peak, without) = (monitor.forecast(u[lags + 1 :]) for monitor in monitors)
+    assert (with_peak.low >= without.low).all()
+    assert (with_peak.high <= without.high).all()
+    (predicted,), _ = stepper.advance(x, u[lags + 1])
+    g = 1.0 if tube.follows is None else float(tube.follows.along(u)[lags + 1, 0])
+    most = np.sqrt(max(g, 1.0) * tube.peak.level * np.diag(np.linalg.inv(tube.R)))
+    least = np.minimum(most, np.sqrt(g) * tube.half_widths)
+    assert (with_peak.high[0] >= predicted + (1.0 - 1e-7) * least).all()
+    assert (with_peak.high[0] <= predicted + (1.0 + 1e-7) * most).all()
 
 
 def test_the_reach_of_a_linear_model_is_above_the_exact_one_and_close() -> None:

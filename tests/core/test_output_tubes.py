@@ -63,16 +63,19 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
     assert all(r.status is Status.UNKNOWN for r in readings[:settling])
     judged = readings[settling:]
     assert all(r.status is not Status.UNKNOWN for r in judged)
-    E = energy(innovations(made.model, tube.L[None], trial, settling)[:, 0], tube)
+    e = innovations(made.model, tube.L[None], trial, settling)[:, 0]
+    E = energy(e, tube)
+    assert tube.peak is not None
     g: FloatArray = np.ones(len(E))
     if tube.follows is not None:
         g = tube.follows.along(trial.u)[settling:, 0]
+    peaks = np.einsum("ti,ij,tj->t", e, tube.R, e) / tube.peak.level / np.maximum(g, 1.0)
     error = innovations(made.model, 0 * tube.L[None], trial, settling)[:, 0]
     response = made.funnel.response
     assert response is not None
     rows = g[:, None] if response.follows is None else response.follows.along(trial.u)[settling:]
     parts = ((error / response.half_widths) ** 2 / rows).max(axis=1)
-    expected = np.maximum(E / tube.level / g, parts)
+    expected = np.maximum(np.maximum(E / tube.level / g, peaks), parts)
     used = np.array([r.assumption for r in judged])
     if len(made.funnel.tubes) == 1:
         assert used == pytest.approx(expected, rel=1e-6)
@@ -87,6 +90,27 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
             assert r.half_widths == pytest.approx(widths, rel=1e-8)
         assert (r.status is Status.OUTSIDE) == (r.margin < 0.0)
         assert (deviation <= widths).all() or r.status is not Status.INSIDE
+
+
+@pytest.mark.parametrize("name", ["linear", "two_following"])
+def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(name: str) -> None:
+    made, trial = design(name), trial_of(name)
+    tube, k = made.funnel.tubes[0], made.funnel.settling + 40
+    assert tube.peak is not None
+    wide = replace(
+        made.funnel, tubes=(replace(tube, level=100.0 * tube.level),), response=None, cusum=None
+    )
+    innovation = np.array(run(monitor_of(name), trial)[k].deviation[-len(tube.R) :])
+    g = 1.0 if tube.follows is None else max(1.0, float(tube.follows.along(trial.u)[k, 0]))
+    direction = np.arange(1.0, 1.0 + len(tube.R))
+    most = direction * np.sqrt(tube.peak.level * g / (direction @ tube.R @ direction))
+    for part, status in ((0.99, Status.INSIDE), (1.01, Status.ASSUMPTION_VIOLATED)):
+        y = trial.y.copy()
+        y[k] += part * most - innovation
+        reading = run(Monitor(made.model, None, wide), replace(trial, y=y))[k]
+        assert reading.status is status
+        assert ("one sample's innovation energy" in reading.reason) == (part > 1.0)
+        assert reading.assumption >= part**2 * (1.0 - 1e-6)
 
 
 def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:

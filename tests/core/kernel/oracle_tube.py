@@ -331,6 +331,10 @@ def is_proved(model: Json, funnel: Json, proof: Json, policy: Json | None = None
             return False
         if not disjoint(given):
             return False
+        if "peak" in tube:
+            peak, largest = (exact(tube["peak"][key]) for key in ("level", "measured"))
+            if set(tube["peak"]) != {"level", "measured"} or not 0 <= factor**2 * largest <= peak:
+                return False
         kept = m + len(F) if model["kind"] == "implicit" and m > 1 and box else 0
         if not all(holds(F, H, m, tube, tree, (box, ray, hull), kept) for F, H in modes):
             return False

@@ -47,7 +47,15 @@ def test_the_sentences_are_those_of_the_page() -> None:
     rho = funnel["tubes"][0]["rho"]
     assert f"E+ = {rho} E + e^2 from 0 (largest of 5 distinct trials, each " in said[2]
     assert said[2].endswith("exceeds their largest with probability at most 1/6)")
-    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[3]
+    peak = rounded(tubes(funnel)["peak"]["level"], "ROUND_FLOOR")
+    largest = rounded(tubes(funnel)["peak"]["measured"], "ROUND_CEILING")
+    assert said[3] == (
+        f"  assuming (1) innovation peak of its own observer: e^2 <= {peak} (m/s)^2 at every "
+        f"sample (largest of 5 distinct trials, each taken whole, {largest}, safety factor 1.5 in "
+        "amplitude; a next trial that is exchangeable with them exceeds their largest with "
+        "probability at most 1/6)"
+    )
+    assert "(2) innovation energy of its own observer: sum of e^2 <= " in said[4]
 
 
 def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
@@ -70,9 +78,10 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
         f"(change of {name} / 1.5{unit})^2), sums over the run's samples, each i samples ago "
         f"(largest of 5 distinct trials" in said[2]
     )
-    assert said[3].startswith("  assuming output error: |speed - simulated| / (")
-    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 (sum 0.9^i (change of {name}" in said[3]
-    assert "probability at most 1/6)" in said[3]
+    assert said[3].startswith("  assuming innovation peak: e^2 <= ")
+    assert said[4].startswith("  assuming output error: |speed - simulated| / (")
+    assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 (sum 0.9^i (change of {name}" in said[4]
+    assert "probability at most 1/6)" in said[4]
 
 
 def test_windows_that_share_samples_count_once() -> None:
@@ -218,6 +227,9 @@ def term(funnel: Json, i: int = 0) -> Json:
         (lambda f: term(f).update(future=1), "unknown member 'future'"),
         (lambda f: tubes(f).update(inlet=1e-12), "without an inlet"),
         (lambda f: scaled(tubes(f), "level", 0.999), "below safety_factor"),
+        (lambda f: scaled(tubes(f)["peak"], "level", 0.999), "level of the peak is below"),
+        (lambda f: tubes(f)["peak"].update(measured=-1e-9), "measured peak should be 0 or more"),
+        (lambda f: tubes(f)["peak"].update(samples=2), "unknown member 'samples'"),
         (lambda f: scaled(f["response"]["assumption"], "measured", 1.01), "below safety_factor"),
         (lambda f: f["response"]["assumption"].update(safety_factor=0.9), "1 or more"),
         (lambda f: f["response"]["assumption"].update(measured_on=[]), "on no trial"),
