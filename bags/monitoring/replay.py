@@ -14,7 +14,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
-from bags.signals.sampling import FILLED, MOST_FILLED, said_filled
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -88,6 +88,8 @@ class Replay:
             found.append(first._replace(reason=reason))
         before: Reading | None = None
         for reading in self.readings:
+            if reading.reason == LOST:
+                continue  # the next one that came says how many
             starts = before is not None and _starting(before) and _starting(reading)
             if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
