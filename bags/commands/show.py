@@ -254,6 +254,9 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
     for row in catching.rows:
         if row.refused:
             console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    if alone := [f"{row.fault}: {row.output}" for row in catching.rows if row.output]:
+        said = "a sensor's fault is in one output at a time; above is the one caught least: "
+        console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
     if false := catching.rows[0].funnel.count:
         console.print(
             f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "

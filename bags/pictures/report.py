@@ -131,7 +131,8 @@ def _catching_row(row: Row, detectors: Sequence[str]) -> str:
     for name in detectors:
         other = row.others[name]
         cells.append(f"{other.count}, {other.after:.2f} s" if other.count else "0")
-    return f"<tr><td>{escape(row.fault)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
+    fault = escape(f"{row.fault}, {row.output}" if row.output else row.fault)
+    return f"<tr><td>{fault}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
 
 
 def page(
