@@ -337,15 +337,18 @@ def push(
     `push`: the largest of each trial with its digest.
     """
     from bags.chain.problems import measured
+    from bags.commands import show
     from bags.recordings.folders import expand_bags
     from nlsid_core import files
 
-    given = measured(
+    given, broken = measured(
         problem, expand_bags(bags), responses=response, excitations=command, period=period or None,
         seconds=seconds or None, safety_factor=safety_factor, resample=resample,
     )  # fmt: skip
     files.write_document(out_file, given.document())
+    assert given.push is not None  # `measured` has just measured it
     out.print(str(given.push), soft_wrap=True, markup=False)
+    out.print(show.breaking_table(broken))
     out.print(f"wrote {out_file}", soft_wrap=True)
 
 
