@@ -477,6 +477,8 @@ class FunnelMonitor(ManagedNode):
             "alarm": reading.alarm,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
+            "judged in this run": str(watch.judged if watch else 0),
+            "lost": str(watch.lost if watch else 0),
             "filled in": said_filled(watch.filled, watch.samples) if watch else "",
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),

@@ -77,6 +77,7 @@ def run_init(
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
     for wall in dict.fromkeys(proposal.walls):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
+    console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
     given = "TRIALS" if live else " ".join(map(str, bags))
     if live:

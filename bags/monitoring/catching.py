@@ -26,6 +26,7 @@ UNTOUCHED = "untouched"
 BIAS = 0.1  # of the range of each output
 DELAY = 5  # samples
 LOST = 5  # samples
+NOT_THERE = "lost"
 WIDE = 0.5  # of the range: a tube of a larger half-width says little
 OUTLIER = 4.0  # times the median trial's share of the level: twice its amplitude
 
@@ -329,9 +330,11 @@ def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
     widths: list[Sequence[float]] = []
     bad, alarm, lost, share = None, None, False, 0.0
     for k, (t, y, u) in enumerate(zip(copy.t.tolist(), copy.y, copy.u, strict=True)):
-        if k in copy.lost:
-            continue
         sample: tuple[Any, Any] = (float(y[0]), float(u[0])) if single else (y, u)
+        if k in copy.lost:
+            monitor.unmeasured(t, sample[1], NOT_THERE)
+            lost = True
+            continue
         reading = monitor.update(t, *sample)
         if reading.status is Status.UNKNOWN:
             lost = lost or (bool(times) and not reading.reason.startswith(OVER))

@@ -14,7 +14,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
-from bags.signals.sampling import FILLED, MOST_FILLED, said_filled
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -45,7 +45,7 @@ class Replay:
     @property
     def span(self) -> float:
         """S of the run, from the first sample after those that start it to the last."""
-        stamps = [r.t for r in self.readings if not _starting(r)]
+        stamps = [r.t for r in self.readings if not r.starts]
         return stamps[-1] - stamps[0] + self.period if stamps else 0.0
 
     @property
@@ -71,7 +71,7 @@ class Replay:
     @property
     def said_filled(self) -> str:
         """The same in words, of how many; empty if there is none."""
-        count = sum(not _starting(reading) for reading in self.readings)
+        count = sum(not reading.starts for reading in self.readings)
         return said_filled(self.filled, count)
 
     @property
@@ -88,7 +88,9 @@ class Replay:
             found.append(first._replace(reason=reason))
         before: Reading | None = None
         for reading in self.readings:
-            starts = before is not None and _starting(before) and _starting(reading)
+            if reading.reason == LOST:
+                continue  # the next one that came says how many
+            starts = before is not None and before.starts and reading.starts
             if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
                 if lost > 0:
@@ -149,16 +151,12 @@ class Replay:
         return "" if self.judged or not self.readings else self.readings[-1].reason
 
 
-def _starting(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
-
-
 def _filled(reading: Reading) -> bool:
     return reading.reason.startswith(FILLED)
 
 
 def _unjudged(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and not _starting(reading) and not _filled(reading)
+    return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
 
 
 def replay_bag(

@@ -23,10 +23,12 @@ from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, Pair, slope_window
 from bags.signals.columns import read_columns
+from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
+from bags.signals.timing import held
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
@@ -47,9 +49,7 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-RELATED: Final = 0.3  # correlation below which command and response may be unrelated
-STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
-ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
+GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
@@ -75,6 +75,15 @@ class Proposal:
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
     error: float = math.inf  # %, of the best model that was tried, in simulation
+    tried_on: str = "trials held back"
+
+    @property
+    def expectation(self) -> str:
+        """How good a model will be, as far as what was tried says."""
+        if math.isinf(self.error):
+            return "no model that was tried is stable: expect identification to refuse"
+        grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
+        return f"expect {self.error:.3g} % error in simulation (of {self.tried_on}): {grade}"
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
         """As the later steps read it."""
@@ -320,7 +329,7 @@ def _read(
     y_paths = [signal.path for signal in chosen["response"]]
     drives = [factors(signal.path) for signal in chosen["excitation"]]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
-    steps, held, tails, bands, ranges, u_steps = [], [], [], [], [], []
+    steps, commanded, bands, ranges, u_steps = [], [], [], [], []
     repeated = 0
     for path in bags:
         read = read_signals(
@@ -335,12 +344,7 @@ def _read(
         last = max(int(read[name].stamp_ns[-1]) for name in y_paths)
         for name in u_paths:
             stamps = read[name].stamp_ns
-            intervals = np.diff(stamps[stamps < last]) / 1e9
-            between = float(intervals.max(initial=0.0))
-            tail = max((last - int(stamps[-1])) / 1e9, 0.0)
-            ended = len(intervals) >= STREAMED and tail > ENDED * between
-            tails.append(tail if ended else 0.0)
-            held.append(between if ended else max(between, tail))
+            commanded.append(held(stamps, last))
             u_steps.append(np.diff(stamps) / 1e9)
         ranges.append([_range([read[name] for name in parts]) for parts in drives])
     every, u_every = np.concatenate(steps), np.concatenate(u_steps)
@@ -356,8 +360,8 @@ def _read(
         longest_gap=float(every.max()),
         band=float(np.median([b for b in bands if b > 0] or [0.0])),
         command_period=float(np.median(u_every)) if len(u_every) else math.inf,
-        longest_held=max(held),
-        longest_tail=max(tails),
+        longest_held=max(each.longest for each in commanded),
+        longest_tail=max(each.tail for each in commanded),
         u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
         topics=len({name.partition(":")[0] for name in y_paths}),
     )
@@ -554,10 +558,10 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
             identify(train, LinearClass(lags), comparators=())
             break
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
-    where = "on what they were fitted to" if alone else "on trials held back"
-    proposal.why["lags"] = f"proved models simulated {where} are off by {said}"
+    proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
+    proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"
     if best > POOR:
-        proposal.walls.append(_poor(best, where.removeprefix("on ")) + _others(proposal, found))
+        proposal.walls.append(_poor(best, proposal.tried_on) + _others(proposal, found))
 
 
 def _followed(proposal: Proposal, found: Found) -> list[Pair]:

@@ -23,6 +23,7 @@ from bags.signals.reader import (
 )
 from bags.signals.sampling import (
     BRIDGED,
+    LOST,
     MOST_FILLED,
     Sample,
     Sampler,
@@ -100,7 +101,9 @@ def to_trajectories(
     gap_ns = round(BRIDGED * period_ns if max_gap is None else max_gap * 1e9)
     held = [product(_held_for(samples, gap_ns) for samples in part) for part in parts]
     sampler = Sampler(list(map(str, signals)), held, period=period_ns / 1e9)
-    found = list(_sampled(sampler, [*responses, *drives]))
+    found = [
+        sample for sample in _sampled(sampler, [*responses, *drives]) if sample.missing != LOST
+    ]
     complete = [k for k, sample in enumerate(found) if not sample.missing]
     if len(complete) < 2:
         raise DataError(_no_overlap(label, responses, drives, len(complete)))

@@ -21,6 +21,8 @@ besides the model has to be known:
 - An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`;
   `|delay(T s)` adds T to its stamp, `|lag(T s)` filters what is held, `A * B` multiplies two such.
 - Signals may come from any number of topics, each of one or more of them.
+- Responses that are samples as they come and up to MOST_LOST periods apart have `LOST` samples
+  between them, a period apart: no response, and the commands of their time if they are known.
 - On a grid, a sample between two messages of a response that are more than BRIDGED periods apart is
   `filled` in: identification takes it and counts it, a monitor does not judge it, as nobody
   measured it. Commands are held by nature; that is no loss.
@@ -49,10 +51,13 @@ from bags.signals.expressions import (
 )
 from bags.signals.reader import Samples
 from nlsid_core.errors import BagError, apart
+from nlsid_core.running.grid import TOLERANCE
 
 MATCH: Final = 0.05  # periods between stamps of one sample on two topics; a loop's usual scatter
 BRIDGED: Final = 1.5  # periods between two messages: a sample is missing between them
+MOST_LOST: Final = 100  # samples in a row whose commands are kept; then nothing is known
 MOST_FILLED: Final = 0.05  # of the samples: with more, data are invented rather than recorded
+LOST: Final = "the sample is lost: no message of it came"
 FILLED: Final = "filled in"  # how the reason of a sample begins that nobody measured
 NOT_FINITE: Final = "not a finite number"
 HISTORY: Final = 2**16  # values kept of a signal while no sample comes: a minute at 1 kHz
@@ -252,6 +257,7 @@ class Sampler:
             awaited = self._kept[:n] if stamp_ns <= until_ns else self._kept
             if until_ns < math.inf and not all(kept.is_certain(stamp_ns) for kept in awaited):
                 return given
+            given += self._lost_before(stamp_ns)
             self._take_stamp(stamp_ns)
             values = [kept.value_at(stamp_ns) for kept in self._kept]
             self._released_ns = stamp_ns
@@ -264,6 +270,33 @@ class Sampler:
             filled = "" if missing or not self.on_grid else self._filled(stamp_ns)
             u = self._multiplied(values[n:])
             given.append(Sample(stamp_ns, tuple(values[:n]), u, missing, filled))
+
+    def _lost_before(self, stamp_ns: int) -> list[Sample]:
+        """The samples that should have come between the last one given and this one."""
+        if self.on_grid or not self._started:
+            return []
+        n = len(self.responses)
+        gap_ns = stamp_ns - int(self._released_ns)
+        periods = gap_ns / self.period_ns
+        count = round(periods)
+        if not 1 < count <= MOST_LOST + 1 or abs(periods - count) > TOLERANCE:
+            return []
+        lost = []
+        for left in range(count - 1, 0, -1):
+            at = stamp_ns - gap_ns * left // count
+            u = self._multiplied([self._commanded(k, at) for k in range(n, len(self._kept))])
+            lost.append(Sample(at, (math.nan,) * n, u, LOST))
+        return lost
+
+    def _commanded(self, k: int, at_ns: int) -> float:
+        """What signal k, which drives, was at a lost sample; NaN if a message with it may be lost.
+
+        That is if it is measured with a response, or if no hold is stated and it is not new.
+        """
+        kept, value = self._kept[k], self._kept[k].value_at(at_ns)
+        lost = self._signals[k].path.topic in self.response_topics
+        old = kept.limit_ns == math.inf and at_ns - kept.stamps[0] > BRIDGED * self.period_ns
+        return math.nan if lost or old else value
 
     def _multiplied(self, values: Sequence[float]) -> tuple[float, ...]:
         """The excitations from the values of all their factors."""

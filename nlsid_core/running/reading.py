@@ -59,6 +59,11 @@ class Reading(NamedTuple):
     half_widths: Sequence[float] = ()
 
     @property
+    def starts(self) -> bool:
+        """Whether a run is still to begin."""
+        return self.status is Status.UNKNOWN and self.reason.startswith("waiting for ")
+
+    @property
     def numbers(self) -> dict[str, float]:
         """What is published of it, by name; `nominal[1]` where several signals are measured."""
         values = {

@@ -26,6 +26,7 @@ from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
 from bags.setup.proposal import choose
+from bags.tools.fitness import check_fitness
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
     CMD_TYPE,
@@ -374,6 +375,13 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
     said = nlsid("init", bags, "--out", config, "-u", "/cmd:data", "-y", "/speed:data")
     assert "commands end up to 4.9 s before the responses do" in said
+    assert re.search(r"expect [\d.e-]+ % error in simulation \(of trials held back\): good", said)
+    [found] = check_fitness(
+        [bags / "run_0"], excitations=["/cmd:data"], responses=["/speed:data"], clock="log"
+    )
+    commands = [finding.what for finding in found.findings if finding.check == "commands"]
+    assert commands[0].endswith("one held for at most 0.1 s (grid.hold)"), "as init says"
+    assert "ends 4.9 s before the responses do" in commands[1]
     grid = load_config(config).grid
     assert grid.hold is None
     assert grid.split_gaps

@@ -19,7 +19,7 @@ from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
 from bags.signals.grid import filled_samples, read_dataset
 from bags.signals.reader import read_signals
-from bags.signals.sampling import Sample, Sampler, sampled_path
+from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
 from nlsid_core.design import design_output_tube
 from nlsid_core.errors import BagError
@@ -81,7 +81,12 @@ def is_bridged(values: Series, at: int, period_ns: int) -> bool:
 
 def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Sample]:
     given = [sample for k, stamp, value in events for sample in sampler.feed(k, stamp, value)]
-    return given + sampler.flush()
+    return came(given + sampler.flush())
+
+
+def came(samples: Sequence[Sample]) -> list[Sample]:
+    """Those of which a message came."""
+    return [sample for sample in samples if sample.missing != LOST]
 
 
 def interleaved(
@@ -237,6 +242,34 @@ def test_products_of_delayed_and_lagged_signals_are_what_the_words_say(seed: int
     found = [[*sample.y, *sample.u] for sample in given]
     np.testing.assert_allclose(found, truth, rtol=1e-12)
     assert np.isfinite(found).any()
+
+
+def test_a_lost_sample_has_the_commands_of_its_time_where_they_are_known() -> None:
+    """Not those that no hold keeps, nor what is measured with the response."""
+    measured = "/y:other|hold(1 s)"
+    texts = [U, f"{U}|hold(1 s)", measured, f"{U}|hold(1 s) * {measured}"]
+    sampler, times = Sampler([Y], texts, period=0.01), [0, 10, 20, 61, 400]
+    for k in range(1, 6):
+        sampler.feed(k, 0, 2.0)
+    given = [sample for t in times for sample in sampler.feed(0, t * MS, 1.0)]
+    for k in range(1, 6):
+        given += sampler.feed(k, 5 * MS, 3.0)
+    given += sampler.flush()
+    lost = [sample for sample in given if sample.missing == LOST]
+    assert [sample.stamp_ns / MS for sample in given[:6]] == [0, 10, 20, 30.25, 40.5, 50.75]
+    assert len(lost) == 3 + 33
+    assert all(math.isnan(sample.y[0]) for sample in lost)
+    nan = math.nan
+    np.testing.assert_array_equal([s.u for s in lost], [[nan, 3.0, nan, nan]] * len(lost))
+    again = Sampler([Y], [U], period=0.01)
+    for k, t in ((1, 0), (0, 0), (1, 8), (0, 30), (1, 30)):
+        given = again.feed(k, t * MS, float(t))
+    assert [(s.stamp_ns // MS, s.u) for s in given] == [(10, (8.0,)), (20, (8.0,)), (30, (30.0,))]
+    far = Sampler([Y], [U], period=0.01)
+    far.feed(1, 0, 1.0)
+    for t in (0, 10, 10 + 10 * (MOST_LOST + 2), 10 + 10 * (2 * MOST_LOST + 3)):
+        far.feed(0, t * MS, 1.0)
+    assert [sample.missing for sample in far.flush()].count(LOST) == MOST_LOST
 
 
 def test_what_answers_is_no_product_and_has_no_lag() -> None:
@@ -442,7 +475,7 @@ def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Pa
                 decode(message.data, *source.types_on("/tf")),
             )
         ]
-    assert [sample.y[0] for sample in given] == read[signals[1]].values.tolist()
+    assert [sample.y[0] for sample in came(given)] == read[signals[1]].values.tolist()
     with pytest.raises(BagError, match="'frame' on 'tf2_msgs/msg/TFMessage' is not an array of"):
         read_signals(tmp_path / "tf", ["/tf:transforms[frame=base].transform.translation.x"])
     with pytest.raises(BagError, match=r"is nan in message 0 .*not finite"):
@@ -464,7 +497,12 @@ def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:
     sampler.feed(1, 0, 1.0)
     assert sampler.feed(0, 50 * MS, 2.0) == []
     assert sampler.flush(60 * MS) == [Sample(50 * MS, (2.0,), (1.0,))]
-    [late] = [*sampler.feed(0, 200 * MS, 3.0), *sampler.flush(200 * MS)]
+    *lost, late = [*sampler.feed(0, 200 * MS, 3.0), *sampler.flush(200 * MS)]
+    assert [(sample.stamp_ns, sample.missing) for sample in lost] == [
+        (100 * MS, LOST),
+        (150 * MS, LOST),
+    ]
+    np.testing.assert_array_equal([sample.u for sample in lost], [[1.0], [np.nan]])
     assert late.missing == f"{U}|hold(0.1 s): nothing for 0.2 s; at most 0.1 s is held"
     assert math.isnan(late.u[0])
     sampler.feed(1, 150 * MS, 5.0)
