@@ -503,9 +503,12 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
-    folders = expand_bags(bags)
+    folders = every = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in folders if trial_name(f) in settings.split.test] or folders
+        folders = [f for f in every if trial_name(f) in settings.split.test] or every
+    if len(folders) < len(every):
+        said = f"{len(folders)} of {len(every)} bags: those in split.test of {config}"
+        out.print(f"{said}; without --config all are judged", soft_wrap=True)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
