@@ -14,7 +14,7 @@ from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
-from bags.monitoring.catching import WIDE, Catching, Caught
+from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
@@ -269,6 +269,16 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
         said = f"{word}{line}"
         console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def breaking_table(found: Breaking) -> Table:
+    """By fault, how many of the copies that have it break what a proof assumes."""
+    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
+    table.add_column("fault")
+    table.add_column("broken", justify="right")
+    for fault, count in found.counts.items():
+        table.add_row(fault, f"{count} of {found.trials}")
+    return table
 
 
 def width_lines(catching: Catching) -> list[str]:

@@ -48,7 +48,7 @@ class Copy:
     lost: frozenset[int] = frozenset()
 
 
-Fault = Callable[[Trajectory, FloatArray, StableModel], Copy]  # of a trial, its outputs' ranges
+Fault = Callable[[Trajectory, FloatArray, Any], Copy]  # of a trial, its outputs' ranges
 
 
 def _scaled(factor: float) -> Fault:
@@ -104,6 +104,37 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
 )
 
 OF_SENSORS = frozenset(name for name, _ in SABOTAGES[:5])  # put into one output at a time
+
+
+def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
+    """What a robot records that does the same although 0.8 of its command arrives."""
+    return Copy(trial.t, trial.y, trial.u / 0.8)
+
+
+# Of recorded states: none needs a model, and the recording itself says what the robot did.
+OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _commanded_more))
+
+
+@dataclass(frozen=True)
+class Breaking:
+    """By fault, in how many of so many trials a copy with it breaks what a proof assumes."""
+
+    trials: int
+    counts: dict[str, int]
+
+
+def breaking(trials: Dataset, used: Callable[[Trajectory], float]) -> Breaking:
+    """What an assumption about recordings of states (y) and inputs would tell from a sound robot.
+
+    used: the largest part of the assumption that a recording shows; above 1 it is broken. Every
+    copy is what a robot with that fault records under the same inputs at its actuators.
+    """
+    ranges = np.ptp(np.vstack([trial.y for trial in trials]), axis=0)
+    counts = {}
+    for name, fault in OF_STATES:
+        copies = [(trial, fault(trial, ranges, None)) for trial in trials]
+        counts[name] = sum(used(replace(trial, y=c.y, u=c.u)) > 1.0 for trial, c in copies)
+    return Breaking(len(trials), counts)
 
 
 @dataclass(frozen=True)
