@@ -193,7 +193,7 @@ def funnel_table(design: OutputTubeDesign) -> Table:
             for width, signal in widths
         )
         if tube.follows is not None:
-            said += " on average, wider and narrower as the commands go: times sqrt(g)"
+            said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
@@ -264,6 +264,9 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
             soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
         )  # fmt: skip
+    for line in catching.beyond:
+        said = f"warning: {line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "

@@ -231,6 +231,17 @@ class Catching:
         """The output whose half-width is the largest part of its range."""
         return max(self.widths, key=lambda width: width.share)
 
+    @property
+    def beyond(self) -> list[str]:
+        """What to know of a tube that follows the commands beyond the output's range."""
+        return [
+            f"the half-width of {width.name} is up to {_up(width.most)} {width.unit} where the "
+            f"commands change most, beyond its range, {width.range:.3g} {width.unit}: the tube "
+            "says nothing there"
+            for width in self.widths
+            if width.most is not None and width.most > width.range
+        ]
+
     def warnings(self, most: float = WIDE) -> list[str]:
         """What to know of a tube whose half-width is more than `most` of the range."""
         said = []

@@ -101,7 +101,9 @@ def _catching(catching: Catching, drawn: str) -> str:
     widths = "; ".join(
         f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
     )
-    wide = "".join(f'<p class="not">{escape(line)}</p>' for line in catching.warnings())
+    wide = "".join(
+        f'<p class="not">{escape(line)}</p>' for line in [*catching.beyond, *catching.warnings()]
+    )
     return f"""
 <h2>The funnel: what it can catch</h2>
 <p>Half-width: {widths}.</p>{wide}
