@@ -482,7 +482,7 @@ class FunnelMonitor(ManagedNode):
             "filled in": said_filled(watch.filled, watch.samples) if watch else "",
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
-            "design": self._funnel.state,
+            "design": self._funnel.state.partition("\n")[0],
             "signals": self._names,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }

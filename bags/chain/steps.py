@@ -32,6 +32,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
+LARGER: Final = 20.0  # times the largest value of most trials: hardly the same unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,8 @@ class Trials:
     def apart(self) -> list[str]:
         """Trials where a signal is nowhere near what it is in all others, in words for people.
 
-        That is by more than the others' range: kelvin among degC, another sensor, another zero.
+        That is by more than the others' range: kelvin among degC, another sensor, another zero; or
+        many times larger than in most of them: mm among m.
         """
         trials = self.every
         if len(trials) < LEAST_APART:
@@ -74,6 +76,14 @@ class Trials:
             for k, trial in enumerate(trials)
             for low, high in [(np.delete(lows, k).min(), np.delete(highs, k).max())]
             if max(lows[k] - high, low - highs[k]) > max(high - low, highs[k] - lows[k])
+        ] + [
+            f"{trial.name}: {signal.name} is up to {largest[k]:.4g} {signal.unit}, in most trials "
+            f"up to {np.median(largest):.4g}; is it in another unit?"
+            for letter in ("y", "u")
+            for signal, lows, highs in _ranges(trials, letter)
+            for largest in [np.maximum(-lows, highs)]
+            for k, trial in enumerate(trials)
+            if largest[k] > LARGER * np.median(largest) > 0.0
         ]
 
 

@@ -6,8 +6,10 @@ A command imports what it runs when it is called: `nlsid check` needs no NumPy, 
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from bags.commands.bag_cli import bag_app
+from bags.commands.bag_cli import JsonOption, bag_app
 from bags.commands.config_cli import config_app
 from bags.commands.fleet_cli import (
     PatienceOption,
@@ -314,6 +316,45 @@ def funnel(
 
 
 @app.command()
+def push(
+    bags: BagsArgument,
+    problem: Annotated[Path, typer.Option(help="The problem whose equations are compared.")],
+    out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
+    response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
+    command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
+    period: PeriodOption = 0.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
+    ] = 0.0,
+    safety_factor: Annotated[
+        float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
+    ] = 1.5,
+    resample: Annotated[
+        str, typer.Option(help="none, last or linear: see grid.resample.")
+    ] = "none",
+) -> None:
+    """Measure on bags how far a problem's equations are off; `nlsid funnel` proves with that.
+
+    States and inputs in the equations' order and units. The problem that is written has a member
+    `push`: the largest of each trial with its digest.
+    """
+    from bags.chain.problems import measured
+    from bags.commands import show
+    from bags.recordings.folders import expand_bags
+    from nlsid_core import files
+
+    given, broken = measured(
+        problem, expand_bags(bags), responses=response, excitations=command, period=period or None,
+        seconds=seconds or None, safety_factor=safety_factor, resample=resample,
+    )  # fmt: skip
+    files.write_document(out_file, given.document())
+    assert given.push is not None  # `measured` has just measured it
+    out.print(str(given.push), soft_wrap=True, markup=False)
+    out.print(show.breaking_table(broken))
+    out.print(f"wrote {out_file}", soft_wrap=True)
+
+
+@app.command()
 def compose(
     proofs: Annotated[
         list[Path], typer.Argument(help="funnel.proof.json files, in the order of time.")
@@ -441,6 +482,7 @@ def monitor(
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
@@ -452,6 +494,7 @@ def monitor(
     from bags.commands import show
     from bags.designs import documents
     from bags.designs.design import Wiring
+    from bags.fleet.monitor import judged_of
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
@@ -464,9 +507,12 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
-    folders = expand_bags(bags)
+    folders = every = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in folders if trial_name(f) in settings.split.test] or folders
+        folders = [f for f in every if trial_name(f) in settings.split.test] or every
+    if len(folders) < len(every):
+        said = f"{len(folders)} of {len(every)} bags: those in split.test of {config}"
+        err.print(f"{said}; without --config all are judged", soft_wrap=True)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
@@ -481,8 +527,12 @@ def monitor(
         drawn = report_available() and all(entry.half_width for entry in replays)
         if drawn:
             write_margins(picture, replays)
-    out.print(show.replay_table(replays))
-    for entry in replays:
+    if as_json:
+        pairs = zip(replays, folders, strict=True)
+        typer.echo(json.dumps([asdict(judged_of(entry, bag, entry.name)) for entry, bag in pairs]))
+    else:
+        out.print(show.replay_table(replays))
+    for entry in [] if as_json else replays:
         for line in show.forecasts(entry, proved.design) if forecast else ():
             out.print(line, soft_wrap=True, markup=False, highlight=False)
         if entry.first_bad is not None:
@@ -500,7 +550,7 @@ def monitor(
             out.print(f"{entry.name}: {said}", soft_wrap=True)
         if not entry.judged:
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
-    if drawn:
+    if drawn and not as_json:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)
@@ -651,6 +701,7 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) ->
     from bags.chain.problems import FunnelProblem
     from bags.designs import documents
     from bags.pictures.report import report_available
+    from nlsid_core import files
 
     given = FunnelProblem.load(problem)
     with progress_bar("designing") as progress, workers.sharing() as executor:
@@ -664,6 +715,11 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) ->
         write_funnel_picture(picture, design)
         out.print(f"wrote {picture}", soft_wrap=True)
     out.print(str(design), soft_wrap=True)
+    if given.push is not None:
+        path = out_dir / documents.PUSH
+        files.write_document(path, given.push.document())
+        out.print(f"wrote {path}", soft_wrap=True)
+        out.print(f"measured, not proved: {given.push}", soft_wrap=True, markup=False)
 
 
 def main() -> None:

@@ -101,18 +101,25 @@ def choose(
     """
     if responses and excitations:
         return list(responses), list(excitations)
-    pairs = [
-        pair
-        for pair in found.pairs
-        if (not responses or _same(pair.response.text, responses[0]))
-        and (not excitations or _same(pair.command.text, excitations[0]))
-    ]
-    if not pairs:
-        raise BagError(
-            "no number looks like a command that another one follows; name them with --excitation "
-            "and --response (nlsid bag signals lists what there is)"
-        )
-    return list(responses) or [pairs[0].response.text], list(excitations) or [pairs[0].command.text]
+    best = []
+    for response in responses or [""]:
+        pairs = [
+            pair
+            for pair in found.pairs
+            if (not response or _same(pair.response.text, response))
+            and (not excitations or _same(pair.command.text, excitations[0]))
+            and (pair.score > 0.0 or response or excitations)
+        ]
+        if not pairs:
+            what = f"{response} follows no command" if response else "no number follows another"
+            still = f"; always the same: {', '.join(found.still)}" if found.still else ""
+            raise BagError(
+                f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
+                f"there is){still}"
+            )
+        best.append(pairs[0])
+    commands = dict.fromkeys(pair.command.text for pair in best)
+    return list(responses) or [best[0].response.text], list(excitations) or list(commands)
 
 
 def propose(
@@ -139,6 +146,11 @@ def propose(
     chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
     proposal = Proposal({"robot": robot})
     _say_signals(proposal, chosen, found)
+    if all(any(_unwrapped(s.path) for s in signals) for signals in chosen.values()):
+        proposal.walls.append(
+            "an angle drives and an angle answers: if a trial begins near half a turn, they may "
+            "begin a whole turn apart; leave such trials out, or take |derivative of both"
+        )
     if definitions:
         proposal.content["definitions"] = [str(path) for path in definitions]
     with Bag(bags[0], definitions=types) as bag:
@@ -194,6 +206,11 @@ class _Read:
     longest_tail: float
     u_ranges: tuple[tuple[float, float], ...]
     topics: int
+
+
+def _unwrapped(text: str) -> bool:
+    """Whether it is an angle that goes on over a turn."""
+    return "|unwrap" in text and "|derivative" not in text
 
 
 def _same(candidate: str, named: str) -> bool:
@@ -261,8 +278,8 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                 )
             if best.response.is_position and not best.command.is_position:
                 proposal.walls.append(
-                    f"{y.path} is a position: one that adds up its command for ever is in no model "
-                    f"class; take |derivative({slope_window(best.response.rate):g} s) of it"
+                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
+                    f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
                 )
 
 
@@ -608,7 +625,8 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
     if good.delays is not None:
         section["delays"] = list(good.delays)
         proposal.why["delays"] = "as the lags"
-    shown = sorted(known.items(), key=lambda item: item[1])[:SHOWN]
+    ranked = sorted(known, key=known.__getitem__)
+    shown = [(c, known[c]) for c in dict.fromkeys([*ranked[:SHOWN], good])]
     said = ", ".join(
         f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.right_degree}: {error:.3g} %"
         for c, error in shown

@@ -39,6 +39,7 @@ from nlsid_core.progress import Progress, silent
 from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
+FEW: Final = 0.01  # of the samples, left out at the ends: nobody needs to hear of it
 MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
@@ -79,7 +80,8 @@ def to_trajectories(
     `max_gap`, which its path says from then on. Samples that are filled in, here or by the rule of
     `bags.signals.sampling`, are counted: `filled` in the provenance, `filled_samples`.
 
-    Samples without every signal are left out at the start and the end, and logged. Between them
+    Samples without every signal are left out at the start and the end, and logged if they are more
+    than FEW. Between them
     they raise DataError, or with `split_gaps` end one trajectory and begin the next.
 
     Raises DataError, saying where, if stamps repeat, a gap is too long, a response that is not
@@ -109,7 +111,7 @@ def to_trajectories(
         raise DataError(_no_overlap(label, responses, drives, len(complete)))
     last = complete[-1]
     left_out = sampler.incomplete + len(found) - last - 1
-    if left_out and not split_gaps:
+    if left_out > FEW * len(complete) and not split_gaps:
         log.warning(
             "%s: %d of %d samples left out, where a signal is missing at the start or the end",
             label,

@@ -137,6 +137,7 @@ def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> N
         "",
         "|to(deg)",
         "|unwrap",
+        "|unit(deg)|unwrap",
         "|unwrap|derivative(0.1 s)",
         "|derivative(0.07 s)|to(rpm)",
     ):
@@ -155,6 +156,10 @@ def test_an_unwrapped_angle_is_the_angle_without_jumps() -> None:
     wrapped = np.angle(np.exp(1j * truth))
     found = Expression.parse("/odom:a.yaw|unwrap").apply(wrapped, np.arange(500), "rad")
     np.testing.assert_allclose(found, truth, atol=1e-12)
+    compass = np.rad2deg(truth) % 360.0 + np.where(np.arange(500) == 0, 359.9, 0.0)
+    found = Expression.parse("/boat:heading|unit(deg)|unwrap").apply(compass, np.arange(500), "")
+    np.testing.assert_allclose(found[0], -0.1, atol=1e-9)
+    np.testing.assert_allclose(found[1:], np.rad2deg(truth)[1:], atol=1e-9)
 
 
 def drive(path: Path, *, stamped: bool = True, count: int = 200) -> Path:
