@@ -150,14 +150,22 @@ def state_affine(
     trail.add(CertifiedRse, lambda method: _certified(problem, trail, method))
 
     def last_step(method: CertifiedSem) -> StateAffineModel:
-        last = _certified(problem, trail, method)
+        """From the best proved model at hand, and from the certified iterates where they are few
+        unknowns or there is no other start.
+        """
         at_hand = [c.model for c in trail.candidates if c.proof is not None]
-        at_hand.sort(key=lambda model: simulation_percent(model, train))
-        proofs = [(start, prove_stability(start)) for start in (last, *at_hand[:1])]
-        reached = [descend_certified(problem, start, p) for start, p in proofs if p is not None]
+        starts = [_least_error(at_hand, train)] if at_hand else []
+        if problem.is_bounded_by_leading or not starts:
+            starts.append(_certified(problem, trail, method))
+        proofs = [(start, prove_stability(start)) for start in starts]
+        reached = [
+            descend_certified(problem, start, proof, steps=method.iterations)
+            for start, proof in proofs
+            if proof is not None
+        ]
         if not reached:
             raise Infeasible("no proof for the last certified iterate, where the last step starts")
-        return min(reached, key=lambda model: simulation_percent(model, train))
+        return _least_error(reached, train)
 
     trail.add(CertifiedSem, last_step)
     return trail
