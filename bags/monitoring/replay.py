@@ -18,6 +18,7 @@ from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.tubes import FADES
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -132,7 +133,9 @@ class Replay:
 
 
 def _starting(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
+    """Whether the reading is of the samples that give a run its measured start."""
+    waits = reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
+    return waits and FADES not in reading.reason
 
 
 def _unjudged(reading: Reading) -> bool:

@@ -34,6 +34,7 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
+FADES = "the start fades"
 
 
 class TubeRun:
@@ -184,11 +185,10 @@ class TubeRun:
             return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
         if all(map(math.isfinite, (*y.tolist(), *u.tolist()))):
             return ""
-        for values, signals, why in ((y, self._stepper.y, "it is {}".format),
-                                     (u, self._stepper.u, unsaid)):  # fmt: skip
+        for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
             for value, signal in zip(values.tolist(), signals, strict=True):
                 if not math.isfinite(value):
-                    return f"no {signal.name} at t = {t:g} s ({why(value)}): nothing is claimed"
+                    return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
     def _without(self, u: FloatArray, fault: str) -> str:
@@ -223,7 +223,7 @@ class TubeRun:
                 return self._unknown(t, y, f"{refused}, at t = {t:g} s")
             self._k = 0
             ended = f", after {self._ended}" if self._ended else ""
-            return self._unknown(t, y, f"{STARTING} {self.lags} samples: the start fades{ended}")
+            return self._unknown(t, y, f"{STARTING} {self.lags} samples: {FADES}{ended}")
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))
