@@ -190,10 +190,9 @@ def one_in_parts(bag: Path, cache: Path, seconds: float) -> list[Path]:
 
 
 def parts(bag: Path, seconds: float) -> list[Path]:
-    """The bag cut every so many seconds, once; a rest of less than half of that is left out."""
+    """The bag cut every so many seconds, once."""
     made = sorted(bag.parent.glob(f"{bag.stem}_part_[0-9][0-9]"))
-    made = made or split(bag, bag.parent / f"{bag.stem}_part", every=seconds)
-    return made[:-1] if len(made) > 1 else made
+    return made or split(bag, bag.parent / f"{bag.stem}_part", every=seconds)
 
 
 ROBOTS = (

@@ -344,9 +344,9 @@ class Excitation(ManagedNode):
     def _report(self) -> None:
         values = {
             "input": f"{self._input:.6g}",
-            "sample": str(self._next),
+            "sample": "none" if self._next is None else str(self._next),
             "of": str(len(self._once)),
-            "repeat": str(self._repeat + 1),
+            "repeat": str(min(self._repeat + 1, self._repeats)),
         }
         level = DiagnosticStatus.ERROR if self._failed else DiagnosticStatus.OK
         now = self.get_clock().now().to_msg()

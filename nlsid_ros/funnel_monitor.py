@@ -32,6 +32,7 @@ from bags.designs.design import AnyDesign
 from bags.monitoring.announcement import Run
 from bags.monitoring.watch import WAITING, Stamped, Watch
 from bags.signals.grid import seconds
+from bags.signals.sampling import said_filled
 from bags.viewing.drawn import HalfWidths, signal_names
 from nlsid_core import files
 from nlsid_core.errors import BagError, DataError, NlsidError
@@ -476,9 +477,12 @@ class FunnelMonitor(ManagedNode):
             "alarm": reading.alarm,
             "time in run [s]": f"{reading.t:.9g}",
             "judged": str(self._judged),
+            "judged in this run": str(watch.judged if watch else 0),
+            "lost": str(watch.lost if watch else 0),
+            "filled in": said_filled(watch.filled, watch.samples) if watch else "",
             "late commands": str(watch.pairing.late if watch else 0),
             "duplicate responses": str(watch.pairing.duplicate_responses if watch else 0),
-            "design": self._funnel.state,
+            "design": self._funnel.state.partition("\n")[0],
             "signals": self._names,
             "slowest of the last second [ms]": f"{self._slowest_ns * 1e-6:.3f}",
         }

@@ -64,7 +64,7 @@ REPORT = 1.0  # s between diagnostics while nothing changes
 BIG = 1e9
 LOOK = 0.02  # s between looks at whether responses come, commands go and the monitor judges
 ENDED = ("the plan is over", "the proof is over")  # as it should
-ASKED = ("asked to", "the node stops")
+ASKED = ("asked to by ~/stop", "the node stops")
 LIMITS = [field.name for field in fields(Limits)]
 
 
@@ -400,7 +400,7 @@ class TrackingController(ManagedNode):
 
     def _on_stop(self, _request: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
         answer.success, answer.message = True, "stopping" if self._controller else "not running"
-        self._halt("asked to")
+        self._halt(ASKED[0])
         return answer
 
     def _tell(self, text: str) -> None:

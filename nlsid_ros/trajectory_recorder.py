@@ -151,6 +151,8 @@ class TrajectoryRecorder(ManagedNode):
         self._clock_of_log = LogClock()
         if self._at_once:
             self._begin()
+        else:
+            self.get_logger().info("waiting for ~/start")
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", qos.EVENTS)
         self._topics = Subscriptions(
             self,
@@ -180,7 +182,15 @@ class TrajectoryRecorder(ManagedNode):
         self._topics.take()
         self._topics.drop_all()
         if self._recording is not None:
-            self._recording.close()
+            self._close(self._recording)
+
+    def _close(self, recording: Recording) -> str:
+        """Close it; what is then to be said of it."""
+        recording.close()
+        said = recording.ended or f"{recording.bag.path} is closed"
+        if not recording.ended:
+            self.get_logger().info(said)
+        return said
 
     def _take(self) -> None:
         """Write what has arrived; before there is simulated time it waits."""
@@ -286,10 +296,9 @@ class TrajectoryRecorder(ManagedNode):
         if self._recording is None:
             return False, "nothing is being recorded"
         self._take()
-        self._recording.close()
-        ended, path = self._recording.ended, self._recording.bag.path
-        self._recording = None
-        return not ended, ended or f"{path} is closed"
+        recording, self._recording = self._recording, None
+        said = self._close(recording)
+        return not recording.ended, said
 
     def _on_pause(self, pause: bool) -> tuple[bool, str]:
         if self._recording is None:

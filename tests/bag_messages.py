@@ -1,6 +1,6 @@
 """Serialised standard messages and small bags for the tests of bags."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -75,8 +75,12 @@ def speed_bag(
     start_ns: int = START_NS,
     stamps_ns: Iterable[int] | None = None,
     custom: dict[str, str] | None = None,
+    lost: Container[int] = (),
 ) -> Path:
-    """A bag of speeds on /odom and commands on /cmd_vel, one of each every 25 ms by default."""
+    """A bag of speeds on /odom and commands on /cmd_vel, one of each every 25 ms by default.
+
+    lost: numbers of the speeds that are not in it.
+    """
     pairs = list(zip(speeds, commands, strict=True))
     stamps = list(stamps_ns or (start_ns + k * PERIOD_NS for k in range(len(pairs))))
     with BagWriter(path, custom=custom) as bag:
@@ -84,5 +88,6 @@ def speed_bag(
             log = start_ns + k * PERIOD_NS
             times = {"log_time_ns": log, "publish_time_ns": log}
             bag.write(CMD, CMD_TYPE, command(stamp, value), **times)
-            bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
+            if k not in lost:
+                bag.write(ODOM, ODOM_TYPE, odometry(stamp, speed), **times)
     return path

@@ -1,6 +1,7 @@
 """Funnel problems in files: dynamics, nominal, goal and weights as one JSON document."""
 
 import dataclasses
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,23 +9,32 @@ from typing import Literal
 
 import numpy as np
 
+from bags.monitoring.catching import Breaking, breaking
+from bags.signals.grid import read_dataset
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import ContinuousTracking, FunnelDesign, Goal, design
-from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
+from nlsid_core.dynamics import (
+    MeasuredPush,
+    Nominal,
+    PiecewisePolynomial,
+    VectorField,
+    measured_push,
+)
 from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
 MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "nominal", "goal",
-           "Q", "R", "limits", "hold", "error")  # fmt: skip
+           "Q", "R", "limits", "hold", "error", "push")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class FunnelProblem:
     """`ContinuousTracking` with a vector field, in its words.
 
-    limits: (L, 3) rows (input, low, high) at which inputs saturate. A file has format, version,
+    limits: (L, 3) rows (input, low, high) at which inputs saturate. push: what recordings differ
+    from `field` by, for which the funnel is proved too. A file has format, version,
     vector_field, nominal and goal; the rest may be left out.
     """
 
@@ -39,6 +49,7 @@ class FunnelProblem:
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
+    push: MeasuredPush | None = None
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -61,6 +72,7 @@ class FunnelProblem:
             "limits": self.limits.tolist(),
             "hold": self.hold,
             "error": None if self.error is None else self.error.tolist(),
+            "push": None if self.push is None else self.push.document(),
         }
 
     @classmethod
@@ -100,6 +112,7 @@ class FunnelProblem:
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
+            _push(document, field.n, source),
         )
 
     def design(
@@ -107,7 +120,7 @@ class FunnelProblem:
     ) -> FunnelDesign:
         """Solve it, its L-steps shared by an executor; raises as `nlsid_core.design.design`."""
         problem = ContinuousTracking(
-            self.field,
+            self.field if self.push is None else self.field.pushed(self.push.box),
             self.nominal,
             goal=self.goal,
             shape=self.shape,  # type: ignore[arg-type]  # checked by the problem
@@ -120,6 +133,31 @@ class FunnelProblem:
             error=self.error,
         )
         return design(problem, executor=executor, progress=progress)
+
+
+def measured(
+    path: Path,
+    bags: Sequence[Path],
+    *,
+    responses: Sequence[str],
+    excitations: Sequence[str],
+    period: float | None,
+    seconds: float | None,
+    safety_factor: float,
+    resample: str = "none",
+) -> tuple[FunnelProblem, Breaking]:
+    """The problem of a file with what its equations leave out of bags; and what would break that.
+
+    responses, excitations: its states and inputs as signals. For the rest see `measured_push` and
+    `read_dataset`, whose errors pass through.
+    """
+    problem = FunnelProblem.load(path)
+    trials = read_dataset(
+        bags, responses=responses, excitations=excitations, period=period, resample=resample
+    )
+    push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
+    found = breaking(trials, lambda trial: push.used(problem.field, trial))
+    return dataclasses.replace(problem, push=push), found
 
 
 def _array(
@@ -146,3 +184,13 @@ def _goal(document: Json, n: int, source: str) -> Goal | None:
     goal = files.member(document, "goal", dict, source=source)
     centre = files.array(goal, "centre", (n,), source=source)
     return Goal(np.array(centre), np.array(files.array(goal, "P", (n, n), source=source)))
+
+
+def _push(document: Json, n: int, source: str) -> MeasuredPush | None:
+    if document.get("push") is None:
+        return None
+    given = files.member(document, "push", dict, source=source)
+    push = MeasuredPush.from_document(given, source=f"{source} push")
+    if push.largest.shape[1] != n:
+        raise DocumentError(f"{source}: the push is of {push.largest.shape[1]} states, not {n}")
+    return push

@@ -16,7 +16,7 @@ from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
-from bags.signals.grid import read_dataset, skipped_samples
+from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
@@ -32,13 +32,15 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
 
 LEAST_APART: Final = 3  # trials: of two nobody can say which is the odd one
+LARGER: Final = 20.0  # times the largest value of most trials: hardly the same unit
 
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """The bags' trials by what they are for, and how many samples were skipped in gaps.
+    """The bags' trials by what they are for.
 
-    absent: names in the configuration's split that none of the bags has.
+    skipped: samples that were left out in gaps; filled: those nobody measured. absent: names
+    in the configuration's split that none of the bags has.
     """
 
     train: Dataset
@@ -46,6 +48,7 @@ class Trials:
     validation: Dataset | None = None
     calibration: Dataset | None = None
     skipped: int = 0
+    filled: int = 0
     absent: tuple[str, ...] = ()
 
     @property
@@ -59,7 +62,8 @@ class Trials:
     def apart(self) -> list[str]:
         """Trials where a signal is nowhere near what it is in all others, in words for people.
 
-        That is by more than the others' range: kelvin among degC, another sensor, another zero.
+        That is by more than the others' range: kelvin among degC, another sensor, another zero; or
+        many times larger than in most of them: mm among m.
         """
         trials = self.every
         if len(trials) < LEAST_APART:
@@ -72,6 +76,14 @@ class Trials:
             for k, trial in enumerate(trials)
             for low, high in [(np.delete(lows, k).min(), np.delete(highs, k).max())]
             if max(lows[k] - high, low - highs[k]) > max(high - low, highs[k] - lows[k])
+        ] + [
+            f"{trial.name}: {signal.name} is up to {largest[k]:.4g} {signal.unit}, in most trials "
+            f"up to {np.median(largest):.4g}; is it in another unit?"
+            for letter in ("y", "u")
+            for signal, lows, highs in _ranges(trials, letter)
+            for largest in [np.maximum(-lows, highs)]
+            for k, trial in enumerate(trials)
+            if largest[k] > LARGER * np.median(largest) > 0.0
         ]
 
 
@@ -212,7 +224,8 @@ def by_use(labelled: Dataset, config: Config) -> Trials:
         )
     named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
-    return replace(trials, skipped=skipped_samples(labelled), absent=absent)
+    skipped, filled = skipped_samples(labelled), filled_samples(labelled)
+    return replace(trials, skipped=skipped, filled=filled, absent=absent)
 
 
 def _labelled(

@@ -325,7 +325,9 @@ def split(
     repeats: Annotated[
         str | None, typer.Option(help="A signal whose repetitions become the parts.")
     ] = None,
-    every: Annotated[float | None, typer.Option(help="s per part.")] = None,
+    every: Annotated[
+        float | None, typer.Option(help="s per part; a rest shorter than half goes with the last.")
+    ] = None,
 ) -> None:
     """Copy a bag in parts: at the repeats of an excitation, or every so many seconds."""
     from bags.tools import edit

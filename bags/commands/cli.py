@@ -314,6 +314,45 @@ def funnel(
 
 
 @app.command()
+def push(
+    bags: BagsArgument,
+    problem: Annotated[Path, typer.Option(help="The problem whose equations are compared.")],
+    out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
+    response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
+    command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
+    period: PeriodOption = 0.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
+    ] = 0.0,
+    safety_factor: Annotated[
+        float, typer.Option(min=1.0, help="Of the box over the largest push that was measured.")
+    ] = 1.5,
+    resample: Annotated[
+        str, typer.Option(help="none, last or linear: see grid.resample.")
+    ] = "none",
+) -> None:
+    """Measure on bags how far a problem's equations are off; `nlsid funnel` proves with that.
+
+    States and inputs in the equations' order and units. The problem that is written has a member
+    `push`: the largest of each trial with its digest.
+    """
+    from bags.chain.problems import measured
+    from bags.commands import show
+    from bags.recordings.folders import expand_bags
+    from nlsid_core import files
+
+    given, broken = measured(
+        problem, expand_bags(bags), responses=response, excitations=command, period=period or None,
+        seconds=seconds or None, safety_factor=safety_factor, resample=resample,
+    )  # fmt: skip
+    files.write_document(out_file, given.document())
+    assert given.push is not None  # `measured` has just measured it
+    out.print(str(given.push), soft_wrap=True, markup=False)
+    out.print(show.breaking_table(broken))
+    out.print(f"wrote {out_file}", soft_wrap=True)
+
+
+@app.command()
 def compose(
     proofs: Annotated[
         list[Path], typer.Argument(help="funnel.proof.json files, in the order of time.")
@@ -464,9 +503,12 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
-    folders = expand_bags(bags)
+    folders = every = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in folders if trial_name(f) in settings.split.test] or folders
+        folders = [f for f in every if trial_name(f) in settings.split.test] or every
+    if len(folders) < len(every):
+        said = f"{len(folders)} of {len(every)} bags: those in split.test of {config}"
+        out.print(f"{said}; without --config all are judged", soft_wrap=True)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
@@ -490,6 +532,8 @@ def monitor(
         if (alarm := entry.first_alarm) is not None:
             said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
             out.print(said, soft_wrap=True)
+        if entry.filled:
+            out.print(f"{entry.name}: {entry.said_filled}", soft_wrap=True)
         for reading in entry.unjudged[:UNJUDGED_SAID]:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
@@ -649,6 +693,7 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) ->
     from bags.chain.problems import FunnelProblem
     from bags.designs import documents
     from bags.pictures.report import report_available
+    from nlsid_core import files
 
     given = FunnelProblem.load(problem)
     with progress_bar("designing") as progress, workers.sharing() as executor:
@@ -662,6 +707,11 @@ def _funnel_around_trajectory(problem: Path, out_dir: Path, workers: Workers) ->
         write_funnel_picture(picture, design)
         out.print(f"wrote {picture}", soft_wrap=True)
     out.print(str(design), soft_wrap=True)
+    if given.push is not None:
+        path = out_dir / documents.PUSH
+        files.write_document(path, given.push.document())
+        out.print(f"wrote {path}", soft_wrap=True)
+        out.print(f"measured, not proved: {given.push}", soft_wrap=True, markup=False)
 
 
 def main() -> None:

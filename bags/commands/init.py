@@ -8,12 +8,14 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
+from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
 from bags.setup.candidates import Candidate, Found, look
 from bags.setup.proposal import Proposal, choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.expressions import parse_factors
+from bags.signals.reader import expanded
 from nlsid_core.errors import DataError
 from nlsid_core.files import write_atomically
 
@@ -43,6 +45,15 @@ def run_init(
     types = read_definitions(definitions)
     console.print(f"looking into {len(folders)} bag{'s' * (len(folders) != 1)}", soft_wrap=True)
     found = look(folders, definitions=types)
+    with Bag(folders[0], definitions=types) as bag:
+        responses, excitations = (
+            [
+                element
+                for text in texts
+                for element in (expanded(bag, [text]) if "[*]" in text else [text])
+            ]
+            for texts in (responses, excitations)
+        )
     asked = not yes and not (responses and excitations)
     if asked and not sys.stdin.isatty():
         raise DataError(
@@ -77,6 +88,7 @@ def run_init(
         console.print(f"{text}: {proposal.why[text]}", soft_wrap=True, markup=False)
     for wall in dict.fromkeys(proposal.walls):
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
+    console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
     given = "TRIALS" if live else " ".join(map(str, bags))
     if live:

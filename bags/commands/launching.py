@@ -81,7 +81,7 @@ class LaunchFile:
             f"  {a.name}:={'...' if a.default is None else a.default}  {a.description}"
             for a in self.arguments
         ]
-        return "\n".join([f"{self.path.name} are", *lines])
+        return "\n".join([f"{self.path.name}:", *lines])
 
 
 def in_one_process(commands: Sequence[Sequence[str]]) -> list[str]:

@@ -14,10 +14,11 @@ from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
-from bags.monitoring.catching import WIDE, Catching, Caught
+from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
+from bags.signals.sampling import said_filled
 from bags.viewing.drawn import signal_names
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.design import OutputTubeDesign
@@ -92,6 +93,8 @@ def notes(result: Identified) -> list[str]:
         lines += str(scores).splitlines()
     if result.trials.skipped:
         lines.append(f"{result.trials.skipped} samples skipped in gaps")
+    if said := said_filled(result.trials.filled, sum(map(len, result.trials.every))):
+        lines.append(said)
     lines += result.trials.apart
     if result.trials.absent:
         lines.append(f"split names {', '.join(result.trials.absent)}, and no bag is called so")
@@ -263,6 +266,16 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
         said = f"{word}{line}"
         console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def breaking_table(found: Breaking) -> Table:
+    """By fault, how many of the copies that have it break what a proof assumes."""
+    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
+    table.add_column("fault")
+    table.add_column("broken", justify="right")
+    for fault, count in found.counts.items():
+        table.add_row(fault, f"{count} of {found.trials}")
+    return table
 
 
 def width_lines(catching: Catching) -> list[str]:

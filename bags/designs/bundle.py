@@ -50,13 +50,14 @@ class Bundle:
         funnel = Path(funnel)
         folder = funnel.parent
         composed = funnel.name == designs.COMPOSITION
-        proof = (funnel if composed else folder / designs.PROOF).read_bytes()
+        named = funnel.read_bytes()
+        proof = named if composed else (folder / designs.PROOF).read_bytes()
         contents = {PROOF: proof, **_beside(folder, proof)}
         for stage in list(contents) if composed else []:
             if stage != PROOF:
                 inner = _beside(folder, contents[stage])
                 contents |= {f"{stage}.{role}": content for role, content in inner.items()}
-        if not composed and contents.get("funnel") != funnel.read_bytes():
+        if not composed and contents.get("funnel") != named:
             raise CertificateMismatch(f"{designs.PROOF} beside {funnel} is not about this funnel")
         bundle = cls(contents)
         _refuse_size(bundle.text())

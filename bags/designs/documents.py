@@ -31,6 +31,7 @@ FUNNEL_PLOT = "funnel.png"
 CATCHING_PLOT = "catching.png"
 FREE_RUN_PLOT = "free_run.png"
 MOTION_PLOT = "motion.png"
+PUSH = "push.json"  # what recordings differ from given equations by
 
 
 def load_stable_model(path: Path | str) -> StableModel:

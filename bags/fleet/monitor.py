@@ -49,7 +49,8 @@ class Judged:
     broken first, in words. spent: the largest part of what is assumed that was used (None: not
     measured), at spent_at, s of the run. margin: the least (None: nothing judged), margin_at: s.
     start: of the bag, spent_when, and bad_from: of the first bad sample, all ISO 8601 in UTC.
-    alarm: of the second alarm. judged, span: s. digest: of the recording.
+    alarm: of the second alarm. judged, span: s. filled: samples nobody
+    measured. digest: of the recording.
     """
 
     bag: str
@@ -67,6 +68,7 @@ class Judged:
     alarm: str = ""
     judged: float = 0.0
     span: float = 0.0
+    filled: int = 0
     digest: str = ""
 
     @property
@@ -113,6 +115,7 @@ class JudgeBag:
             alarm="" if alarm is None else alarm.alarm,
             judged=replay.judged_span,
             span=replay.span,
+            filled=replay.filled,
             digest=bag_origin(bag)["digest"],
         )
         return files.canonical(asdict(judged))

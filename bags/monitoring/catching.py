@@ -5,7 +5,7 @@ the same `Monitor` as a bag or a live robot.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from statistics import median
 from typing import Any
@@ -26,6 +26,7 @@ UNTOUCHED = "untouched"
 BIAS = 0.1  # of the range of each output
 DELAY = 5  # samples
 LOST = 5  # samples
+NOT_THERE = "lost"
 WIDE = 0.5  # of the range: a tube of a larger half-width says little
 OUTLIER = 4.0  # times the median trial's share of the level: twice its amplitude
 
@@ -47,7 +48,7 @@ class Copy:
     lost: frozenset[int] = frozenset()
 
 
-Fault = Callable[[Trajectory, FloatArray, StableModel], Copy]  # of a trial, its outputs' ranges
+Fault = Callable[[Trajectory, FloatArray, Any], Copy]  # of a trial, its outputs' ranges
 
 
 def _scaled(factor: float) -> Fault:
@@ -101,6 +102,37 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
     ("actuator x 0.8", _weak),
     (f"{LOST} samples lost", _dropped),
 )
+
+
+def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
+    """What a robot records that does the same although 0.8 of its command arrives."""
+    return Copy(trial.t, trial.y, trial.u / 0.8)
+
+
+# Of recorded states: none needs a model, and the recording itself says what the robot did.
+OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _commanded_more))
+
+
+@dataclass(frozen=True)
+class Breaking:
+    """By fault, in how many of so many trials a copy with it breaks what a proof assumes."""
+
+    trials: int
+    counts: dict[str, int]
+
+
+def breaking(trials: Dataset, used: Callable[[Trajectory], float]) -> Breaking:
+    """What an assumption about recordings of states (y) and inputs would tell from a sound robot.
+
+    used: the largest part of the assumption that a recording shows; above 1 it is broken. Every
+    copy is what a robot with that fault records under the same inputs at its actuators.
+    """
+    ranges = np.ptp(np.vstack([trial.y for trial in trials]), axis=0)
+    counts = {}
+    for name, fault in OF_STATES:
+        copies = [(trial, fault(trial, ranges, None)) for trial in trials]
+        counts[name] = sum(used(replace(trial, y=c.y, u=c.u)) > 1.0 for trial, c in copies)
+    return Breaking(len(trials), counts)
 
 
 @dataclass(frozen=True)
@@ -329,9 +361,11 @@ def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:
     widths: list[Sequence[float]] = []
     bad, alarm, lost, share = None, None, False, 0.0
     for k, (t, y, u) in enumerate(zip(copy.t.tolist(), copy.y, copy.u, strict=True)):
-        if k in copy.lost:
-            continue
         sample: tuple[Any, Any] = (float(y[0]), float(u[0])) if single else (y, u)
+        if k in copy.lost:
+            monitor.unmeasured(t, sample[1], NOT_THERE)
+            lost = True
+            continue
         reading = monitor.update(t, *sample)
         if reading.status is Status.UNKNOWN:
             lost = lost or (bool(times) and not reading.reason.startswith(OVER))

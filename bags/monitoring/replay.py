@@ -14,11 +14,11 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
-from nlsid_core.running.reading import Reading, Status
-from nlsid_core.running.tubes import FADES
+from nlsid_core.running.reading import Reading, Status, cause
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
@@ -45,7 +45,7 @@ class Replay:
     @property
     def span(self) -> float:
         """S of the run, from the first sample after those that start it to the last."""
-        stamps = [r.t for r in self.readings if not _starting(r)]
+        stamps = [r.t for r in self.readings if not r.starts]
         return stamps[-1] - stamps[0] + self.period if stamps else 0.0
 
     @property
@@ -64,22 +64,40 @@ class Replay:
         return found
 
     @property
+    def filled(self) -> int:
+        """How many samples nobody measured: they are filled in between others, and not judged."""
+        return sum(map(_filled, self.readings))
+
+    @property
+    def said_filled(self) -> str:
+        """The same in words, of how many; empty if there is none."""
+        count = sum(not reading.starts for reading in self.readings)
+        return said_filled(self.filled, count)
+
+    @property
     def unjudged(self) -> tuple[Reading, ...]:
         """The first reading of every stretch that was not judged, starts left out.
 
-        Of samples that never came, one that says so.
+        Of samples that never came, one that says so; of filled ones, one where they are more than
+        MOST_FILLED of all.
         """
         said, found = "", []
+        if self.filled > MOST_FILLED * len(self.readings):
+            first = next(filter(_filled, self.readings))
+            reason = f"{self.said_filled}: more than {100 * MOST_FILLED:g} %"
+            found.append(first._replace(reason=reason))
         before: Reading | None = None
         for reading in self.readings:
-            starts = before is not None and _starting(before) and _starting(reading)
+            if reading.reason == LOST:
+                continue  # the next one that came says how many
+            starts = before is not None and before.starts and reading.starts
             if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
                 if lost > 0:
                     reason = f"{lost} samples are missing"
                     t = before.t + self.period
                     found.append(Reading(t, Status.UNKNOWN, reason=reason))
-            again, said = said, reading.reason if _unjudged(reading) else ""
+            again, said = said, cause(reading.reason) if _unjudged(reading) else ""
             if said and said != again:
                 found.append(reading)
             before = reading
@@ -115,7 +133,8 @@ class Replay:
     def verdict(self) -> str:
         """The status at the first bad sample, else inside, else unknown.
 
-        Inside says that every sample was judged; those that start a run are not counted.
+        Inside says that every sample was judged; those that start a run are not counted, nor up to
+        MOST_FILLED that are filled in.
         """
         if self.first_bad is not None:
             return self.first_bad.status.value
@@ -132,14 +151,12 @@ class Replay:
         return "" if self.judged or not self.readings else self.readings[-1].reason
 
 
-def _starting(reading: Reading) -> bool:
-    """Whether the reading is of the samples that give a run its measured start."""
-    waits = reading.status is Status.UNKNOWN and reading.reason.startswith("waiting for ")
-    return waits and FADES not in reading.reason
+def _filled(reading: Reading) -> bool:
+    return reading.reason.startswith(FILLED)
 
 
 def _unjudged(reading: Reading) -> bool:
-    return reading.status is Status.UNKNOWN and not _starting(reading)
+    return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
 
 
 def replay_bag(

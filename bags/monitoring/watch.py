@@ -9,7 +9,7 @@ import numpy as np
 
 from bags.designs.design import AnyDesign
 from bags.signals.grid import seconds
-from bags.signals.sampling import NOT_FINITE, Sample
+from bags.signals.sampling import LOST, NOT_FINITE, Sample
 from nlsid_core.arrays import FloatArray
 from nlsid_core.running.alarm import Alarm, AlarmOptions, State
 from nlsid_core.running.comparison import Centre
@@ -57,9 +57,11 @@ class Watch:
 
     A run begins with the first complete sample, or, if `announced`, at the stamp given to `begin`;
     the samples before it then give the observer its state, and runs may follow each other. Time in
-    the readings is s since the run's first sample or announced start. steps: samples that a
-    forecast is followed for before the next one, in `forecasts`; 0: none is made. `pairing.check`
-    says whether messages have the signals, `pairing.stamp` which of their times is the stamp.
+    the readings is s since the run's first sample or announced start. samples: since then; lost,
+    filled: those of them that nobody measured, and so not judged (`LOST`, `Sample.filled`); judged:
+    since a run began, which may have been by itself. steps: samples that a forecast is followed for
+    before the next one, in `forecasts`; 0: none is made. `pairing.check` says whether messages have
+    the signals, `pairing.stamp` which of their times is the stamp.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class Watch:
         self.monitor.restart()
         self._alarm.restart()
         self.origin_ns: int | None = None
+        self.samples = self.lost = self.filled = self.judged = 0
         self._newest_ns = 0
         self._newest: dict[str, tuple[int, tuple[float, ...]]] = {}  # of each response topic
         self._recent: deque[Sample] = deque(maxlen=HELD if self._announced else 0)
@@ -195,6 +198,9 @@ class Watch:
     def _judge(self, samples: Sequence[Sample]) -> list[Stamped]:
         judged = []
         for sample in samples:
+            lost = sample.missing == LOST
+            if lost and not self.monitor.goes_on:
+                continue  # the monitor says which
             if self.origin_ns is None:
                 self.origin_ns = sample.stamp_ns
             if self._start_ns is not None and sample.stamp_ns >= self._start_ns:
@@ -213,7 +219,16 @@ class Watch:
             ):
                 reading = self.monitor.missing(t, sample.missing)
             else:
-                reading = self.monitor.update(t, y, u)
+                reading = (
+                    self.monitor.unmeasured(t, u, sample.missing if lost else sample.filled)
+                    if lost or sample.filled
+                    else self.monitor.update(t, y, u)
+                )
+                self.samples += 1
+                self.lost += lost
+                self.filled += bool(sample.filled)
+                judged_now = reading.status is not Status.UNKNOWN
+                self.judged = 0 if reading.waits else self.judged + judged_now
                 self._held = sample.stamp_ns, u
                 if self._steps:
                     self._look_ahead(reading, np.atleast_1d(u))

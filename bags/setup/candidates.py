@@ -18,13 +18,14 @@ from bags.recordings.definitions import Definition
 from bags.recordings.message_types import is_stamped
 from bags.signals.columns import Columns, expand_paths, read_columns
 from bags.signals.delays import Delay, delay
-from bags.signals.expressions import derivative
+from bags.signals.expressions import derivative, turn_of
 from bags.signals.signal import ANGLES, SignalPath
 from bags.signals.units import per_second
 from bags.tools.listing import Listed, bag_signals
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError, DataError
 
+SHOWN: Final = 4  # of what never varies
 EXPLORED: Final = 5  # bags that are looked into, spread over all of them
 MOST_ELEMENTS: Final = 16  # of an unnamed array that are candidates; more is a picture or a scan
 MOST_CANDIDATES: Final = 256
@@ -35,6 +36,8 @@ WINDOW: Final = 5  # messages of a slope
 OTHER_KIND_LIKED: Final = 0.7  # a rate for a reference position; positions that add up a command
 HELD: Final = 0.5  # of the messages repeat the value before: a command, or a robot at rest
 HELD_IS_DRIVEN: Final = 0.05  # for what neither type nor name says the role of
+LEAP: Final = 0.9  # of a turn, from one message to the next: the angle begins again
+ROOM: Final = 1.1  # turns that such an angle, with its noise, lies in
 SLOPES_LIKED: Final = 0.95  # against a rate that is measured
 OTHER_JOINT_LIKED: Final = 0.8  # against the same joint's
 COMMANDS: Final = {  # message types that command; the others are taken by their names
@@ -102,7 +105,8 @@ class Candidate:
     @property
     def is_position(self) -> bool:
         """Whether it is a position or an angle, which may add up what drives it for ever."""
-        return "|derivative" not in self.text and bool(POSITION.search(_field(self.text)))
+        named = POSITION.search(_field(self.text)) or "|unwrap" in self.text
+        return "|derivative" not in self.text and bool(named)
 
     def __str__(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
@@ -131,10 +135,11 @@ class Pair:
 
 @dataclass(frozen=True)
 class Found:
-    """What a look into bags found; pairs: the best first."""
+    """What a look into bags found; pairs: the best first; still: what measures and never varies."""
 
     candidates: tuple[Candidate, ...]
     pairs: tuple[Pair, ...]
+    still: tuple[str, ...] = ()
 
     def commands(self) -> list[Candidate]:
         """What may drive the robot, the best first."""
@@ -175,7 +180,8 @@ def look(bags: Sequence[Path], *, definitions: Mapping[str, Definition] | None =
     varying = tuple(c for c in candidates.values() if c.high > c.low)
     if not varying:
         raise BagError(f"no number varies in {', '.join(path.name for path in explored)}")
-    return Found(varying, tuple(_pairs(varying, series)))
+    still = (c for c in candidates.values() if c.low == c.high and c.command < 0.5)
+    return Found(varying, tuple(_pairs(varying, series)), tuple(c.text for c in still)[:SHOWN])
 
 
 def _of_bag(
@@ -229,10 +235,13 @@ def _forms(
     text: str, unit: str, columns: Columns, values: FloatArray
 ) -> Iterator[tuple[str, FloatArray, str]]:
     """The number, and of a position its slope too: what integrates a command follows it in that."""
-    angle = text.rpartition(".")[2] in ANGLES
-    numbers = np.unwrap(values) if angle and np.isfinite(values).all() else values
-    yield (f"{text}|unwrap" if angle else text), numbers, unit
-    if not POSITION.search(_field(text)):
+    written, unit, turn = text, *_turning(text, unit, values)
+    if turn:
+        written = f"{text}|unwrap" if unit != "deg" else f"{text}|unit(deg)|unwrap"
+    finite = turn and np.isfinite(values).all()
+    numbers = np.unwrap(np.r_[0.0, values], period=turn)[1:] if finite else values
+    yield written, numbers, unit
+    if not (turn or POSITION.search(_field(text))):
         return
     stamps = columns.log_ns if columns.stamp_ns is None else columns.stamp_ns
     usable = np.isfinite(numbers) & (np.diff(stamps, prepend=stamps[:1] - 1) > 0)
@@ -242,8 +251,23 @@ def _forms(
     slopes = np.full(len(numbers), np.nan)
     with suppress(BagError):
         slopes[usable] = derivative(numbers[usable], stamps[usable], window)
-        written = f"{text}|unwrap" if angle else text
         yield f"{written}|derivative({window:g} s)", slopes, per_second(unit)
+
+
+def _turning(text: str, unit: str, values: FloatArray) -> tuple[str, float]:
+    """The unit of an angle that begins again after a whole turn, and that turn; else 0.
+
+    An angle is known by its name, or by leaps of a turn, as a compass from 0 to 360 makes.
+    """
+    if text.rpartition(".")[2] in ANGLES:
+        return unit, turn_of(unit)
+    steps = np.abs(np.diff(values[np.isfinite(values)]))
+    if unit in ("", "rad", "deg") and len(steps):
+        for named, turn in (("deg", turn_of("deg")), ("rad", turn_of("rad"))):
+            leaps = float(steps.max()) > LEAP * turn and np.ptp(values) < ROOM * turn
+            if leaps and unit in ("", named):
+                return named, turn
+    return unit, 0.0
 
 
 def slope_window(rate: float) -> float:
@@ -266,7 +290,7 @@ def _role(text: str, msgtype: str) -> tuple[float, str]:
     topic, _, field = text.lower().partition(":")
     share, why = 0.5, []
     if msgtype in COMMANDS:
-        share, why = share + 0.3, [f"{msgtype} commands"]
+        share, why = share + 0.3, [f"{msgtype} mostly commands"]
     if msgtype in RESPONSES:
         share, why = share - 0.3, [f"{msgtype} is measured"]
     for words, sign in ((SAYS_COMMAND, 1.0), (SAYS_RESPONSE, -1.0)):

@@ -23,10 +23,12 @@ from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, Pair, slope_window
 from bags.signals.columns import read_columns
+from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
 from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
 from bags.signals.repeats import same_excitation
 from bags.signals.signal import SignalPath
+from bags.signals.timing import held
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
@@ -47,9 +49,7 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-RELATED: Final = 0.3  # correlation below which command and response may be unrelated
-STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
-ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
+GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
@@ -75,6 +75,15 @@ class Proposal:
     why: dict[str, str] = field(default_factory=dict)
     walls: list[str] = field(default_factory=list)
     error: float = math.inf  # %, of the best model that was tried, in simulation
+    tried_on: str = "trials held back"
+
+    @property
+    def expectation(self) -> str:
+        """How good a model will be, as far as what was tried says."""
+        if math.isinf(self.error):
+            return "no model that was tried is stable: expect identification to refuse"
+        grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
+        return f"expect {self.error:.3g} % error in simulation (of {self.tried_on}): {grade}"
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
         """As the later steps read it."""
@@ -92,18 +101,25 @@ def choose(
     """
     if responses and excitations:
         return list(responses), list(excitations)
-    pairs = [
-        pair
-        for pair in found.pairs
-        if (not responses or _same(pair.response.text, responses[0]))
-        and (not excitations or _same(pair.command.text, excitations[0]))
-    ]
-    if not pairs:
-        raise BagError(
-            "no number looks like a command that another one follows; name them with --excitation "
-            "and --response (nlsid bag signals lists what there is)"
-        )
-    return list(responses) or [pairs[0].response.text], list(excitations) or [pairs[0].command.text]
+    best = []
+    for response in responses or [""]:
+        pairs = [
+            pair
+            for pair in found.pairs
+            if (not response or _same(pair.response.text, response))
+            and (not excitations or _same(pair.command.text, excitations[0]))
+            and (pair.score > 0.0 or response or excitations)
+        ]
+        if not pairs:
+            what = f"{response} follows no command" if response else "no number follows another"
+            still = f"; always the same: {', '.join(found.still)}" if found.still else ""
+            raise BagError(
+                f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
+                f"there is){still}"
+            )
+        best.append(pairs[0])
+    commands = dict.fromkeys(pair.command.text for pair in best)
+    return list(responses) or [best[0].response.text], list(excitations) or list(commands)
 
 
 def propose(
@@ -130,6 +146,11 @@ def propose(
     chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
     proposal = Proposal({"robot": robot})
     _say_signals(proposal, chosen, found)
+    if all(any(_unwrapped(s.path) for s in signals) for signals in chosen.values()):
+        proposal.walls.append(
+            "an angle drives and an angle answers: if a trial begins near half a turn, they may "
+            "begin a whole turn apart; leave such trials out, or take |derivative of both"
+        )
     if definitions:
         proposal.content["definitions"] = [str(path) for path in definitions]
     with Bag(bags[0], definitions=types) as bag:
@@ -188,6 +209,11 @@ class _Read:
     longest_tail: float
     u_ranges: tuple[tuple[float, float], ...]
     topics: int
+
+
+def _unwrapped(text: str) -> bool:
+    """Whether it is an angle that goes on over a turn."""
+    return "|unwrap" in text and "|derivative" not in text
 
 
 def _same(candidate: str, named: str) -> bool:
@@ -255,19 +281,22 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                 )
             if best.response.is_position and not best.command.is_position:
                 proposal.walls.append(
-                    f"{y.path} is a position: one that adds up its command for ever is in no model "
-                    f"class; take |derivative({slope_window(best.response.rate):g} s) of it"
+                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
+                    f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
                 )
 
 
 def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
-    unstamped = []
+    unstamped: dict[str, str] = {}
     for signals in chosen.values():
         for expression in (e for signal in signals for e in parse_factors(signal.path)):
             msgtype, types = bag.types_on(expression.path.topic)
             expression.path.check(msgtype, types)
+            named = f"{expression.path.topic} ({msgtype})"
             if not is_stamped(msgtype, types) and msgtype != "tf2_msgs/msg/TFMessage":
-                unstamped.append(f"{expression.path.topic} ({msgtype})")
+                unstamped[named] = "has no header stamp"
+            elif _stamps_are_zero(bag, expression.path):
+                unstamped[named] = "has header stamps that are all 0"
             if msgtype not in standard_types().fielddefs:
                 proposal.walls.append(
                     f"{expression.path.topic} is of type {msgtype}: live, its package has to be "
@@ -275,10 +304,10 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
                 )
     proposal.content["clock"] = "log" if unstamped else "header"
     if unstamped:
-        names = ", ".join(dict.fromkeys(unstamped))
-        proposal.why["clock"] = f"{names} has no header stamp"
+        said = ", ".join(f"{name} {why}" for name, why in unstamped.items())
+        proposal.why["clock"] = said
         proposal.walls.append(
-            f"{names} has no header stamp: samples are paired by the times of logging, live of "
+            f"{said}: samples are paired by the times of logging, live of "
             "arrival, whose jitter becomes part of the model's error"
         )
         pace = _pace(bag)
@@ -289,6 +318,12 @@ def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: 
                 "use_sim_time goes by the simulated one; record with `ros2 bag record "
                 "--use-sim-time`, or give commands a header"
             )
+
+
+def _stamps_are_zero(bag: Bag, path: SignalPath) -> bool:
+    """Whether the publisher of a signal does not fill its header stamps in."""
+    stamps = read_columns(bag, {str(path): path})[path.topic].stamp_ns
+    return stamps is not None and len(stamps) > 0 and not stamps.any()
 
 
 def _pace(bag: Bag) -> float:
@@ -314,7 +349,7 @@ def _read(
     y_paths = [signal.path for signal in chosen["response"]]
     drives = [factors(signal.path) for signal in chosen["excitation"]]
     u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
-    steps, held, tails, bands, ranges, u_steps = [], [], [], [], [], []
+    steps, commanded, bands, ranges, u_steps = [], [], [], [], []
     repeated = 0
     for path in bags:
         read = read_signals(
@@ -329,12 +364,7 @@ def _read(
         last = max(int(read[name].stamp_ns[-1]) for name in y_paths)
         for name in u_paths:
             stamps = read[name].stamp_ns
-            intervals = np.diff(stamps[stamps < last]) / 1e9
-            between = float(intervals.max(initial=0.0))
-            tail = max((last - int(stamps[-1])) / 1e9, 0.0)
-            ended = len(intervals) >= STREAMED and tail > ENDED * between
-            tails.append(tail if ended else 0.0)
-            held.append(between if ended else max(between, tail))
+            commanded.append(held(stamps, last))
             u_steps.append(np.diff(stamps) / 1e9)
         ranges.append([_range([read[name] for name in parts]) for parts in drives])
     every, u_every = np.concatenate(steps), np.concatenate(u_steps)
@@ -350,8 +380,8 @@ def _read(
         longest_gap=float(every.max()),
         band=float(np.median([b for b in bands if b > 0] or [0.0])),
         command_period=float(np.median(u_every)) if len(u_every) else math.inf,
-        longest_held=max(held),
-        longest_tail=max(tails),
+        longest_held=max(each.longest for each in commanded),
+        longest_tail=max(each.tail for each in commanded),
         u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
         topics=len({name.partition(":")[0] for name in y_paths}),
     )
@@ -548,10 +578,10 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
             identify(train, LinearClass(lags), comparators=())
             break
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
-    where = "on what they were fitted to" if alone else "on trials held back"
-    proposal.why["lags"] = f"proved models simulated {where} are off by {said}"
+    proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
+    proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"
     if best > POOR:
-        proposal.walls.append(_poor(best, where.removeprefix("on ")) + _others(proposal, found))
+        proposal.walls.append(_poor(best, proposal.tried_on) + _others(proposal, found))
 
 
 def _followed(proposal: Proposal, found: Found) -> list[Pair]:
@@ -598,7 +628,8 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
     if good.delays is not None:
         section["delays"] = list(good.delays)
         proposal.why["delays"] = "as the lags"
-    shown = sorted(known.items(), key=lambda item: item[1])[:SHOWN]
+    ranked = sorted(known, key=known.__getitem__)
+    shown = [(c, known[c]) for c in dict.fromkeys([*ranked[:SHOWN], good])]
     said = ", ".join(
         f"{c.lags}, {'all' if c.delays is None else c.delays[0]}, {c.right_degree}: {error:.3g} %"
         for c, error in shown

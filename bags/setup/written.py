@@ -19,7 +19,7 @@ HEAD: Final = (
 
 def yaml_text(proposal: Proposal) -> str:
     """The whole file; what the later steps will meet stands at its head."""
-    lines = list(_comment(HEAD))
+    lines = [*_comment(HEAD), *_comment(f"{proposal.expectation}.".capitalize())]
     for wall in dict.fromkeys(proposal.walls):
         lines += _comment(f"Mind: {wall}")
     return "\n".join([*lines, *_section(proposal.content, Config, proposal.why, 0)]) + "\n"

@@ -1,12 +1,15 @@
 """The delay between a command and the response to it."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from scipy.signal import correlate, correlation_lags
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import DataError
+
+RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
 
 
 @dataclass(frozen=True)

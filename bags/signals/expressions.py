@@ -4,7 +4,8 @@ The path is what `bags.signals.signal` reads. Operations after a `|` change the 
 from left to right, and use no later sample, so that a monitor gives the same numbers:
 
 - `unit(U)`: the recorded number is in U. `to(U)`: convert it to U.
-- `unwrap`: an angle in rad without jumps of a turn.
+- `unwrap`: an angle without jumps of a turn, 360 where its unit is deg (see `unit`), else 2π; it
+  begins within half a turn of 0.
 - `derivative(T s)`: the slope over the last T s, see `derivative`.
 
 These say when the signal is sampled (`bags.signals.sampling`):
@@ -42,7 +43,7 @@ TIMED: Final = ("derivative", "hold", "linear", "delay", "lag")  # these take a 
 SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
 DRIVING: Final = ("delay", "lag")  # of what drives only
 SIGNAL_CLOCKS: Final = ("header", "log")
-TURN: Final = 2.0 * np.pi
+TURNS: Final = {"deg": 360.0, "rev": 1.0}  # a whole turn by the number's unit; others are rad
 MIN_SAMPLES: Final = 3  # two give a slope without any smoothing
 BLOCK: Final = 2**20  # samples of neighbourhoods laid side by side at once
 
@@ -153,8 +154,9 @@ class Expression:
                 factor, shift = self._conversion(unit, operation.unit)
                 values, unit = values * factor + shift, operation.unit
             elif operation.name == "unwrap":
-                turns = np.concatenate([[0.0], np.cumsum(_turns(np.diff(values)))])
-                values = values - TURN * turns[: len(values)]
+                turn = turn_of(unit)
+                turns = np.cumsum(_turns(np.diff(values, prepend=0.0), turn))
+                values = values - turn * turns
             elif operation.name == "derivative":
                 try:
                     values = derivative(values, stamp_ns, operation.window)
@@ -173,7 +175,7 @@ class Expression:
                 steps.append(_Scaled(*self._conversion(unit, operation.unit)))
                 unit = operation.unit
             elif operation.name == "unwrap":
-                steps.append(_Unwrapped())
+                steps.append(_Unwrapped(turn_of(unit)))
             elif operation.name == "derivative":
                 steps.append(_Slope(operation.window))
                 unit = per_second(unit)
@@ -236,15 +238,13 @@ class _Scaled:
 
 
 class _Unwrapped:
-    def __init__(self) -> None:
-        self._last: float | None = None
-        self._turns = 0.0
+    def __init__(self, turn: float) -> None:
+        self._turn, self._turns, self._last = turn, 0.0, 0.0
 
     def update(self, _stamp_ns: int, value: float) -> float:
-        if self._last is not None:
-            self._turns += float(_turns(np.array(value - self._last)))
+        self._turns += float(_turns(np.array(value - self._last), self._turn))
         self._last = value
-        return value - TURN * self._turns
+        return value - self._turn * self._turns
 
 
 class _Slope:
@@ -310,9 +310,14 @@ def _slopes(before_ns: IntArray, values: FloatArray) -> FloatArray:
     return slopes
 
 
-def _turns(step: FloatArray) -> FloatArray:
+def turn_of(unit: str) -> float:
+    """A whole turn in `unit`; numbers whose unit nobody states are in rad."""
+    return TURNS.get(unit, 2.0 * np.pi)
+
+
+def _turns(step: FloatArray, turn: float) -> FloatArray:
     """Whole turns by which an angle jumped in each `step`; none for NaN."""
-    turns: FloatArray = np.nan_to_num(np.rint(step / TURN))
+    turns: FloatArray = np.nan_to_num(np.rint(step / turn))
     return turns
 
 

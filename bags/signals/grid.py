@@ -21,7 +21,16 @@ from bags.signals.reader import (
     read_signals,
     stamp_text,
 )
-from bags.signals.sampling import Sample, Sampler, held_values, one_clock, sampled_path
+from bags.signals.sampling import (
+    BRIDGED,
+    LOST,
+    MOST_FILLED,
+    Sample,
+    Sampler,
+    held_values,
+    one_clock,
+    sampled_path,
+)
 from nlsid_core.arrays import FloatArray, IntArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, apart
@@ -30,8 +39,7 @@ from nlsid_core.progress import Progress, silent
 from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
-DEFAULT_MAX_GAP: Final = 1.5  # periods: no sample may be missing
-MOST_FILLED: Final = 0.05  # of the samples: with more, the data are invented rather than recorded
+FEW: Final = 0.01  # of the samples, left out at the ends: nobody needs to hear of it
 MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
@@ -68,10 +76,12 @@ def to_trajectories(
     sample may be missing). Responses that are samples as they come are used as they are, one on
     each point of the grid, where they follow each other in a period give or take GRID_TOLERANCE,
     as the monitor takes them; a point without one, in a gap of at most `max_gap`, is filled in on
-    the line between its neighbours, and counted (`filled` in the provenance). A command without a
-    limit of its own, `|hold(T s)`, gets one of `max_gap`, which its path says from then on.
+    the line between its neighbours. A command without a limit of its own, `|hold(T s)`, gets one of
+    `max_gap`, which its path says from then on. Samples that are filled in, here or by the rule of
+    `bags.signals.sampling`, are counted: `filled` in the provenance, `filled_samples`.
 
-    Samples without every signal are left out at the start and the end, and logged. Between them
+    Samples without every signal are left out at the start and the end, and logged if they are more
+    than FEW. Between them
     they raise DataError, or with `split_gaps` end one trajectory and begin the next.
 
     Raises DataError, saying where, if stamps repeat, a gap is too long, a response that is not
@@ -90,16 +100,18 @@ def to_trajectories(
     base = responses[0].stamp_ns
     where = f"{label}: {responses[0].path}"
     period_ns = _period_ns(base, period, where, on_grid=on_grid)
-    gap_ns = round(DEFAULT_MAX_GAP * period_ns if max_gap is None else max_gap * 1e9)
+    gap_ns = round(BRIDGED * period_ns if max_gap is None else max_gap * 1e9)
     held = [product(_held_for(samples, gap_ns) for samples in part) for part in parts]
     sampler = Sampler(list(map(str, signals)), held, period=period_ns / 1e9)
-    found = list(_sampled(sampler, [*responses, *drives]))
+    found = [
+        sample for sample in _sampled(sampler, [*responses, *drives]) if sample.missing != LOST
+    ]
     complete = [k for k, sample in enumerate(found) if not sample.missing]
     if len(complete) < 2:
         raise DataError(_no_overlap(label, responses, drives, len(complete)))
     last = complete[-1]
     left_out = sampler.incomplete + len(found) - last - 1
-    if left_out and not split_gaps:
+    if left_out > FEW * len(complete) and not split_gaps:
         log.warning(
             "%s: %d of %d samples left out, where a signal is missing at the start or the end",
             label,
@@ -188,7 +200,7 @@ def _trajectory(
     stamps = np.array([sample.stamp_ns for sample in run], dtype=np.int64)
     y = np.array([sample.y for sample in run])
     u = np.array([sample.u for sample in run])
-    filled = 0
+    filled = sum(bool(sample.filled) for sample in run)
     if not sampler.on_grid:
         where = f"{label}: {sampler.responses[0]}"
         _refuse_gaps(stamps, gap_ns, where)
@@ -213,7 +225,6 @@ def _trajectory(
                     for part, rules in zip(drives, sampler.excitations, strict=True)
                 ]
             )
-            log.warning("%s: %d of %d samples filled in between others", where, filled, len(grid))
     t = seconds(period_ns * np.arange(len(y)), 0)
     if filled:
         origin = json.loads(labels["provenance"] or "{}") | {"filled": filled}
@@ -406,6 +417,11 @@ def skipped_samples(dataset: Dataset) -> int:
         origin = json.loads(trial.provenance or "{}")
         bags[trial.digest] = int(origin.get("skipped", 0))
     return sum(bags.values())
+
+
+def filled_samples(dataset: Dataset) -> int:
+    """How many samples of `dataset` were not measured but filled in between others."""
+    return sum(json.loads(trial.provenance or "{}").get("filled", 0) for trial in dataset)
 
 
 def require_excitation(dataset: Dataset) -> None:

@@ -21,6 +21,11 @@ besides the model has to be known:
 - An excitation is the latest command at or before the sample, at most T s old with `|hold(T s)`;
   `|delay(T s)` adds T to its stamp, `|lag(T s)` filters what is held, `A * B` multiplies two such.
 - Signals may come from any number of topics, each of one or more of them.
+- Responses that are samples as they come and up to MOST_LOST periods apart have `LOST` samples
+  between them, a period apart: no response, and the commands of their time if they are known.
+- On a grid, a sample between two messages of a response that are more than BRIDGED periods apart is
+  `filled` in: identification takes it and counts it, a monitor does not judge it, as nobody
+  measured it. Commands are held by nature; that is no loss.
 - The first sample is the first with every signal; what came before it is counted, not given.
   Later a signal that is missing is NaN, and `missing` says which and why.
 
@@ -46,20 +51,31 @@ from bags.signals.expressions import (
 )
 from bags.signals.reader import Samples
 from nlsid_core.errors import BagError, apart
+from nlsid_core.running.grid import TOLERANCE
 
 MATCH: Final = 0.05  # periods between stamps of one sample on two topics; a loop's usual scatter
+BRIDGED: Final = 1.5  # periods between two messages: a sample is missing between them
+MOST_LOST: Final = 100  # samples in a row whose commands are kept; then nothing is known
+MOST_FILLED: Final = 0.05  # of the samples: with more, data are invented rather than recorded
+LOST: Final = "the sample is lost: no message of it came"
+FILLED: Final = "filled in"  # how the reason of a sample begins that nobody measured
 NOT_FINITE: Final = "not a finite number"
 LEAP: Final = 1000  # samples in a row of which every one would be said to be missing
 HISTORY: Final = 2**16  # values kept of a signal while no sample comes: a minute at 1 kHz
 
 
 class Sample(NamedTuple):
-    """One sample: responses y and excitations u in the order they were named, NaN where missing."""
+    """One sample: responses y and excitations u in the order they were named, NaN where missing.
+
+    missing: which signal has no value and why; filled: which response was not measured here but
+    bridges a gap, and how long that is. Empty if there is none.
+    """
 
     stamp_ns: int
     y: tuple[float, ...]
     u: tuple[float, ...]
     missing: str = ""
+    filled: str = ""
 
 
 class Sampler:
@@ -242,6 +258,7 @@ class Sampler:
             awaited = self._kept[:n] if stamp_ns <= until_ns else self._kept
             if until_ns < math.inf and not all(kept.is_certain(stamp_ns) for kept in awaited):
                 return given
+            given += self._lost_before(stamp_ns)
             self._take_stamp(stamp_ns)
             values = [kept.value_at(stamp_ns) for kept in self._kept]
             self._released_ns = stamp_ns
@@ -253,8 +270,36 @@ class Sampler:
                 self.incomplete += 1
                 continue
             missing = "" if all(map(math.isfinite, values)) else self._why(stamp_ns, values)
+            filled = "" if missing or not self.on_grid else self._filled(stamp_ns)
             u = self._multiplied(values[n:])
-            given.append(Sample(stamp_ns, tuple(values[:n]), u, missing))
+            given.append(Sample(stamp_ns, tuple(values[:n]), u, missing, filled))
+
+    def _lost_before(self, stamp_ns: int) -> list[Sample]:
+        """The samples that should have come between the last one given and this one."""
+        if self.on_grid or not self._started:
+            return []
+        n = len(self.responses)
+        gap_ns = stamp_ns - int(self._released_ns)
+        periods = gap_ns / self.period_ns
+        count = round(periods)
+        if not 1 < count <= MOST_LOST + 1 or abs(periods - count) > TOLERANCE:
+            return []
+        lost = []
+        for left in range(count - 1, 0, -1):
+            at = stamp_ns - gap_ns * left // count
+            u = self._multiplied([self._commanded(k, at) for k in range(n, len(self._kept))])
+            lost.append(Sample(at, (math.nan,) * n, u, LOST))
+        return lost
+
+    def _commanded(self, k: int, at_ns: int) -> float:
+        """What signal k, which drives, was at a lost sample; NaN if a message with it may be lost.
+
+        That is if it is measured with a response, or if no hold is stated and it is not new.
+        """
+        kept, value = self._kept[k], self._kept[k].value_at(at_ns)
+        lost = self._signals[k].path.topic in self.response_topics
+        old = kept.limit_ns == math.inf and at_ns - kept.stamps[0] > BRIDGED * self.period_ns
+        return math.nan if lost or old else value
 
     def _multiplied(self, values: Sequence[float]) -> tuple[float, ...]:
         """The excitations from the values of all their factors."""
@@ -294,6 +339,14 @@ class Sampler:
     def _why(self, stamp_ns: int, values: Sequence[float]) -> str:
         k = next(k for k, value in enumerate(values) if not math.isfinite(value))
         return f"{self._signals[k]}: {self._kept[k].why(stamp_ns)}"
+
+    def _filled(self, stamp_ns: int) -> str:
+        """Which response bridges a gap at `stamp_ns`, empty if none does; after `value_at`."""
+        for signal, kept in zip(self.responses, self._kept, strict=False):
+            gap_ns = kept.gap_ns(stamp_ns)
+            if gap_ns > BRIDGED * self.period_ns:
+                return f"{FILLED}: {signal} between messages {gap_ns / 1e9:.3g} s apart"
+        return ""
 
 
 class _Kept:
@@ -368,6 +421,15 @@ class _Kept:
         share = (stamp_ns - before_ns) / (self.stamps[1] - before_ns)
         return value + (self.values[1] - value) * share
 
+    def gap_ns(self, stamp_ns: int) -> int:
+        """From the value at or before `stamp_ns` to the one after; 0 on a value. After `value_at`.
+
+        It is certain as soon as the value is, of a response on a grid.
+        """
+        if len(self.stamps) < 2 or self.stamps[0] == stamp_ns:
+            return 0
+        return self.stamps[1] - self.stamps[0]
+
     def _lagged(self, stamp_ns: int, k: int) -> float:
         """What the lag reaches at `stamp_ns` from value k, its target held."""
         target = self.targets[k]
@@ -389,6 +451,11 @@ class _Kept:
             return f"no message for more than {self.limit_ns / 1e9:g} s"
         age, most = apart((stamp_ns - self.stamps[before]) / 1e9, self.limit_ns / 1e9)
         return f"nothing for {age} s; at most {most} s is held"
+
+
+def said_filled(filled: int, samples: int) -> str:
+    """How many of the samples nobody measured, in words; empty if all were measured."""
+    return f"{filled} of {samples} samples filled in, not measured" if filled else ""
 
 
 def one_clock(signals: Sequence[Expression]) -> str:

@@ -1,4 +1,4 @@
-"""The clocks of a recording: offset and drift between them, gaps, duplicates."""
+"""The times of a recording: offset and drift between clocks, gaps, duplicates, commands held."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +14,30 @@ SAME_CLOCK: Final = 1.0  # s; latencies stay below, an offset between clocks rar
 DRIFT_SIGNIFICANT: Final = 5.0  # times the scatter of the segments about the line
 OWN_PACE: Final = 1e-3  # s per s; two real clocks differ by less
 DRIFT_LEAST: Final = 1e-3  # s over the recording; less than a message's latency says nothing
+STREAMED: Final = 10  # commands of a bag from which on their intervals say how they are sent;
+ENDED: Final = 3.0  # of the longest of these: without a command for longer they have ended
+
+
+@dataclass(frozen=True)
+class Held:
+    """For how long commands are held. longest: s from one to the next.
+
+    tail: s of responses after the last command, where those have come to an end; 0 if the last one
+    is held too, and is counted in `longest`.
+    """
+
+    longest: float
+    tail: float
+
+
+def held(stamp_ns: IntArray, until_ns: int) -> Held:
+    """How long commands with these stamps (N,) were held while responses came, to `until_ns`."""
+    intervals = np.diff(stamp_ns[stamp_ns < until_ns]) / 1e9
+    between = float(intervals.max(initial=0.0))
+    tail = max((until_ns - int(stamp_ns[-1])) / 1e9, 0.0)
+    if len(intervals) >= STREAMED and tail > ENDED * between:
+        return Held(between, tail)
+    return Held(max(between, tail), 0.0)
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,8 @@ def split(
     """Copy a bag in parts to the new bags `out`_01, `out`_02, ...
 
     repeats: a signal whose repetitions are the parts; each is marked as a repeat of one excitation.
-    every: s a part. Raises BagError if neither or both are given, if the signal does not repeat,
-    and as `cut`.
+    every: s a part; a rest of less than half of that goes with the part before it.
+    Raises BagError if neither or both are given, if the signal does not repeat, and as `cut`.
     """
     if (repeats is None) == (every is None):
         raise BagError("split a bag either at the repeats of a signal or every so many seconds")
@@ -130,7 +130,11 @@ def _edges(
             first_ns = last_ns = _first_ns(bag)
             for _, batch in bag.batches():
                 last_ns = max(last_ns, int(np.max(batch.log_ns)))
-        return [*range(first_ns, last_ns + 1, round(every * 1e9)), last_ns + 1], {}
+        step_ns = round(every * 1e9)
+        begins = [*range(first_ns, last_ns + 1, step_ns)]
+        if len(begins) > 1 and 2 * (last_ns - begins[-1]) < step_ns:
+            begins.pop()
+        return [*begins, last_ns + 1], {}
     samples = read_signals(path, [repeats], clock="log time")[repeats]
     step_ns = int(np.median(np.diff(samples.stamp_ns)))
     found = find_period(samples.values)

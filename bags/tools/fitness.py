@@ -18,14 +18,14 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.remote import StorageError, place
 from bags.signals.columns import expand_paths, read_columns
-from bags.signals.delays import Delay, delay
+from bags.signals.delays import RELATED, Delay, delay
 from bags.signals.expressions import Expression
 from bags.signals.grid import to_trajectories
 from bags.signals.reader import HEADER_STAMP, Samples, expanded, read_signals
 from bags.signals.repeats import find_period, same_excitation
 from bags.signals.sampling import sampled_path
 from bags.signals.signal import SignalPath
-from bags.signals.timing import clock_relation
+from bags.signals.timing import clock_relation, held
 from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import BagError, DataError
 
@@ -36,7 +36,6 @@ LEVELS_FEW: Final = 8  # distinct values of a response: quantised to less than i
 STEP_COARSE: Final = 0.02  # of the range: the quantisation step of a response
 BAND_LOOK: Final = 0.4  # of the sampling rate: power above is close to being aliased
 LINES_FEW: Final = 3  # frequency lines with power: no more than one or two sinusoids
-RELATED: Final = 0.3  # correlation of command and response below which they may be unrelated
 LONGEST_DELAY: Final = 5.0  # s
 LEAST_OVERLAP: Final = 10  # steps of the response: less says nothing of a delay
 LONGEST_HELD: Final = 1e5  # s: to see what there is, whatever limit a configuration sets
@@ -114,8 +113,9 @@ def check_fitness(
         for samples in measured:
             findings += _regularity(samples)
             findings += _range(samples)
+        last_ns = max(int(samples.stamp_ns[-1]) for samples in measured)
         for samples in commanded:
-            findings += _commands(samples)
+            findings += _commands(samples, last_ns)
             findings += _excitation(samples)
         findings += _samples(measured, commanded)
         findings += _delays(commanded, measured)
@@ -227,8 +227,11 @@ def _regularity(samples: Samples) -> list[Finding]:
     return findings
 
 
-def _commands(samples: Samples) -> list[Finding]:
-    """Commands are held until the next one: their stamps may come as they like."""
+def _commands(samples: Samples, last_ns: int) -> list[Finding]:
+    """Commands are held until the next one: their stamps may come as they like.
+
+    last_ns: the last stamp of a response.
+    """
     steps = np.diff(samples.stamp_ns) / 1e9
     name = samples.path
     if not len(steps):
@@ -236,8 +239,12 @@ def _commands(samples: Samples) -> list[Finding]:
     period = float(np.median(steps))
     rate = f"{1 / period:.4g} Hz" if period > 0 else "several at one time"
     clock = "" if samples.clock == HEADER_STAMP else f" by {samples.clock}"
-    what = f"{name}: {rate}{clock}, one held for at most {np.max(steps):.3g} s (grid.hold)"
+    found = held(samples.stamp_ns, last_ns)
+    what = f"{name}: {rate}{clock}, one held for at most {found.longest:.3g} s (grid.hold)"
     findings = [Finding(Level.GOOD, "commands", what)]
+    if found.tail:
+        what = f"{name} ends {found.tail:.3g} s before the responses do: what follows is not fitted"
+        findings.append(Finding(Level.LOOK, "commands", what))
     repeats = int((steps == 0).sum())
     if repeats:
         what = f"{name}: {repeats} of {len(samples)} stamps repeat the one before; the last counts"

@@ -5,7 +5,6 @@ nothing: it repeats the monitor's word, and takes it back when the word or the s
 """
 
 import math
-import re
 import threading
 import time
 import unicodedata
@@ -14,6 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
+
+from nlsid_core.running.reading import cause
 
 OK, WARN, ERROR, STALE = range(4)  # as diagnostic_msgs/DiagnosticStatus has them
 SILENT: Final = 2.5  # s without the monitor's status, which it repeats every second
@@ -24,13 +25,7 @@ MOST_EVENTS: Final = 200
 MOST_NODES: Final = 32
 LONGEST_TEXT: Final = 300  # characters of anything that came from outside
 WORDS: Final = ("inside", "warning", "unknown", "assumption violated", "outside")
-_NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 MONITORING: Final = ("margin", "assumption", "time_to_exit", "latency")
-
-
-def _cause(text: str) -> str:
-    """A status without its numbers: a cause that lasts is one event, whatever time it names."""
-    return _NUMBER.sub("#", text)
 
 
 class Sample(NamedTuple):
@@ -126,7 +121,7 @@ class Scene:
             self._nodes[node] = Said(level, text, time.monotonic())
             if node == self.monitor and names:
                 self._names = tuple(clean(name) for name in names)
-            if before is None or (before.level, _cause(before.text)) != (level, _cause(text)):
+            if before is None or (before.level, cause(before.text)) != (level, cause(text)):
                 self._events.append(Event(stamp_ns, level, node, text))
                 self._told += 1
 

@@ -11,6 +11,7 @@ from nlsid_core.design.continuous.tvlqr import (
     nominal_through,
     tvlqr,
 )
+from nlsid_core.design.cycle import closed_cycle
 from nlsid_core.design.design import design
 from nlsid_core.design.problems import ContinuousTracking, OutputTube, SampledTracking
 from nlsid_core.design.riccati import Feedback, discrete_tvlqr
@@ -25,6 +26,7 @@ __all__ = [
     "OutputTubeDesign",
     "SampledTracking",
     "Tracking",
+    "closed_cycle",
     "compose_funnels",
     "design",
     "design_funnel",

@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray
+from nlsid_core import files
+from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.dynamics.taylor import Rates
 from nlsid_core.dynamics.vector_field import VectorField
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, DocumentError
 
+FORMAT = "nlsid/measured_push"
 STEPS = 4  # of Runge-Kutta in a sample
 
 
@@ -42,6 +44,46 @@ class MeasuredPush:
         """
         trials, n = self.largest.shape
         return float(min(n / (trials + 1), 1.0))
+
+    def used(self, dynamics: VectorField, trial: Trajectory) -> float:
+        """The largest part of the box that another recording shows; above 1 it breaks it."""
+        one = Dataset((trial,))
+        found = measured_push(dynamics, one, seconds=self.seconds, safety_factor=1.0)
+        half = self.box[:, 1]
+        shown = found.largest[0]
+        parts = np.divide(shown, half, out=np.where(shown > 0, np.inf, 0.0), where=half > 0)
+        return float(parts.max())
+
+    def document(self) -> Json:
+        """The JSON form; every number round-trips exactly."""
+        return {
+            "format": FORMAT,
+            "version": files.VERSION,
+            "seconds": self.seconds,
+            "safety_factor": self.safety_factor,
+            "largest": self.largest.tolist(),
+            "measured_on": [{"name": name, "digest": d} for name, d in self.measured_on],
+        }
+
+    @classmethod
+    def from_document(cls, document: Json, *, source: str = "push") -> "MeasuredPush":
+        """Raises DocumentError if the document is not one."""
+        files.header(document, FORMAT, source=source)
+        trials = files.member(document, "measured_on", list, source=source)
+        largest = files.array(document, "largest", (len(trials), None), source=source)
+        found = cls(
+            largest,
+            tuple(files.named_digests(trials, source=source)),
+            files.number(document, "seconds", source=source),
+            files.number(document, "safety_factor", source=source),
+        )
+        sound = len(trials) and largest.min(initial=0.0) >= 0
+        if not (sound and found.seconds > 0 and found.safety_factor >= 1):
+            raise DocumentError(
+                f"{source}: needs a trial, largest pushes of 0 or more, seconds above 0 and a "
+                "safety_factor of 1 or more"
+            )
+        return found
 
     def __str__(self) -> str:
         return (

@@ -3,7 +3,7 @@
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise, product
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
-from nlsid_core.polynomial import Polynomial, trace
+from nlsid_core.polynomial import Polynomial, trace, variables
 from nlsid_core.polynomial.maps import coefficient_table
 
 FORMAT = "nlsid/vector_field"
@@ -139,6 +139,24 @@ class VectorField:
         within = np.zeros((0, 3)) if valid is None else np.asarray(valid, dtype=np.float64)
         pieces = (tuple(p.over(names) for p in equations),)
         return cls(pieces, n, m, uncertain=bounds, valid=within, expansion=expansion)
+
+    def pushed(self, box: ArrayLike) -> "VectorField":
+        """ẋ = f + w with w in `box` (n, 2) too; a row of zeros adds nothing."""
+        rows = np.asarray(box, dtype=np.float64)
+        if rows.shape != (self.n, 2):
+            raise ShapeError(f"the box of a push on {self.n} states has shape {rows.shape}")
+        states = np.flatnonzero(rows.any(axis=1)).tolist()
+        first = len(self.uncertain)
+        names = [f"w{first + j}" for j in range(len(states))]
+        added = dict(zip(states, variables(names), strict=True))
+        return replace(
+            self,
+            pieces=tuple(
+                tuple(p + added[i].exact() if i in added else p for i, p in enumerate(piece))
+                for piece in self.pieces
+            ),
+            uncertain=np.vstack([self.uncertain, rows[states]]),
+        )
 
     @property
     def depends_on_time(self) -> bool:

@@ -1,7 +1,11 @@
 """Newton's method on the robust simulation error, with a barrier where the minimiser needs one.
 
-A minimiser can lie on the boundary of K ≻ 0, where J stays finite and damped Newton stalls at a
-wrong value. Only a few eigenvalues of K vanish there. With U their vectors where Newton stalled,
+Damped Newton can come too near the boundary of K ≻ 0 on its way, where J stays finite, and stall at
+a wrong value. J + μ u'K⁻¹u, u a random vector, is as convex and as cheap as J, and infinite on
+nearly all of the boundary: its minimisers for μ → 0 lead to a minimiser of J inside.
+
+A minimiser can also lie on the boundary. Only a few eigenvalues of K vanish there. With U their
+vectors where Newton stalled,
     J + μ log det(U'K⁻¹U)
 is minimised for μ → 0: (U'K⁻¹U)⁻¹ is a Schur complement of K, concave in K, so the barrier is
 convex, keeps K ≻ 0 and has parameter rank U; the last iterate is within μ·rank U of the minimum.
@@ -143,6 +147,12 @@ class Minimum:
     converged: bool
     on_boundary: bool = False
 
+    @property
+    def is_inside(self) -> bool:
+        """Whether it is a minimiser where no eigenvalue of K vanishes."""
+        pivots = self.point.factor.pivots
+        return self.converged and bool(np.min(pivots) > BOUNDARY_PIVOT * np.median(pivots))
+
 
 def minimise(
     bound: Convex,
@@ -158,27 +168,38 @@ def minimise(
     """
     descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
-    found = descent.path(z) if inequalities else descent.to_minimum(z)
-    pivots = found.point.factor.pivots
-    if found.converged and np.min(pivots) > BOUNDARY_PIVOT * np.median(pivots):
+    found = descent.freely(z)
+    if found.is_inside:
         return found
     return _on_boundary(bound, descent, z, found)
 
 
 def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Minimum) -> Minimum:
     """Minimise where eigenvalues of K vanish; `start` is well inside, Newton ended at `found`."""
+    led = _past_boundary(bound, descent, 0.5 * (start + _unknowns(found)))
+    if led is not None:
+        return led
     U, best, lowest = np.zeros((len(found.point.x), 0)), found if found.converged else None, found
     for _ in range(MAX_BASES):
         U = np.linalg.qr(np.column_stack([U, _vanishing(found.point)]))[0]
         # K is affine: half way back to the start no eigenvalue is small.
-        z = 0.5 * (start + np.concatenate([found.point.theta, found.extra]))
-        found = descent.path(z, barrier=SchurBarrier(bound, U))
+        found = descent.path(0.5 * (start + _unknowns(found)), barrier=SchurBarrier(bound, U))
         if found.converged:
             if best is not None and best.point.J <= found.point.J:
                 found = best
             return replace(found, steps=descent.steps, on_boundary=True)
         lowest = min(lowest, found, key=lambda minimum: minimum.point.J)
     return replace(lowest if best is None else best, steps=descent.steps)
+
+
+def _past_boundary(bound: Convex, descent: "Descent", z: FloatArray) -> Minimum | None:
+    """The minimiser inside K ≻ 0, if the path of `Repulsion` from z leads to it."""
+    here = descent.objective.at(z[: descent.parameters])
+    away = descent.path(z, barrier=Repulsion(bound, here))
+    if not away.converged:
+        return None
+    found = descent.freely(_unknowns(away))
+    return replace(found, steps=descent.steps) if found.is_inside else None
 
 
 def _vanishing(point: Point) -> FloatArray:
@@ -199,6 +220,25 @@ def smallest_eigenvalues(factor: Root, N: int, count: int) -> tuple[FloatArray, 
     half = factor.half_solve(U)
     inverses, rotation = np.linalg.eigh(half.T @ half)
     return 1.0 / inverses[::-1], U @ rotation[:, ::-1]
+
+
+class Repulsion:
+    """u'K⁻¹u with a random vector u, 1 at the point it is made at."""
+
+    def __init__(self, bound: Convex, at: Point) -> None:
+        u = np.random.default_rng(0).standard_normal((len(at.x), 1))
+        self.bound, self.U = bound, u / np.linalg.norm(at.factor.half_solve(u))
+
+    def value(self, point: Point) -> float:
+        """At a point of J."""
+        return float(np.square(point.factor.half_solve(self.U)).sum())
+
+    def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
+        """Gradient -x'K_i x and Hessian 2 (L⁻¹K_i x)'(L⁻¹K_j x), x = K⁻¹u."""
+        x = point.factor.half_solve_transposed(point.factor.half_solve(self.U))[:, 0]
+        slopes = self.bound.slopes(x)
+        half = point.factor.half_solve(slopes)
+        return -slopes.T @ x, 2.0 * half.T @ half
 
 
 class SchurBarrier:
@@ -230,6 +270,10 @@ class SchurBarrier:
         return -np.einsum("aai->i", inner), hessian
 
 
+def _unknowns(found: Minimum) -> FloatArray:
+    return np.concatenate([found.point.theta, found.extra])
+
+
 def _newton_step(gradient: FloatArray, hessian: FloatArray) -> FloatArray:
     """-H⁺g in the scale of the diagonal; a parameter with hardly any curvature keeps its scale.
 
@@ -256,7 +300,11 @@ class Descent:
         self.perfect = PERFECT_FIT * objective.rows.unit
         self.steps = 0
 
-    def path(self, z: FloatArray, *, barrier: SchurBarrier | None = None) -> Minimum:
+    def freely(self, z: FloatArray) -> Minimum:
+        """Without a barrier of K."""
+        return self.path(z) if self.inequalities else self.to_minimum(z)
+
+    def path(self, z: FloatArray, *, barrier: Repulsion | SchurBarrier | None = None) -> Minimum:
         """Follow the minimisers for μ → 0."""
         size = sum(inequality.order for inequality in self.inequalities)
         size += 0 if barrier is None else barrier.U.shape[1]
@@ -264,14 +312,14 @@ class Descent:
         mu = FIRST_GAP * self.objective.at(z[: self.parameters]).J / size
         while True:
             found = self.to_minimum(z, mu=mu, barrier=barrier)
-            z = np.concatenate([found.point.theta, found.extra])
+            z = _unknowns(found)
             small = mu * size <= gap * found.point.J or self.perfect >= found.point.J
             if small or not found.converged:
                 return found
             mu *= MU_FALL if barrier is None else MU_FALL_K
 
     def to_minimum(
-        self, z: FloatArray, *, mu: float = 0.0, barrier: SchurBarrier | None = None
+        self, z: FloatArray, *, mu: float = 0.0, barrier: Repulsion | SchurBarrier | None = None
     ) -> Minimum:
         """Newton's method for one μ."""
         value, point = self._value(z, mu, barrier)
@@ -308,7 +356,7 @@ class Descent:
         return Minimum(point, z[self.parameters :], self.steps, converged=False)
 
     def _value(
-        self, z: FloatArray, mu: float, barrier: SchurBarrier | None
+        self, z: FloatArray, mu: float, barrier: Repulsion | SchurBarrier | None
     ) -> tuple[float, Point | None]:
         total = sum(inequality.barrier(z) for inequality in self.inequalities)
         if not np.isfinite(total):
@@ -322,7 +370,7 @@ class Descent:
         return point.J + mu * total, point
 
     def _derivatives(
-        self, z: FloatArray, point: Point, mu: float, barrier: SchurBarrier | None
+        self, z: FloatArray, point: Point, mu: float, barrier: Repulsion | SchurBarrier | None
     ) -> tuple[FloatArray, FloatArray]:
         gradient, hessian = np.zeros(len(z)), np.zeros((len(z), len(z)))
         inner = slice(0, self.parameters)

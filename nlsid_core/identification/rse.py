@@ -55,7 +55,7 @@ def robust_simulation_error(
         found = minimise(Bound(rows, linearised_at), start)
         point = found.point
         yield Iterate(point.theta, point.p, point.J, found.on_boundary)
-        if previous - point.J <= tolerance * previous and linearised_at is not None:
+        if np.isfinite(previous) and previous - point.J <= tolerance * previous:
             return
         linearised_at, previous = point.theta, point.J
 

@@ -105,7 +105,7 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
     radius = task.searched_rate
-    starts = tuple(stable_starts(regression, radius))
+    starts = tuple(stable_starts(train, model_class.lags, radius))
     trail.follow(
         regression.rows,
         lambda i: regression.model(i.theta, i.p),
@@ -153,7 +153,17 @@ def state_affine(
     trail: Trail[StateAffineModel] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: state_affine_equation_error(problem))
     trail.add(Rie, lambda _: robust_identification_error(problem)[0])
-    trail.follow(problem.rows, lambda i: problem.model(i.theta, i.p))
+    radius, n_y = task.searched_rate, len(problem.y_scale[0])
+    constant = not (model_class.leading_degree or model_class.lagged_degree)
+    trail.follow(
+        problem.rows,
+        lambda i: problem.model(i.theta, i.p),
+        [
+            (name, problem.embedded(theta))
+            for name, theta in stable_starts(train, model_class.lags, radius)
+        ],
+        (lambda theta: reflected(theta, radius, n_y)) if constant else None,
+    )
     trail.add(CertifiedRse, lambda method: _certified(problem, trail, method))
 
     def last_step(method: CertifiedSem) -> StateAffineModel:

@@ -3,95 +3,177 @@
 A search that goes downhill ends at the minimum of the valley it begins in, so it begins in several.
 A model of more lags, fitted by least squares, has an impulse response h; with the Hankel matrix
 H_ij = h_{i+j+1} ≈ U S V' of the n largest singular values, S^(-1/2) U' H↑ V S^(-1/2) has the poles
-of n lags that explain it best, H↑ being H one sample later (Kung 1978). Poles outside the circle
-are reflected into it. Nonlinear classes begin at a linear model of the same signals, too.
+of n lags that explain it best, H↑ being H one sample later (Kung 1978); with several outputs h and
+H have blocks, and the first block row of U S^(1/2) is the output matrix. Poles outside the circle
+are reflected into it, by their eigenvectors. Nonlinear classes begin at a linear model of the same
+signals, too.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.linalg import hankel, svd
-from scipy.signal import lfilter
+from scipy.linalg import LinAlgError, eig, svd
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError, SolverError
 from nlsid_core.identification.implicit_class import ImplicitRows
-from nlsid_core.identification.linear import (
-    SLOWEST_POLE,
-    Regression,
-    build_regression,
-    least_squares,
-)
+from nlsid_core.identification.linear import SLOWEST_POLE
 from nlsid_core.identification.moments import MonotoneClass
+from nlsid_core.identification.regressors import lagged, signal_scale
 from nlsid_core.identification.rse import robust_simulation_error
+from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
-from nlsid_core.models import DifferenceEquation, MonotoneEquation, StateAffineModel
+from nlsid_core.models import MonotoneEquation, StateAffineModel
 
 LINEAR_ITERATES = 10  # of the robust simulation error, for the linear model of other classes
 LONGER = 4  # times the lags, of the model that is reduced
 BEND = 1e-3  # the cubic part, at one spread, of the equation that a linear model begins as
 WELL_CONDITIONED = 1e8  # G_0 of a model that determines its outputs
 LONGEST_RESPONSE = 400  # samples of its impulse response
+SHOWN = 1e-8  # relative singular value of a state that the impulse response shows
 
 
 def stable_starts(
-    regression: Regression, radius: float = SLOWEST_POLE
+    train: Dataset, lags: int, radius: float = SLOWEST_POLE
 ) -> Iterator[tuple[str, FloatArray]]:
-    """Left parameters (n+1,) of models whose poles are within the radius, with their names."""
-    direct = np.concatenate([[1.0], -least_squares(regression).a])
-    yield "from least squares", reflected(direct, radius)
-    try:
-        longer = build_regression(regression.dataset, LONGER * regression.lags)
-    except DataError:  # too few rows, or too little excitation for as many lags
-        return
-    poles = reduced_poles(least_squares(longer), regression.lags)
-    if np.isfinite(poles).all():
-        yield "from a longer model", reflected(np.poly(poles).real, radius)
+    """Left parameters ((n+1) n_y²,) of linear models whose poles are within the radius, named."""
+    y = signal_scale(np.concatenate([trial.y for trial in train]), "response")
+    u = signal_scale(np.concatenate([trial.u for trial in train]), "excitation")
+    scaled = [((trial.y - y[0]) / y[1], (trial.u - u[0]) / u[1]) for trial in train]
+    n_y = len(y[0])
+    for name, size in (("from least squares", lags), ("from a longer model", LONGER * lags)):
+        found = autoregression(scaled, size)
+        if found is None:  # too few rows
+            return
+        a, b = found
+        try:
+            start = a if size == lags else reduced(a, b, lags)
+            theta = reflected(np.concatenate([np.eye(n_y)[None], -start]).ravel(), radius, n_y)
+        except LinAlgError:
+            continue
+        yield name, theta
 
 
-def reflected(theta: FloatArray, radius: float = SLOWEST_POLE) -> FloatArray:
-    """θ (n+1,) with every pole outside the circle at the place that is as far inside, 1/z̄, and
-    what is slower than the radius on it; θ itself if every pole is within the radius.
+def autoregression(
+    trials: Sequence[tuple[FloatArray, FloatArray]], lags: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """(a (n, n_y, n_y), b (n+1, n_y, n_u)) of y = Σ aₖ y(t-k) + Σ bₖ u(t-k) + c by least squares.
+
+    Of all that fit equally well the smallest; None if there are fewer equations than unknowns.
     """
-    poles, radius = np.roots(theta), min(radius, SLOWEST_POLE)
+    long = [(lagged(y, lags), lagged(u, lags)) for y, u in trials if len(y) > lags]
+    if not long:
+        return None
+    Y, U = (np.concatenate(part) for part in zip(*long, strict=True))
+    columns = np.column_stack(
+        [Y[:, 1:].reshape(len(Y), -1), U.reshape(len(U), -1), np.ones(len(U))]
+    )
+    if columns.shape[0] < columns.shape[1]:
+        return None
+    n_y, n_u = Y.shape[2], U.shape[2]
+    found = np.linalg.lstsq(columns, Y[:, 0], rcond=None)[0]
+    a, b = found[: lags * n_y].reshape(lags, n_y, n_y), found[lags * n_y : -1].reshape(-1, n_u, n_y)
+    return a.transpose(0, 2, 1), b.transpose(0, 2, 1)
+
+
+def reflected(theta: FloatArray, radius: float = SLOWEST_POLE, outputs: int = 1) -> FloatArray:
+    """θ ((n+1) n_y²,) with every pole outside the circle at the place that is as far inside, 1/z̄,
+    and what is slower than the radius on it; θ itself if every pole is within the radius.
+    """
+    G = theta.reshape(-1, outputs, outputs)
+    A = companion(-np.linalg.solve(G[0], G[1:]))
+    poles, left, right = eig(A, left=True, right=True)
+    moved, radius = poles.copy(), min(radius, SLOWEST_POLE)
     outside = np.abs(poles) > 1.0
-    slow = np.abs(poles) > radius
-    if not slow.any():
+    moved[outside] = 1.0 / poles[outside].conj()
+    slow = np.abs(moved) > radius
+    moved[slow] *= radius / np.abs(moved[slow])
+    changed = np.flatnonzero(outside | slow)
+    if not len(changed):
         return theta
-    poles[outside] = 1.0 / poles[outside].conj()
-    slow = np.abs(poles) > radius
-    poles[slow] *= radius / np.abs(poles[slow])
-    lags = len(theta) - 1  # np.roots leaves out poles at 0
-    return np.concatenate([np.poly(poles).real, np.zeros(lags - len(poles))])
+    if outputs == 1:
+        return np.poly(moved).real
+    for i in changed:  # only these: others, as poles at 0, may have too few eigenvectors
+        weight = (moved[i] - poles[i]) / np.vdot(left[:, i], right[:, i])
+        A = A + (weight * np.outer(right[:, i], left[:, i].conj()))
+    a = lags_of(A.real, np.eye(outputs, len(A)), len(G) - 1)
+    return np.concatenate([np.eye(outputs)[None], -a]).ravel()
 
 
-def reduced_poles(model: DifferenceEquation, lags: int) -> FloatArray:
-    """Poles (lags,) by the Hankel matrix of the model's impulse response; NaN if it diverges."""
-    half = LONGEST_RESPONSE // 2
-    impulse = np.eye(1, 2 * half + 1)[0]
+def companion(a: FloatArray) -> FloatArray:
+    """A of x⁺ = A x, y the first n_y states, for a (n, n_y, n_y): outputs always tell x."""
+    n, n_y, _ = a.shape
+    return np.hstack([np.vstack(list(a)), np.eye(n * n_y, (n - 1) * n_y)])
+
+
+def lags_of(A: FloatArray, C: FloatArray, lags: int) -> FloatArray:
+    """a (n, n_y, n_y) of the outputs y = C x, x⁺ = A x with n·n_y states.
+
+    LinAlgError if n outputs do not tell the state.
+    """
+    if len(C) == 1:
+        return -np.poly(np.linalg.eigvals(A)).real[1:, None, None]
+    powers = [C]
+    for _ in range(lags):
+        powers.append(powers[-1] @ A)
+    newest_first = np.vstack(powers[-2::-1])
+    wide = np.linalg.solve(newest_first.T, powers[-1].T).T
+    if not np.isfinite(wide).all():
+        raise LinAlgError("the outputs do not tell the state")
+    return wide.reshape(len(C), lags, len(C)).transpose(1, 0, 2)
+
+
+def reduced(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
+    """a (n, n_y, n_y) of fewer lags by the Hankel matrix of the impulse response.
+
+    LinAlgError if the response diverges, or shows fewer states than that.
+    """
+    (n_y, n_u), states = b.shape[1:], lags * b.shape[1]
+    half = LONGEST_RESPONSE // 2 // max(1, max(n_y, n_u) // 2)
+    h = np.zeros((2 * half + 1, n_y, n_u))
     with np.errstate(over="ignore", invalid="ignore"):
-        h = lfilter(model.b, np.concatenate([[1.0], -model.a]), impulse)[1:]
+        for t in range(len(h)):
+            h[t] = b[t] if t < len(b) else 0.0
+            for k in range(min(t, len(a))):
+                h[t] += a[k] @ h[t - 1 - k]
         if not np.isfinite(np.square(h)).all():
-            return np.full(lags, np.nan)
-    U, s, Vt = svd(hankel(h[:half], h[half - 1 : 2 * half - 1]))
-    root = np.sqrt(s[:lags])
-    if root[-1] <= 1e-8 * root[0]:
-        return np.full(lags, np.nan)
-    later = hankel(h[1 : half + 1], h[half : 2 * half])
-    A = (U[:, :lags].T @ later @ Vt[:lags].T) / np.outer(root, root)
-    return np.asarray(np.linalg.eigvals(A))
+            raise LinAlgError("the impulse response diverges")
+    index = np.arange(half)[:, None] + np.arange(half) + 1
+    now, later = (
+        h[index + d].transpose(0, 2, 1, 3).reshape(half * n_y, half * n_u) for d in (0, 1)
+    )
+    U, s, Vt = svd(now, full_matrices=False)
+    if len(s) < states or s[states - 1] <= SHOWN * s[0]:
+        raise LinAlgError("the impulse response shows fewer states")
+    root = np.sqrt(s[:states])
+    A = (U[:, :states].T @ later @ Vt[:states].T) / np.outer(root, root)
+    return lags_of(A, U[:n_y, :states] * root, lags)
 
 
 def linear_start(
     train: Dataset, lags: int, delays: tuple[int, ...] | None
 ) -> StateAffineModel | None:
-    """A linear model of the same lags and delays by the robust simulation error; None if none."""
+    """A linear model of the same lags and delays by the robust simulation error; None if none.
+
+    Of the iterates from the identity and from the stable starts those that simulate best.
+    """
     try:
         problem = build_state_affine_rows(train, StateAffineClass(lags, delays))
-        *_, last = robust_simulation_error(problem.rows, iterations=LINEAR_ITERATES)
-    except (DataError, SolverError):  # delays, excitation or a search that linear models have not
+    except DataError:  # delays or excitation that linear models have not
         return None
+    error, found = SimulationError(problem.rows), []
+    for theta in (None, *(theta for _, theta in stable_starts(train, lags))):
+        try:
+            *_, last = robust_simulation_error(
+                problem.rows, start=theta, iterations=LINEAR_ITERATES
+            )
+            found.append((error.at(last.theta).J, last))
+        except (SolverError, LinAlgError):
+            continue
+    if not found:
+        return None
+    _, last = min(found, key=lambda one: one[0])
     model = problem.model(last.theta, last.p)
     return model if np.linalg.cond(model.G[0].coefficients[0]) < WELL_CONDITIONED else None
 

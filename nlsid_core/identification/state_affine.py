@@ -90,6 +90,14 @@ class StateAffineRows:
         box = (self.u_range - self.u_scale[0][:, None]) / self.u_scale[1][:, None]
         return np.asarray(box[[i for i, _ in self.window]])
 
+    def embedded(self, theta: FloatArray) -> FloatArray:
+        """Left parameters of the linear model with constant ones θ ((n+1) n_y²,)."""
+        n_y = len(self.y_scale[0])
+        blocks = [np.zeros((len(exponents), n_y**2)) for exponents in self.left]
+        for block, constant in zip(blocks, theta.reshape(len(blocks), -1), strict=True):
+            block[0] = constant  # the monomials begin with 1
+        return np.concatenate([block.ravel() for block in blocks])
+
     def model(self, theta: FloatArray, p: FloatArray) -> StateAffineModel:
         """The model of left parameters θ and right parameters p of orthonormal columns."""
         n_y = len(self.y_scale[0])

@@ -175,6 +175,13 @@ class Monitor:
         self._ended = self._ended or reason
         return Reading(t, Status.UNKNOWN, reason=self._ended)
 
+    def unmeasured(self, t: float, u: Any, reason: str) -> Reading:
+        """The reading at t (s) of a sample whose state nobody measured, under the input u.
+
+        It is unknown. Tubes around a simulation go on with it; every other run ends.
+        """
+        return self._tubes.unmeasured(t, u, reason) if self.goes_on else self.missing(t, reason)
+
     def ahead(self) -> Ahead:
         """What the outputs can be at the next samples, from here; of tubes around a simulation.
 

@@ -1,9 +1,13 @@
 """`Reading`: what a monitor says of one sample, whatever the kind of funnel."""
 
 import math
+import re
 from collections.abc import Sequence
 from enum import Enum
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+FADES: Final = "the start fades"
+_NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 
 
 class Status(Enum):
@@ -56,6 +60,16 @@ class Reading(NamedTuple):
     half_widths: Sequence[float] = ()
 
     @property
+    def waits(self) -> bool:
+        """Whether a run is still to begin."""
+        return self.status is Status.UNKNOWN and self.reason.startswith("waiting for ")
+
+    @property
+    def starts(self) -> bool:
+        """Whether it is of the samples that a run's measured start is made of."""
+        return self.waits and FADES not in self.reason
+
+    @property
     def numbers(self) -> dict[str, float]:
         """What is published of it, by name; `nominal[1]` where several signals are measured."""
         values = {
@@ -72,6 +86,11 @@ class Reading(NamedTuple):
             values[f"nominal[{i}]"] = self.nominal[i] if self.nominal else math.nan
             values[f"measured[{i}]"] = self.measured[i]
         return values
+
+
+def cause(text: str) -> str:
+    """A reason without its numbers: a cause that lasts is one, whatever time it names."""
+    return _NUMBER.sub("#", text)
 
 
 def unsaid(value: object) -> str:

@@ -25,7 +25,7 @@ from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
-from nlsid_core.running.reading import Level, Reading, Status, unsaid
+from nlsid_core.running.reading import FADES, Level, Reading, Status, unsaid
 from nlsid_core.running.start import start_in_motion
 from nlsid_core.running.stepping import Stepper
 
@@ -34,7 +34,6 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
-FADES = "the start fades"
 
 
 class TubeRun:
@@ -152,6 +151,12 @@ class TubeRun:
         if doubted:
             self._begin(reason)
         return Reading(t, Status.UNKNOWN, reason=reason)
+
+    def unmeasured(self, t: float, u: Any, reason: str) -> Reading:
+        """The reading at t (s) where nobody measured the outputs: a step with e = 0 under u."""
+        nothing = np.full(len(self._names), np.nan)
+        fault = self._take(t) or self._without(np.array(u, dtype=np.float64, ndmin=1), reason)
+        return self._unknown(t, nothing, fault or reason)[0]
 
     def _take(self, t: float) -> str:
         """Count the sample stamped t; a new run starts where some before it did not come."""

@@ -26,6 +26,7 @@ from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
 from bags.setup.proposal import choose
+from bags.tools.fitness import check_fitness
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
     CMD_TYPE,
@@ -35,6 +36,7 @@ from tests.bag_messages import (
     command,
     header,
     joints,
+    odometry,
     speed_bag,
     twist,
 )
@@ -374,12 +376,91 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
     said = nlsid("init", bags, "--out", config, "-u", "/cmd:data", "-y", "/speed:data")
     assert "commands end up to 4.9 s before the responses do" in said
+    assert re.search(r"expect [\d.e-]+ % error in simulation \(of trials held back\): good", said)
+    [found] = check_fitness(
+        [bags / "run_0"], excitations=["/cmd:data"], responses=["/speed:data"], clock="log"
+    )
+    commands = [finding.what for finding in found.findings if finding.check == "commands"]
+    assert commands[0].endswith("one held for at most 0.1 s (grid.hold)"), "as init says"
+    assert "ends 4.9 s before the responses do" in commands[1]
     grid = load_config(config).grid
     assert grid.hold is None
     assert grid.split_gaps
     nlsid("identify", bags, "--config", config, "--out", tmp_path / "out")
     trained = decoded((tmp_path / "out" / documents.TRAINING).read_bytes(), source="it")["training"]
     assert all(trial.u.min() > 0.4 for trial in trained)
+
+
+def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    kind, number = "std_msgs/msg/Float64", standard_types().types["std_msgs/msg/Float64"]
+    with BagWriter(tmp_path / "bag") as writer:
+        y, u = np.zeros(2), np.zeros(2)
+        for k in range(400):
+            u = rng.uniform(-1.0, 1.0, 2) if k % 20 == 0 else u
+            y = 0.8 * y + 0.2 * u
+            values = {"/cmd_a": u[0], "/cmd_b": u[1], "/speed_a": y[0], "/speed_b": y[1]}
+            for topic, value in ({"/state_c": 1.0} | values).items():
+                data = bytes(standard_types().serialize_cdr(number(value), kind))
+                stamp = START_NS + k * 100_000_000
+                writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    found = look([tmp_path / "bag"])
+    named = ["/speed_b:data", "/speed_a:data"]
+    assert choose(found, named) == (named, ["/cmd_b:data", "/cmd_a:data"])
+    with pytest.raises(BagError, match="/speed_c:data follows no command"):
+        choose(found, ["/speed_c:data"])
+
+
+def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
+    commands = np.repeat(np.random.default_rng(2).uniform(-1.0, 1.0, (20, 2)), 10, axis=0)
+    types, kind = standard_types(), "geometry_msgs/msg/Twist"
+    with BagWriter(tmp_path / "bag") as writer:
+        for k, (forward, turn) in enumerate(commands):
+            times = dict.fromkeys(("log_time_ns", "publish_time_ns"), START_NS + k * 25_000_000)
+            message = twist(forward)
+            message.angular.z = turn + 0.5 * forward
+            writer.write("/cmd_vel", kind, bytes(types.serialize_cdr(message, kind)), **times)
+            writer.write(
+                "/odom", "nav_msgs/msg/Odometry", odometry(times["log_time_ns"], 0.0), **times
+            )
+    with pytest.raises(BagError, match=r"no number follows another; .*always the same: /odom:"):
+        choose(look([tmp_path / "bag"]))
+
+
+def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None:
+    """Degrees that begin again at 360, without a unit in the type."""
+    rng = np.random.default_rng(3)
+    kind, number = "std_msgs/msg/Float64", standard_types().types["std_msgs/msg/Float64"]
+    for name in ("a", "b"):
+        with BagWriter(tmp_path / name) as writer:
+            heading = course = 0.0
+            for k in range(300):
+                course = float(rng.uniform(-30.0, 30.0)) if k % 20 == 0 else course
+                heading += 0.2 * (course - heading)
+                values = {"/course": course % 360.0, "/heading": (heading - 0.01) % 360.0}
+                for topic, value in values.items():
+                    data = bytes(standard_types().serialize_cdr(number(value), kind))
+                    stamp = START_NS + k * 100_000_000
+                    writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+    u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
+    assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
+    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", u, "-y", y,
+                 "--out", tmp_path / "robot.yaml")  # fmt: skip
+    assert ": good" in said
+    assert "if a trial begins near half a turn" in said
+
+
+def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
+    """A publisher that does not fill them in: identification would refuse them."""
+    rng = np.random.default_rng(4)
+    for name in ("a", "b"):
+        u = np.repeat(rng.uniform(-1.0, 1.0, 20), 10)
+        y = np.convolve(u, 0.2 * 0.8 ** np.arange(60))[: len(u)]
+        speed_bag(tmp_path / name, y, u, stamps_ns=[0] * len(u))
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", CMD, "-y", SPEED, "--out", config)
+    assert load_config(config).clock == "log"
+    assert "/odom (nav_msgs/msg/Odometry) has header stamps that are all 0" in said
 
 
 def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(

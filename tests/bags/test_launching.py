@@ -68,7 +68,7 @@ def test_arguments_fill_parameters_names_and_remappings_and_conditions_choose_no
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ([], "funnel missing; the arguments of monitor.launch.xml are"),
+        ([], "funnel missing; the arguments of monitor.launch.xml:"),
         (["funnel:=f.json", "funel:=g.json"], "'funel:=g.json' is not one of the arguments"),
         (["funnel=f.json"], "'funnel=f.json' is not one of the arguments"),
     ],
@@ -90,7 +90,7 @@ def test_live_without_a_workflow_lists_every_one_with_its_arguments() -> None:
     done = CliRunner().invoke(app, ["live"])
     assert done.exit_code == 2
     for name in WORKFLOWS:
-        assert f"{name}.launch.xml are" in done.output
+        assert f"{name}.launch.xml:" in done.output
 
 
 def test_live_with_a_workflow_that_does_not_exist_names_those_that_do() -> None:

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bags.designs.design import WiredDesign
-from bags.monitoring.replay import replay_messages
+from bags.monitoring.replay import Replay, replay_messages
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.signals.expressions import Expression
-from bags.signals.grid import read_dataset
+from bags.signals.grid import filled_samples, read_dataset
 from bags.signals.reader import read_signals
-from bags.signals.sampling import Sample, Sampler, sampled_path
+from bags.signals.sampling import LOST, MOST_LOST, Sample, Sampler, sampled_path
 from bags.tools.listing import bag_signals
 from nlsid_core.design import design_output_tube
 from nlsid_core.errors import BagError
@@ -37,6 +37,7 @@ from tests.bag_messages import (
     header,
     odometry,
     serialised,
+    speed_bag,
     twist,
 )
 
@@ -71,9 +72,21 @@ def brute(signal: str, values: Series, at: int) -> float:
     return v0 + (after[0][1] - v0) * ((at - t0) / (after[0][0] - t0))
 
 
+def is_bridged(values: Series, at: int, period_ns: int) -> bool:
+    """Whether `at` is on no message, and those around it are more than 1.5 periods apart."""
+    before = [stamp for stamp, _ in values if stamp <= at]
+    after = [stamp for stamp, _ in values if stamp > at]
+    return before[-1] != at and 2 * (after[0] - before[-1]) > 3 * period_ns
+
+
 def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Sample]:
     given = [sample for k, stamp, value in events for sample in sampler.feed(k, stamp, value)]
-    return given + sampler.flush()
+    return came(given + sampler.flush())
+
+
+def came(samples: Sequence[Sample]) -> list[Sample]:
+    """Those of which a message came."""
+    return [sample for sample in samples if sample.missing != LOST]
 
 
 def interleaved(
@@ -126,6 +139,9 @@ def test_samples_are_what_the_rule_says_in_any_order_of_arrival(seed: int, rule:
     for sample, (_, values) in zip(given, truth, strict=True):
         assert np.array_equal([*sample.y, *sample.u], values, equal_nan=True)
         assert bool(sample.missing) is not bool(np.isfinite(values).all())
+        known = rule != "none" and not sample.missing
+        bridged = [known and is_bridged(c, sample.stamp_ns, 10 * MS) for c in columns[:-1]]
+        assert bool(sample.filled) is any(bridged)
 
 
 @settings(max_examples=40, deadline=None)
@@ -138,6 +154,7 @@ def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> N
         "",
         "|to(deg)",
         "|unwrap",
+        "|unit(deg)|unwrap",
         "|unwrap|derivative(0.1 s)",
         "|derivative(0.07 s)|to(rpm)",
     ):
@@ -156,6 +173,10 @@ def test_an_unwrapped_angle_is_the_angle_without_jumps() -> None:
     wrapped = np.angle(np.exp(1j * truth))
     found = Expression.parse("/odom:a.yaw|unwrap").apply(wrapped, np.arange(500), "rad")
     np.testing.assert_allclose(found, truth, atol=1e-12)
+    compass = np.rad2deg(truth) % 360.0 + np.where(np.arange(500) == 0, 359.9, 0.0)
+    found = Expression.parse("/boat:heading|unit(deg)|unwrap").apply(compass, np.arange(500), "")
+    np.testing.assert_allclose(found[0], -0.1, atol=1e-9)
+    np.testing.assert_allclose(found[1:], np.rad2deg(truth)[1:], atol=1e-9)
 
 
 def drive(path: Path, *, stamped: bool = True, count: int = 200) -> Path:
@@ -243,6 +264,34 @@ def test_products_of_delayed_and_lagged_signals_are_what_the_words_say(seed: int
     found = [[*sample.y, *sample.u] for sample in given]
     np.testing.assert_allclose(found, truth, rtol=1e-12)
     assert np.isfinite(found).any()
+
+
+def test_a_lost_sample_has_the_commands_of_its_time_where_they_are_known() -> None:
+    """Not those that no hold keeps, nor what is measured with the response."""
+    measured = "/y:other|hold(1 s)"
+    texts = [U, f"{U}|hold(1 s)", measured, f"{U}|hold(1 s) * {measured}"]
+    sampler, times = Sampler([Y], texts, period=0.01), [0, 10, 20, 61, 400]
+    for k in range(1, 6):
+        sampler.feed(k, 0, 2.0)
+    given = [sample for t in times for sample in sampler.feed(0, t * MS, 1.0)]
+    for k in range(1, 6):
+        given += sampler.feed(k, 5 * MS, 3.0)
+    given += sampler.flush()
+    lost = [sample for sample in given if sample.missing == LOST]
+    assert [sample.stamp_ns / MS for sample in given[:6]] == [0, 10, 20, 30.25, 40.5, 50.75]
+    assert len(lost) == 3 + 33
+    assert all(math.isnan(sample.y[0]) for sample in lost)
+    nan = math.nan
+    np.testing.assert_array_equal([s.u for s in lost], [[nan, 3.0, nan, nan]] * len(lost))
+    again = Sampler([Y], [U], period=0.01)
+    for k, t in ((1, 0), (0, 0), (1, 8), (0, 30), (1, 30)):
+        given = again.feed(k, t * MS, float(t))
+    assert [(s.stamp_ns // MS, s.u) for s in given] == [(10, (8.0,)), (20, (8.0,)), (30, (30.0,))]
+    far = Sampler([Y], [U], period=0.01)
+    far.feed(1, 0, 1.0)
+    for t in (0, 10, 10 + 10 * (MOST_LOST + 2), 10 + 10 * (2 * MOST_LOST + 3)):
+        far.feed(0, t * MS, 1.0)
+    assert [sample.missing for sample in far.flush()].count(LOST) == MOST_LOST
 
 
 def test_what_answers_is_no_product_and_has_no_lag() -> None:
@@ -363,6 +412,45 @@ def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     assert {entry.reading.status for entry in said[4:388]} == {Status.INSIDE}
 
 
+@pytest.mark.parametrize(
+    ("lost", "verdict"), [((50,), Status.INSIDE), (range(50, 120, 2), Status.UNKNOWN)]
+)
+def test_samples_that_nobody_measured_are_counted_and_not_judged(
+    tmp_path: Path, lost: Sequence[int], verdict: Status
+) -> None:
+    """By identification and by the monitor alike; the rest of the run is judged as before."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 40), 10)
+    y = np.zeros_like(u)
+    for k in range(len(u) - 1):
+        y[k + 1] = 0.8 * y[k] + 0.2 * u[k] + 1e-3 * rng.standard_normal()
+    whole, lossy = tmp_path / "whole", tmp_path / "lossy"
+    speed_bag(whole, y, u)
+    speed_bag(lossy, y, u, lost=lost)
+    data, gappy = (
+        read_dataset(
+            [bag], responses=[SPEED], excitations=[COMMAND], max_gap=0.08, resample="linear"
+        )
+        for bag in (whole, lossy)
+    )
+    assert (filled_samples(data), filled_samples(gappy)) == (0, len(lost))
+    model = replace(identify(data, LinearClass(1)).model, training="sha256:0")
+    made = design_output_tube(model, data)
+    design = WiredDesign(made.model, made.policy, made.funnel)
+    before, after = (replay_messages(design, bag) for bag in (whole, lossy))
+    assert len(before) == len(after) == len(u)
+    assert [entry.reading for entry in after[:50]] == [entry.reading for entry in before[:50]]
+    unmeasured = {k for k, e in enumerate(after) if e.reading.reason.startswith("filled in: /odom")}
+    assert unmeasured == set(lost)
+    assert {after[k].reading.status for k in unmeasured} == {Status.UNKNOWN}
+    judged = [e.reading.status for k, e in enumerate(after) if k > 0 and k not in unmeasured]
+    assert set(judged) == {Status.INSIDE}
+    readings = tuple(entry.reading for entry in after)
+    replay = Replay("lossy", readings, (), "speed", "m/s", 1.0, period=0.025)
+    assert (replay.filled, replay.verdict) == (len(lost), verdict.value)
+    assert bool(replay.unjudged) is (verdict is Status.UNKNOWN)
+
+
 def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Path) -> None:
     types = standard_types().types
     kind = "tf2_msgs/msg/TFMessage"
@@ -409,7 +497,7 @@ def test_a_frame_is_read_by_its_name_from_the_messages_that_have_it(tmp_path: Pa
                 decode(message.data, *source.types_on("/tf")),
             )
         ]
-    assert [sample.y[0] for sample in given] == read[signals[1]].values.tolist()
+    assert [sample.y[0] for sample in came(given)] == read[signals[1]].values.tolist()
     with pytest.raises(BagError, match="'frame' on 'tf2_msgs/msg/TFMessage' is not an array of"):
         read_signals(tmp_path / "tf", ["/tf:transforms[frame=base].transform.translation.x"])
     with pytest.raises(BagError, match=r"is nan in message 0 .*not finite"):
@@ -431,7 +519,12 @@ def test_a_missing_command_is_named_with_how_long_it_has_been_missing() -> None:
     sampler.feed(1, 0, 1.0)
     assert sampler.feed(0, 50 * MS, 2.0) == []
     assert sampler.flush(60 * MS) == [Sample(50 * MS, (2.0,), (1.0,))]
-    [late] = [*sampler.feed(0, 200 * MS, 3.0), *sampler.flush(200 * MS)]
+    *lost, late = [*sampler.feed(0, 200 * MS, 3.0), *sampler.flush(200 * MS)]
+    assert [(sample.stamp_ns, sample.missing) for sample in lost] == [
+        (100 * MS, LOST),
+        (150 * MS, LOST),
+    ]
+    np.testing.assert_array_equal([sample.u for sample in lost], [[1.0], [np.nan]])
     assert late.missing == f"{U}|hold(0.1 s): nothing for 0.2 s; at most 0.1 s is held"
     assert math.isnan(late.u[0])
     sampler.feed(1, 150 * MS, 5.0)

@@ -113,6 +113,21 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
         assert reading.assumption >= part**2 * (1.0 - 1e-6)
 
 
+@EVERY
+def test_a_run_that_starts_at_a_wrong_measurement_is_inside_or_breaks_the_assumption(
+    name: str,
+) -> None:
+    """The tube is around whatever start: what follows of a wrong one is innovation."""
+    monitor, trial = monitor_of(name), trial_of(name)
+    for times in (1.0, 10.0):
+        y = trial.y.copy()
+        y[monitor.lags - 1] += times * design(name).funnel.half_widths
+        monitor.restart()
+        readings = run(monitor, replace(trial, y=y))
+        assert not [r.reason for r in readings if "although" in r.reason]
+        assert {r.status for r in readings[-10:]} == {Status.INSIDE}, "a wrong start fades"
+
+
 def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
     monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
     run(monitor, trial)

@@ -7,13 +7,21 @@ import numpy as np
 import pytest
 
 from benchmarks.rwse_scaling import boundary_rows, linear_matrix_inequality
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification.banded import Rows
-from nlsid_core.identification.newton import SchurBarrier, minimise, smallest_eigenvalues
+from nlsid_core.identification.newton import (
+    Descent,
+    Repulsion,
+    SchurBarrier,
+    minimise,
+    smallest_eigenvalues,
+)
 from nlsid_core.identification.prediction import one_step_residual
 from nlsid_core.identification.rie import IdentificationErrorBound, robust_identification_error
 from nlsid_core.identification.rse import Bound, robust_simulation_error
 from nlsid_core.identification.state_affine import (
     StateAffineClass,
+    build_state_affine_rows,
 )
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
@@ -260,3 +268,48 @@ def test_minimisers_where_eigenvalues_vanish_equal_the_cone_solver_s(N: int) -> 
     assert pytest.approx(optimum, rel=SOLVER) == found.point.J
     dense_smallest = np.linalg.eigvalsh(dense_K(rows, found.point.theta, None))[0]
     assert smallest[0] == pytest.approx(dense_smallest, rel=1e-2)
+
+
+def slow_outputs() -> Rows:
+    """Two outputs of four slow poles: on its way from the identity Newton comes near det K = 0."""
+    rng = np.random.default_rng(0)
+    poles, B, C = np.linspace(0.8, 0.99, 4), rng.standard_normal(4), rng.standard_normal((2, 4))
+    u = np.repeat(rng.standard_normal(10), 10)[:, None]
+    x = np.zeros((len(u), 4))
+    for t in range(1, len(u)):
+        x[t] = poles * x[t - 1] + 0.1 * B * u[t - 1]
+    y = x @ C.T
+    y += 0.05 * np.std(y, axis=0) * rng.standard_normal(y.shape)
+    data = Dataset((Trajectory(t=np.arange(len(u)) * 1.0, y=y, u=u, name="slow"),))
+    return build_state_affine_rows(data, StateAffineClass(2, (1,))).rows
+
+
+def test_where_newton_stalls_on_its_way_the_minimiser_inside_is_found() -> None:
+    rows = slow_outputs()
+    bound = Bound(rows, None)
+    stalled = Descent(bound, (), len(rows.identity)).to_minimum(rows.identity)
+    optimum, _ = linear_matrix_inequality(rows)
+    assert not stalled.converged
+    assert 2.0 * optimum < stalled.point.J
+    found = minimise(bound, rows.identity)
+    assert found.is_inside
+    assert not found.on_boundary
+    assert found.steps < 40
+    assert pytest.approx(optimum, rel=SOLVER) == found.point.J
+
+
+def test_the_derivatives_of_the_repulsion_are_those_of_its_value() -> None:
+    rows = slow_outputs()
+    bound = Bound(rows, None)
+    repulsion = Repulsion(bound, bound.at(rows.identity))
+    assert repulsion.value(bound.at(rows.identity)) == pytest.approx(1.0)
+    theta = near_identity(rows, 0, 0.02)
+    gradient, hessian = repulsion.derivatives(bound.at(theta))
+    step = 1e-5
+    for i in range(len(theta)):
+        moved = step * np.eye(len(theta))[i]
+        above, below = bound.at(theta + moved), bound.at(theta - moved)
+        slope = (repulsion.value(above) - repulsion.value(below)) / (2 * step)
+        assert gradient[i] == pytest.approx(slope, rel=1e-5, abs=1e-6)
+        change = (repulsion.derivatives(above)[0] - repulsion.derivatives(below)[0]) / (2 * step)
+        assert hessian[i] == pytest.approx(change, rel=1e-5, abs=1e-5)

@@ -1,5 +1,6 @@
 """Continuous funnels' documents validate against their schemas, and damaged ones do not."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -9,7 +10,7 @@ import pytest
 from bags.chain.problems import FunnelProblem
 from nlsid_core import files
 from nlsid_core.arrays import Json
-from nlsid_core.dynamics import Nominal
+from nlsid_core.dynamics import MeasuredPush, Nominal
 from tests.continuous_stage import stage
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,5 +58,7 @@ def test_a_problem_validates_with_what_may_be_left_out_or_without() -> None:
     field, policy, _ = stage()
     asked = FunnelProblem(field, Nominal(policy.x, policy.u), np.eye(1), hold="largest")
     judged(asked.document(), "funnel_problem")
+    push = MeasuredPush(np.ones((1, 1)), (("a bag", "0" * 64),), 0.02, 1.5)
+    judged(replace(asked, push=push).document(), "funnel_problem")
     needed = ("format", "version", "vector_field", "nominal", "goal")
     judged({key: asked.document()[key] for key in needed}, "funnel_problem")

@@ -12,7 +12,14 @@ from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError, ShapeError, SolverError
-from nlsid_core.identification import CertifiedSem, LinearClass, identify, newton, prove_stability
+from nlsid_core.identification import (
+    CertifiedSem,
+    LinearClass,
+    Rse,
+    identify,
+    newton,
+    prove_stability,
+)
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.linear import (
@@ -25,7 +32,7 @@ from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import Bound, robust_simulation_error
 from nlsid_core.identification.searches import _tried
 from nlsid_core.identification.simulation_error import SimulationError
-from nlsid_core.identification.starts import reduced_poles, reflected
+from nlsid_core.identification.starts import companion, reduced, reflected, stable_starts
 from nlsid_core.identification.state_affine import StateAffineClass, build_state_affine_rows
 from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import StateAffineModel
@@ -285,6 +292,39 @@ def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_mi
     assert all(candidate.proof is not None for candidate in fit.candidates)
 
 
+def beside_another_output(data: Dataset) -> Dataset:
+    """The data's output, and one sample later half of it with some noise, as two outputs."""
+    (trial,), rng = data, np.random.default_rng(0)
+    other = 0.5 * np.roll(trial.y, 1) + 0.01 * np.std(trial.y) * rng.normal(size=trial.y.shape)
+    y = np.hstack([trial.y, other])
+    return Dataset((Trajectory(t=trial.t, y=y, u=trial.u, name="two"),))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(outputs: int) -> None:
+    one = two_resonances(4, noise=0.1)
+    data, lags, least = (one, 2, 17.3) if outputs == 1 else (beside_another_output(one), 1, 11.0)
+    model_class = StateAffineClass(lags)
+    stacked = build_state_affine_rows(data, model_class)
+    *_, stuck = robust_simulation_error(stacked.rows)
+    assert simulation_percent(stacked.model(stuck.theta, stuck.p), data) > 90.0
+    fit = identify(data, model_class, method=Rse(), comparators=())
+    assert fit.errors["train"]["rse"] < least
+    assert fit.proof.rate < 1.0
+
+
+def test_iterates_from_a_given_start_go_on_to_the_minimum() -> None:
+    regression = build_regression(two_resonances(1, noise=0.1), 4)
+    start = dict(stable_starts(regression.dataset, 4))["from a longer model"]
+    found = list(robust_simulation_error(regression.rows, start=start))
+    assert len(found) > 5
+    error = SimulationError(regression.rows)
+    point = error.at(found[-1].theta)
+    minimum = newton.Descent(error, (), len(start)).to_minimum(found[-1].theta).point
+    assert point.J <= minimum.J * (1 + 1e-3)
+    assert found[0].J > 1.2 * minimum.J
+
+
 def test_reflected_poles_are_inside_and_the_others_stay() -> None:
     theta = np.poly([0.9, 1.25, -2.0, 0.5]).real
     assert np.sort(np.roots(reflected(theta)).real) == pytest.approx([-0.5, 0.5, 0.8, 0.9])
@@ -293,14 +333,30 @@ def test_reflected_poles_are_inside_and_the_others_stay() -> None:
     assert len(on_the_circle) == 4
 
 
+def test_reflected_poles_of_several_outputs_are_inside_and_the_others_stay() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.standard_normal((3, 2, 2))
+    a[2, 1] = a[2, 0]  # a pole at 0
+    theta = np.concatenate([np.eye(2)[None], -a]).ravel()
+    before = np.linalg.eigvals(companion(a))
+    found = reflected(theta, 0.9, 2).reshape(4, 2, 2)
+    after = np.linalg.eigvals(companion(-found[1:]))
+    wanted = np.where(np.abs(before) > 1.0, 1.0 / before.conj(), before)
+    wanted *= np.minimum(1.0, 0.9 / np.maximum(np.abs(wanted), 1e-12))
+    assert np.sum(np.abs(before) > 1.0) == 3
+    assert np.sort(np.abs(after)) == pytest.approx(np.sort(np.abs(wanted)), abs=1e-6)
+    inside = np.concatenate([np.eye(2)[None], -0.1 * a]).ravel()
+    assert reflected(inside, 0.9, 2) is inside
+
+
 def test_a_longer_model_is_reduced_to_the_poles_it_has() -> None:
     """Extra poles that zeros cancel do not show in the impulse response."""
     data = two_resonances(0, noise=0.0)
     short = least_squares(build_regression(data, 4))
     extra = np.poly([0.7, -0.6]).real
     a = -np.convolve(np.concatenate([[1.0], -short.a]), extra)[1:]
-    longer = replace(short, a=a, b=np.convolve(short.b, extra))
-    poles = reduced_poles(longer, 4)
+    found = reduced(a[:, None, None], np.convolve(short.b, extra)[:, None, None], 4)
+    poles = np.linalg.eigvals(companion(found))
     assert np.sort_complex(poles) == pytest.approx(
         np.sort_complex(np.roots(np.concatenate([[1.0], -short.a]))), abs=1e-6
     )

@@ -44,7 +44,7 @@ def robot(funnel: Path) -> Iterator[Robot]:
     ("samples", "speed", "says"),
     [
         ([*GOOD, 4], 0.0, "time went back"),
-        ([*GOOD, 50], 0.0, "of a new run: 40 samples are missing before t ="),
+        ([*GOOD, 150], 0.0, "of a new run: 140 samples are missing before t ="),
         ([0, 1, 2, 3, 5, 4], 0.0, "no speed for 0.5 s"),
         (GOOD, math.nan, "no speed for 0.5 s"),
         (GOOD, math.inf, "no speed for 0.5 s"),
@@ -61,10 +61,10 @@ def test_a_state_that_cannot_be_trusted_is_named_and_only_a_new_run_is_inside(
     robot.drive(samples, speed=speed)
     robot.spin_until(lambda: robot.has_said(says))
     robot.said.clear()
-    robot.drive([100, 101, 102, 103])
+    robot.drive([300, 301, 302, 303])
     robot.spin_until(lambda: robot.has_said(""))
     assert not robot.has_said("inside")
-    robot.drive([104, 105])
+    robot.drive([304, 305])
     if says == "outside":
         robot.spin_until(lambda: len(robot.said["funnel_monitor"]) > 1)
         assert not robot.has_said("inside")
@@ -230,7 +230,7 @@ def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path
 
 
 @pytest.mark.parametrize("role", ["response", "excitation"])
-def test_an_array_of_another_length_is_named_and_a_new_run_starts(
+def test_an_array_of_another_length_is_named_and_a_run_goes_on_if_it_is_no_command(
     monkeypatch: pytest.MonkeyPatch, role: str
 ) -> None:
     use_domain_of_this_run(monkeypatch)
@@ -266,6 +266,10 @@ def test_an_array_of_another_length_is_named_and_a_new_run_starts(
         spin_until(lambda: any("'position' has 0 elements" in text for text in said))
         said.clear()
         send(range(11, 11 + len(design.model) - 1))  # too few to start a run
+        if role == "response":  # its sample is lost, and its command is known
+            spin_until(lambda: "inside" in said)
+            stop(monitor)
+            return
         spin_until(lambda: any("waiting for the first" in text for text in said))
         said.clear()  # the sample before the short one may have been judged late
         spin_until(lambda: len(said) > 1)  # a heartbeat or two

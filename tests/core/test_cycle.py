@@ -1,0 +1,116 @@
+"""Funnels that end inside their start, against simulations of the whole oscillator and wheel."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from examples import limit_cycle, rimless_wheel
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import (
+    ContinuousTracking,
+    FunnelDesign,
+    closed_cycle,
+    design,
+    integrate_nominal,
+)
+from nlsid_core.dynamics import VectorField
+from nlsid_core.errors import DataError, Infeasible
+
+TURNS = 3
+
+
+def decaying(hold: float | None = None, rate: float = -1.0) -> FunnelDesign:
+    """A funnel of dx/dt = rate x + u around 0, for one second."""
+    field = VectorField.from_function(lambda x, u: [rate * x[0] + u[0]], 1, 1)
+    still = integrate_nominal(field, lambda _: np.zeros(1), t=np.linspace(0, 1, 5), start=[0.0])
+    return design(ContinuousTracking(field, still, goal=[0.5], hold=hold))
+
+
+def test_every_start_of_the_ring_comes_to_the_published_limit_cycle() -> None:
+    found = limit_cycle.designed()
+    funnel = found.funnel
+    assert limit_cycle.amplitude(funnel) == pytest.approx(limit_cycle.PUBLISHED, abs=2e-6)
+    (r,), (start,), (end,) = funnel.nominal(0.0), funnel.widths(0.0), funnel.widths(funnel.tf)
+    assert start > 10 * end, "the ring is wide"
+    assert "ends in the goal" in str(found.verdict)
+    goal = found.claim["goal"]
+    assert goal["P"][0][0] ** -0.5 == pytest.approx(start, rel=1e-6), "the goal is the start"
+    assert goal["centre"] == [r]
+
+    def oscillator(_: float, z: FloatArray) -> list[float]:
+        x, y = z
+        return [y - (x**3 / 3 - x), -x]
+
+    def half_turn(_: float, z: FloatArray) -> float:
+        return float(z[1])
+
+    half_turn.direction = 1.0  # type: ignore[attr-defined]
+    half_turn.terminal = True  # type: ignore[attr-defined]
+    for radius in (r - start, r + start):
+        z = np.array([radius, -1e-9])
+        for _ in range(TURNS):
+            solved = solve_ivp(oscillator, (0, 20), z, events=half_turn, rtol=1e-10, atol=1e-12)
+            (z,) = solved.y_events[0]
+            assert z[0] < 0, "half a turn ends on the other side"
+            assert abs(-z[0] - r) <= end
+            z = np.array([-z[0], -1e-9])  # the oscillator is odd
+
+
+def steps(speed: float) -> Iterator[tuple[float, float]]:
+    """(speed before, speed after the impact) of steps of the wheel, θ(t) from its own equation."""
+    a, slope = rimless_wheel.ALPHA, rimless_wheel.SLOPE
+
+    def struck(_: float, z: FloatArray) -> float:
+        return float(z[0] - slope - a)
+
+    struck.terminal = True  # type: ignore[attr-defined]
+    while True:
+        solved = solve_ivp(
+            lambda _, z: [z[1], rimless_wheel.GRAVITY * np.sin(z[0])],
+            (0, 20), [slope - a, speed], events=struck, rtol=1e-10, atol=1e-12,
+        )  # fmt: skip
+        ((_, before),) = solved.y_events[0]
+        speed = float(before * np.cos(2 * a))
+        yield float(before), speed
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_wheel_that_starts_in_its_funnel_walks_on_for_ever(side: int) -> None:
+    found = rimless_wheel.designed()
+    funnel = found.funnel
+    (speed,), (start,), (end,) = (
+        funnel.nominal(funnel.t0), funnel.widths(funnel.t0), funnel.widths(funnel.tf),
+    )  # fmt: skip
+    assert np.cos(2 * rimless_wheel.ALPHA) * end < start, "what the impact leaves is inside"
+    walked = steps(speed + side * start)
+    for _ in range(TURNS):
+        before, after = next(walked)
+        assert abs(before - funnel.nominal(funnel.tf)[0]) <= end
+        assert abs(after - speed) <= start
+    assert after == pytest.approx(rimless_wheel.PUBLISHED, abs=0.2 * start)
+
+
+def test_a_cycle_closes_up_to_the_reset_that_the_widths_allow() -> None:
+    found = decaying()
+    start, end = found.funnel.widths(0.0)[0], found.funnel.widths(1.0)[0]
+    closed = closed_cycle(found, reset=[[0.5]])
+    assert closed.claim["goal"]["P"][0][0] == pytest.approx(
+        0.25 * found.funnel.shape(0.0)[0, 0], rel=1e-6
+    )
+    with pytest.raises(Infeasible, match="does not end inside its start"):
+        closed_cycle(found, reset=[[1.01 * start / end]])
+    closed_cycle(found, reset=[[0.99 * start / end]])
+
+
+@pytest.mark.parametrize("reset", [[[0.0]], [[1.0, 0.0]]])
+def test_a_reset_without_an_inverse_is_refused(reset: Any) -> None:
+    with pytest.raises(DataError, match="invertible"):
+        closed_cycle(decaying(), reset=reset)
+
+
+def test_a_held_funnel_is_not_closed() -> None:
+    with pytest.raises(DataError, match="held into the next cycle"):
+        closed_cycle(decaying(hold=0.01))
