@@ -442,9 +442,9 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
                     data = bytes(standard_types().serialize_cdr(number(value), kind))
                     stamp = START_NS + k * 100_000_000
                     writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
-    course, heading = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
-    assert {heading, course} <= {each.text for each in look([tmp_path / "a"]).candidates}
-    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", course, "-y", heading,
+    u, y = (f"/{name}:data|unit(deg)|unwrap" for name in ("course", "heading"))
+    assert {y, u} <= {each.text for each in look([tmp_path / "a"]).candidates}
+    said = nlsid("init", tmp_path / "a", tmp_path / "b", "-u", u, "-y", y,
                  "--out", tmp_path / "robot.yaml")  # fmt: skip
     assert ": good" in said
     assert "if a trial begins near half a turn" in said
