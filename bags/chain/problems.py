@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from bags.monitoring.catching import Breaking, breaking
 from bags.signals.grid import read_dataset
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray, Json
@@ -144,8 +145,8 @@ def measured(
     seconds: float | None,
     safety_factor: float,
     resample: str = "none",
-) -> FunnelProblem:
-    """The problem of a file with what its equations leave out of bags.
+) -> tuple[FunnelProblem, Breaking]:
+    """The problem of a file with what its equations leave out of bags; and what would break that.
 
     responses, excitations: its states and inputs as signals. For the rest see `measured_push` and
     `read_dataset`, whose errors pass through.
@@ -155,7 +156,8 @@ def measured(
         bags, responses=responses, excitations=excitations, period=period, resample=resample
     )
     push = measured_push(problem.field, trials, seconds=seconds, safety_factor=safety_factor)
-    return dataclasses.replace(problem, push=push)
+    found = breaking(trials, lambda trial: push.used(problem.field, trial))
+    return dataclasses.replace(problem, push=push), found
 
 
 def _array(

@@ -14,13 +14,14 @@ from bags.chain.tracking_config import SimulationConfig, TrackingConfig
 from bags.designs import documents
 from bags.designs.design import SampledDesign
 from bags.designs.documents import Proved
+from bags.monitoring.catching import Breaking, breaking
 from bags.monitoring.replay import replay_messages
 from bags.monitoring.watch import WAITING
 from bags.pictures.report import report_available
 from bags.signals.grid import read_dataset
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.trajectory import Dataset
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import SampledTracking, design
 from nlsid_core.design.sampled.design import TrackingDesign, assume, frame
 from nlsid_core.design.sampled.motion import Feedback, follow_motion, plan_motion, track, tvlqr
@@ -29,6 +30,7 @@ from nlsid_core.identification.states import StateFit, identify_states
 from nlsid_core.models.measured_state import MeasuredState, read_measured_state
 from nlsid_core.policies.sampled import SampledPolicy
 from nlsid_core.progress import Progress
+from nlsid_core.running.assumption import disturbance_of
 from nlsid_core.running.monitor import OVER
 from nlsid_core.running.reading import Reading
 
@@ -173,6 +175,20 @@ def widest_start(made: TrackingDesign, runs: Dataset) -> float:
     first = [trial.y[0] - made.policy.x[0] for trial in runs]
     radius = float(made.funnel.inlet[0])
     return max(made.funnel.norm(0, x_bar) / radius for x_bar in first)
+
+
+def what_breaks(made: TrackingDesign, runs: Dataset) -> Breaking:
+    """By fault, how many of these runs' copies that have it break the proof's assumption."""
+    funnel, a = made.funnel, made.funnel.assumption
+
+    def used(run: Trajectory) -> float:
+        sizes = disturbance_of(
+            made.model, made.policy, run, S=funnel.S, A=funnel.A, form=a.form, rate=a.rate,
+            gain=a.gain,
+        )  # fmt: skip
+        return float(np.max(sizes)) / a.bound
+
+    return breaking(runs, used)
 
 
 def replay_run(proved: Proved[SampledDesign], bag: Path) -> list[Reading]:

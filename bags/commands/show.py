@@ -14,7 +14,7 @@ from bags.chain.config import Config
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
-from bags.monitoring.catching import WIDE, Catching, Caught
+from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
 from bags.pictures.report import report_available
@@ -193,7 +193,7 @@ def funnel_table(design: OutputTubeDesign) -> Table:
             for width, signal in widths
         )
         if tube.follows is not None:
-            said += " on average, wider and narrower as the commands go: times sqrt(g)"
+            said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
@@ -254,6 +254,9 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
     for row in catching.rows:
         if row.refused:
             console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    if alone := [f"{row.fault}: {row.output}" for row in catching.rows if row.output]:
+        said = "a sensor's fault is in one output at a time; above is the one caught least: "
+        console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
     if false := catching.rows[0].funnel.count:
         console.print(
             f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "
@@ -261,11 +264,24 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
             soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
         )  # fmt: skip
+    for line in catching.beyond:
+        said = f"warning: {line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "
         said = f"{word}{line}"
         console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
+
+
+def breaking_table(found: Breaking) -> Table:
+    """By fault, how many of the copies that have it break what a proof assumes."""
+    table = Table(title="what breaks the assumption: copies of its trials", title_justify="left")
+    table.add_column("fault")
+    table.add_column("broken", justify="right")
+    for fault, count in found.counts.items():
+        table.add_row(fault, f"{count} of {found.trials}")
+    return table
 
 
 def width_lines(catching: Catching) -> list[str]:

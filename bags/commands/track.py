@@ -10,6 +10,7 @@ from rich.table import Table
 from bags.chain import tracking_steps
 from bags.chain.tracking_config import load_tracking_config
 from bags.commands.progress import progress_bar
+from bags.commands.show import breaking_table
 from bags.designs import documents
 from bags.pictures.report import report_available
 from bags.recordings.folders import expand_bags
@@ -64,7 +65,9 @@ def funnel(bags: list[Path], design: Path, config: Path) -> None:
         f"the largest of {len(a.measured_on)} runs; the monitor watches it",
         soft_wrap=True,
     )
-    widest = tracking_steps.widest_start(made, tracking_steps.read_states(runs, settings))
+    recorded = tracking_steps.read_states(runs, settings)
+    out.print(breaking_table(tracking_steps.what_breaks(made, recorded)))
+    widest = tracking_steps.widest_start(made, recorded)
     if widest < 1.0:
         out.print(
             f"warning: the runs started within {widest:.2g} of the inlet that is claimed: what "

@@ -5,7 +5,7 @@ the same `Monitor` as a bag or a live robot.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from statistics import median
 from typing import Any
@@ -48,7 +48,7 @@ class Copy:
     lost: frozenset[int] = frozenset()
 
 
-Fault = Callable[[Trajectory, FloatArray, StableModel], Copy]  # of a trial, its outputs' ranges
+Fault = Callable[[Trajectory, FloatArray, Any], Copy]  # of a trial, its outputs' ranges
 
 
 def _scaled(factor: float) -> Fault:
@@ -103,6 +103,39 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
     (f"{LOST} samples lost", _dropped),
 )
 
+OF_SENSORS = frozenset(name for name, _ in SABOTAGES[:5])  # put into one output at a time
+
+
+def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
+    """What a robot records that does the same although 0.8 of its command arrives."""
+    return Copy(trial.t, trial.y, trial.u / 0.8)
+
+
+# Of recorded states: none needs a model, and the recording itself says what the robot did.
+OF_STATES: tuple[tuple[str, Fault], ...] = (*SABOTAGES[:5], ("actuator x 0.8", _commanded_more))
+
+
+@dataclass(frozen=True)
+class Breaking:
+    """By fault, in how many of so many trials a copy with it breaks what a proof assumes."""
+
+    trials: int
+    counts: dict[str, int]
+
+
+def breaking(trials: Dataset, used: Callable[[Trajectory], float]) -> Breaking:
+    """What an assumption about recordings of states (y) and inputs would tell from a sound robot.
+
+    used: the largest part of the assumption that a recording shows; above 1 it is broken. Every
+    copy is what a robot with that fault records under the same inputs at its actuators.
+    """
+    ranges = np.ptp(np.vstack([trial.y for trial in trials]), axis=0)
+    counts = {}
+    for name, fault in OF_STATES:
+        copies = [(trial, fault(trial, ranges, None)) for trial in trials]
+        counts[name] = sum(used(replace(trial, y=c.y, u=c.u)) > 1.0 for trial, c in copies)
+    return Breaking(len(trials), counts)
+
 
 @dataclass(frozen=True)
 class Caught:
@@ -126,12 +159,16 @@ class Caught:
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of sabotage; others: by the name of a detector. refused: why it was not tried."""
+    """One kind of sabotage; others: by the name of a detector. refused: why it was not tried.
+
+    output: of several, the one whose sensor alone had it: that in which it was caught least.
+    """
 
     fault: str
     funnel: Caught
     others: dict[str, Caught]
     refused: str = ""
+    output: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +230,17 @@ class Catching:
     def widest(self) -> Width:
         """The output whose half-width is the largest part of its range."""
         return max(self.widths, key=lambda width: width.share)
+
+    @property
+    def beyond(self) -> list[str]:
+        """What to know of a tube that follows the commands beyond the output's range."""
+        return [
+            f"the half-width of {width.name} is up to {_up(width.most)} {width.unit} where the "
+            f"commands change most, beyond its range, {width.range:.3g} {width.unit}: the tube "
+            "says nothing there"
+            for width in self.widths
+            if width.most is not None and width.most > width.range
+        ]
 
     def warnings(self, most: float = WIDE) -> list[str]:
         """What to know of a tube whose half-width is more than `most` of the range."""
@@ -264,6 +312,8 @@ def what_it_catches(
 ) -> Catching:
     """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
 
+    Of several outputs a sensor's fault is put into one at a time.
+
     half_widths, ranges: (p,) of each output, in its unit. factor: the safety factor, which the
     thresholds of the detectors have too. remedy: see `Catching`. A detector that alarms in more of
     the untouched trials than the monitor gets its threshold raised until it does not.
@@ -288,9 +338,19 @@ def what_it_catches(
         except (DataError, SolverError) as reason:
             rows.append(Row(name, Caught(), {}, str(reason)))
             continue
-        runs = [_run(monitor, copy, p) for copy in copies]
         onsets = [float(copy.t[copy.onset]) for copy in copies]
-        rows.append(_row(name, runs, onsets, detectors))
+        tried = {"": copies}
+        if p > 1 and name in OF_SENSORS:
+            tried = {
+                output: [_in_one(j, *pair) for pair in zip(copies, held_back, strict=True)]
+                for j, output in enumerate(first.y_names)
+            }
+        found = [
+            replace(_row(name, runs, onsets, detectors), output=output)
+            for output, sabotaged in tried.items()
+            for runs in [[_run(monitor, copy, p) for copy in sabotaged]]
+        ]
+        rows.append(min(found, key=lambda row: (row.funnel.count, -row.funnel.after)))
     errors = np.max([np.abs(run.error).max(axis=0) for run in judged], axis=0)
     following = np.concatenate([run.widths for run in scaling])
     limits: list[tuple[float | None, float | None]] = [(None, None)] * p
@@ -318,6 +378,13 @@ def _up(value: float) -> str:
 
 def _untouched(trial: Trajectory) -> Copy:
     return Copy(trial.t, trial.y, trial.u)
+
+
+def _in_one(output: int, copy: Copy, trial: Trajectory) -> Copy:
+    """The copy with its fault in the sensor of one output only."""
+    y = trial.y.copy()
+    y[:, output] = copy.y[:, output]
+    return replace(copy, y=y)
 
 
 def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:

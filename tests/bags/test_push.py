@@ -1,5 +1,7 @@
 """`nlsid push`: bags of a robot with a friction, equations without, and the funnel between them."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +11,11 @@ from typer.testing import CliRunner
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.problems import FunnelProblem
 from bags.commands.cli import app
+from bags.monitoring.catching import breaking
 from nlsid_core import files
-from nlsid_core.data.trajectory import Trajectory
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import Goal, plan_motion
-from nlsid_core.dynamics import MeasuredPush, VectorField
+from nlsid_core.dynamics import MeasuredPush, VectorField, measured_push
 from nlsid_core.errors import DocumentError
 from nlsid_core.proofs import check
 
@@ -63,6 +66,8 @@ def test_what_bags_show_is_stored_with_their_digests_and_the_funnel_is_proved_fo
     status, said = told(folder, "--safety-factor", str(FACTOR))
     assert status == 0, said
     assert "largest of 3 distinct trials, safety factor 1.2" in said
+    assert re.search(r"late by 5 samples .* 3 of 3", said), "the velocity contradicts the command"
+    assert re.search(r"stuck at first value .* 3 of 3", said)
     pushed = FunnelProblem.load(folder / "pushed.json")
     assert pushed.push is not None
     assert pushed.push.box[1, 1] == pytest.approx(FACTOR * PUSH, rel=0.03)
@@ -87,6 +92,15 @@ def test_bags_with_other_states_than_the_equations_are_refused(folder: Path) -> 
     status, said = told(folder, "-y", "/joint_states:position[0]")
     assert status != 0
     assert "3 states (as y) and 1 inputs, the dynamics 2 and 1" in said
+
+
+def test_a_weaker_actuator_breaks_the_box_once_it_takes_more_than_the_friction() -> None:
+    trials = Dataset(tuple(recorded(seed) for seed in range(3)))
+    push = measured_push(FIELD, trials, safety_factor=FACTOR)
+    assert max(push.used(FIELD, trial) for trial in trials) == pytest.approx(1 / FACTOR)
+    assert breaking(trials, lambda t: push.used(FIELD, t)).counts["actuator x 0.8"] == 3
+    rest = replace(trials.trajectories[0], y=np.zeros((200, 2)), u=np.zeros((200, 1)))
+    assert breaking(Dataset((rest,)), lambda t: push.used(FIELD, t)).counts["sensor x 0.6"] == 0
 
 
 def test_a_push_on_one_state_adds_one_w() -> None:
