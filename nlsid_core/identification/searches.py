@@ -114,14 +114,17 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
     )
 
     def minimised(iterations: int, *, stable: bool) -> DifferenceEquation:
-        """The best of the local minima from the robust simulation error and the other starts."""
+        """The best of the local minima from every start and its robust simulation error."""
         thetas = [theta for _, theta in starts]
-        try:
-            *_, last = robust_simulation_error(regression.rows, iterations=iterations)
-        except SolverError:
-            log.info("the robust simulation error gives no start")
-        else:
-            thetas.insert(0, reflected(last.theta, radius))
+        for theta in (None, *thetas):
+            try:
+                *_, last = robust_simulation_error(
+                    regression.rows, start=theta, iterations=iterations
+                )
+            except SolverError:
+                log.info("the robust simulation error gives no start")
+                continue
+            thetas.append(reflected(last.theta, radius))
             if not stable:
                 thetas.append(last.theta)
 
