@@ -6,8 +6,10 @@ A command imports what it runs when it is called: `nlsid check` needs no NumPy, 
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +17,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from bags.commands.bag_cli import bag_app
+from bags.commands.bag_cli import JsonOption, bag_app
 from bags.commands.config_cli import config_app
 from bags.commands.fleet_cli import (
     PatienceOption,
@@ -480,6 +482,7 @@ def monitor(
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Hold recorded bags against a proved funnel of any kind: margin, worst axis, assumption used.
 
@@ -491,6 +494,7 @@ def monitor(
     from bags.commands import show
     from bags.designs import documents
     from bags.designs.design import Wiring
+    from bags.fleet.monitor import judged_of
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
@@ -508,7 +512,7 @@ def monitor(
         folders = [f for f in every if trial_name(f) in settings.split.test] or every
     if len(folders) < len(every):
         said = f"{len(folders)} of {len(every)} bags: those in split.test of {config}"
-        out.print(f"{said}; without --config all are judged", soft_wrap=True)
+        err.print(f"{said}; without --config all are judged", soft_wrap=True)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:
@@ -523,8 +527,12 @@ def monitor(
         drawn = report_available() and all(entry.half_width for entry in replays)
         if drawn:
             write_margins(picture, replays)
-    out.print(show.replay_table(replays))
-    for entry in replays:
+    if as_json:
+        pairs = zip(replays, folders, strict=True)
+        typer.echo(json.dumps([asdict(judged_of(entry, bag, entry.name)) for entry, bag in pairs]))
+    else:
+        out.print(show.replay_table(replays))
+    for entry in [] if as_json else replays:
         for line in show.forecasts(entry, proved.design) if forecast else ():
             out.print(line, soft_wrap=True, markup=False, highlight=False)
         if entry.first_bad is not None:
@@ -542,7 +550,7 @@ def monitor(
             out.print(f"{entry.name}: {said}", soft_wrap=True)
         if not entry.judged:
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
-    if drawn:
+    if drawn and not as_json:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):
         raise typer.Exit(1)

@@ -193,7 +193,7 @@ def funnel_table(design: OutputTubeDesign) -> Table:
             for width, signal in widths
         )
         if tube.follows is not None:
-            said += " on average, wider and narrower as the commands go: times sqrt(g)"
+            said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
@@ -254,6 +254,9 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
     for row in catching.rows:
         if row.refused:
             console.print(f"{row.fault} was not tried: {row.refused}", soft_wrap=True, markup=False)
+    if alone := [f"{row.fault}: {row.output}" for row in catching.rows if row.output]:
+        said = "a sensor's fault is in one output at a time; above is the one caught least: "
+        console.print(said + "; ".join(alone), soft_wrap=True, markup=False, highlight=False)
     if false := catching.rows[0].funnel.count:
         console.print(
             f"warning: {false} of {catching.trials} held-back trials, nothing put into them, "
@@ -261,6 +264,9 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
             soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
         )  # fmt: skip
+    for line in catching.beyond:
+        said = f"warning: {line}"
+        console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
     wide = catching.warnings(WIDE if require is None else require)
     for line in wide:
         word = "" if line.startswith(" ") else "warning: " if require is None else "error: "

@@ -23,7 +23,7 @@ from bags.fleet.check import iso
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import ask
 from bags.fleet.workers import Workers
-from bags.monitoring.replay import Definitions, replay_bag
+from bags.monitoring.replay import Definitions, Replay, replay_bag
 from bags.recordings.definitions import texts_of
 from bags.signals.reader import bag_origin
 from nlsid_core import files
@@ -96,29 +96,33 @@ class JudgeBag:
     def __call__(self, bag: Path, name: str) -> bytes:
         """A Judged, as JSON."""
         replay = replay_bag(self.proved, bag, centre=self.centre, definitions=self.definitions)
-        stamps = dict(zip(map(id, replay.readings), replay.stamps_ns, strict=True))
-        most, worst, bad = most_spent(replay.judged), replay.worst, replay.first_bad
-        alarm = replay.first_alarm
-        judged = Judged(
-            bag=name,
-            robot=robot_of(name),
-            verdict=replay.verdict,
-            reason=replay.reason,
-            assumption="" if bad is None or bad.status is Status.OUTSIDE else bad.assuming,
-            spent=None if most is None else most.assumption,
-            spent_at=0.0 if most is None else most.t,
-            spent_when="" if most is None else iso(stamps[id(most)]),
-            margin=None if worst is None else max(worst.margin, -1e300),
-            margin_at=0.0 if worst is None else worst.t,
-            start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",
-            bad_from="" if bad is None else iso(stamps[id(bad)]),
-            alarm="" if alarm is None else alarm.alarm,
-            judged=replay.judged_span,
-            span=replay.span,
-            filled=replay.filled,
-            digest=bag_origin(bag)["digest"],
-        )
-        return files.canonical(asdict(judged))
+        return files.canonical(asdict(judged_of(replay, bag, name)))
+
+
+def judged_of(replay: Replay, bag: Path, name: str) -> Judged:
+    """What `replay` says of `bag`, which is called `name`, in a few numbers."""
+    stamps = dict(zip(map(id, replay.readings), replay.stamps_ns, strict=True))
+    most, worst, bad = most_spent(replay.judged), replay.worst, replay.first_bad
+    alarm = replay.first_alarm
+    return Judged(
+        bag=name,
+        robot=robot_of(name),
+        verdict=replay.verdict,
+        reason=replay.reason,
+        assumption="" if bad is None or bad.status is Status.OUTSIDE else bad.assuming,
+        spent=None if most is None else most.assumption,
+        spent_at=0.0 if most is None else most.t,
+        spent_when="" if most is None else iso(stamps[id(most)]),
+        margin=None if worst is None else max(worst.margin, -1e300),
+        margin_at=0.0 if worst is None else worst.t,
+        start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",
+        bad_from="" if bad is None else iso(stamps[id(bad)]),
+        alarm="" if alarm is None else alarm.alarm,
+        judged=replay.judged_span,
+        span=replay.span,
+        filled=replay.filled,
+        digest=bag_origin(bag)["digest"],
+    )
 
 
 def most_spent(readings: Sequence[Reading]) -> Reading | None:

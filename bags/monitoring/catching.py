@@ -103,6 +103,8 @@ SABOTAGES: tuple[tuple[str, Fault], ...] = (
     (f"{LOST} samples lost", _dropped),
 )
 
+OF_SENSORS = frozenset(name for name, _ in SABOTAGES[:5])  # put into one output at a time
+
 
 def _commanded_more(trial: Trajectory, _range: FloatArray, _model: Any) -> Copy:
     """What a robot records that does the same although 0.8 of its command arrives."""
@@ -157,12 +159,16 @@ class Caught:
 
 @dataclass(frozen=True)
 class Row:
-    """One kind of sabotage; others: by the name of a detector. refused: why it was not tried."""
+    """One kind of sabotage; others: by the name of a detector. refused: why it was not tried.
+
+    output: of several, the one whose sensor alone had it: that in which it was caught least.
+    """
 
     fault: str
     funnel: Caught
     others: dict[str, Caught]
     refused: str = ""
+    output: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +230,17 @@ class Catching:
     def widest(self) -> Width:
         """The output whose half-width is the largest part of its range."""
         return max(self.widths, key=lambda width: width.share)
+
+    @property
+    def beyond(self) -> list[str]:
+        """What to know of a tube that follows the commands beyond the output's range."""
+        return [
+            f"the half-width of {width.name} is up to {_up(width.most)} {width.unit} where the "
+            f"commands change most, beyond its range, {width.range:.3g} {width.unit}: the tube "
+            "says nothing there"
+            for width in self.widths
+            if width.most is not None and width.most > width.range
+        ]
 
     def warnings(self, most: float = WIDE) -> list[str]:
         """What to know of a tube whose half-width is more than `most` of the range."""
@@ -295,6 +312,8 @@ def what_it_catches(
 ) -> Catching:
     """Every sabotage of every held-back trial, through the monitor and through DETECTORS.
 
+    Of several outputs a sensor's fault is put into one at a time.
+
     half_widths, ranges: (p,) of each output, in its unit. factor: the safety factor, which the
     thresholds of the detectors have too. remedy: see `Catching`. A detector that alarms in more of
     the untouched trials than the monitor gets its threshold raised until it does not.
@@ -319,9 +338,19 @@ def what_it_catches(
         except (DataError, SolverError) as reason:
             rows.append(Row(name, Caught(), {}, str(reason)))
             continue
-        runs = [_run(monitor, copy, p) for copy in copies]
         onsets = [float(copy.t[copy.onset]) for copy in copies]
-        rows.append(_row(name, runs, onsets, detectors))
+        tried = {"": copies}
+        if p > 1 and name in OF_SENSORS:
+            tried = {
+                output: [_in_one(j, *pair) for pair in zip(copies, held_back, strict=True)]
+                for j, output in enumerate(first.y_names)
+            }
+        found = [
+            replace(_row(name, runs, onsets, detectors), output=output)
+            for output, sabotaged in tried.items()
+            for runs in [[_run(monitor, copy, p) for copy in sabotaged]]
+        ]
+        rows.append(min(found, key=lambda row: (row.funnel.count, -row.funnel.after)))
     errors = np.max([np.abs(run.error).max(axis=0) for run in judged], axis=0)
     following = np.concatenate([run.widths for run in scaling])
     limits: list[tuple[float | None, float | None]] = [(None, None)] * p
@@ -349,6 +378,13 @@ def _up(value: float) -> str:
 
 def _untouched(trial: Trajectory) -> Copy:
     return Copy(trial.t, trial.y, trial.u)
+
+
+def _in_one(output: int, copy: Copy, trial: Trajectory) -> Copy:
+    """The copy with its fault in the sensor of one output only."""
+    y = trial.y.copy()
+    y[:, output] = copy.y[:, output]
+    return replace(copy, y=y)
 
 
 def _run(monitor: Monitor, copy: Copy, p: int) -> _Run:

@@ -101,7 +101,9 @@ def _catching(catching: Catching, drawn: str) -> str:
     widths = "; ".join(
         f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
     )
-    wide = "".join(f'<p class="not">{escape(line)}</p>' for line in catching.warnings())
+    wide = "".join(
+        f'<p class="not">{escape(line)}</p>' for line in [*catching.beyond, *catching.warnings()]
+    )
     return f"""
 <h2>The funnel: what it can catch</h2>
 <p>Half-width: {widths}.</p>{wide}
@@ -131,7 +133,8 @@ def _catching_row(row: Row, detectors: Sequence[str]) -> str:
     for name in detectors:
         other = row.others[name]
         cells.append(f"{other.count}, {other.after:.2f} s" if other.count else "0")
-    return f"<tr><td>{escape(row.fault)}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
+    fault = escape(f"{row.fault}, {row.output}" if row.output else row.fault)
+    return f"<tr><td>{fault}</td>{''.join(f'<td>{c}</td>' for c in cells)}</tr>"
 
 
 def page(

@@ -250,8 +250,43 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert width.least == pytest.approx(expected.min(), rel=1e-6)
     assert width.most == pytest.approx(expected.max(), rel=1e-6)
     assert "on average" in width.said
+    assert found.beyond == []
+    narrow = replace(found, widths=(replace(width, range=0.9 * float(expected.max())),))
+    assert "where the commands change most, beyond its range" in narrow.beyond[0]
     (errors,), _ = (part.axes for part in draw(found).subfigs)
     assert len(errors.collections) == found.trials
+
+
+def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() -> None:
+    """Of two outputs; what the monitor says of each alone is counted here by itself."""
+    made = follower("two_outputs")
+    calibration, held_back = dataset(made.model, 100), dataset(made.model, 200, 4)
+    ranges = np.ptp(np.concatenate([trial.y for trial in calibration]), axis=0)
+    monitor = Monitor(made.model, None, made.funnel)
+    found = what_it_catches(
+        monitor, made.model, made.funnel.half_widths.tolist(), held_back=held_back,
+        calibration=calibration, ranges=ranges, factor=FACTOR, remedy="",
+    )  # fmt: skip
+    counts = []
+    for output in range(2):
+        caught = 0
+        for trial in held_back:
+            y = trial.y.copy()
+            y[:, output] *= 0.6
+            monitor.restart()
+            rows = zip(trial.t.tolist(), y, trial.u, strict=True)
+            said = [monitor.update(t, now, u) for t, now, u in rows]
+            caught += any(
+                r.alarm or r.status.value in ("outside", "assumption violated") for r in said
+            )
+        counts.append(caught)
+    scaled = row(found, "sensor x 0.6")
+    assert scaled.funnel.count == min(counts)
+    names = held_back.trajectories[0].y_names
+    assert scaled.output in {
+        name for name, n in zip(names, counts, strict=True) if n == min(counts)
+    }
+    assert {row.output for row in found.rows if row.fault.startswith(("act", "5"))} == {""}
 
 
 def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(

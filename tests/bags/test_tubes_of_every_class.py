@@ -1,5 +1,6 @@
 """Every class that identify offers ends in a proved tube that a bag is held against to its end."""
 
+import json
 import re
 from pathlib import Path
 
@@ -86,6 +87,11 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     done = CliRunner().invoke(app, held)
     assert done.exit_code == 2, done.output
     assert "not judged from 1.000 s on: 3 samples are missing" in done.output
+    told = CliRunner().invoke(app, [*held, "--json"])
+    [entry] = json.loads(told.stdout)
+    assert told.exit_code == 2
+    assert (entry["verdict"], entry["reason"]) == ("unknown", "3 samples are missing")
+    assert (entry["filled"], entry["judged"]) == (0, pytest.approx(entry["span"] - 0.03))
     kept = np.setdiff1d(np.arange(300), [50, 100, 150, 200, 250])
     gaps = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gaps")
     done = CliRunner().invoke(app, [*held[:-1], str(write_joint_bag(tmp_path, gaps))])
