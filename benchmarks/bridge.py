@@ -15,7 +15,7 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from nlsid_core.design.sampled.design import (
     assume,
     design_state_funnel,
     frame,
-    undisturbed,
 )
 from nlsid_core.design.sampled.motion import Feedback, plan_motion, track, tvlqr
 from nlsid_core.identification.states import free_run_error, identify_states
@@ -212,7 +211,10 @@ def compared(design: TrackingDesign, feedback: Feedback) -> tuple[float, float]:
     """
     assumption = design.funnel.assumption
     ideal = design_state_funnel(
-        design.model, design.policy, feedback, assumption=undisturbed(assumption)
+        design.model,
+        design.policy,
+        feedback,
+        assumption=replace(assumption, bound=0.0, measured=0.0),
     )
     small = design_state_funnel(
         design.model, design.policy, feedback, assumption=assumption, start=assumption.bound

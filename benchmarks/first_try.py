@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.machine import describe
-from benchmarks.thesis.soundness import simulate_boundary, simulate_held
+from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -200,17 +200,12 @@ PROBLEMS: dict[str, Callable[[], Written]] = {
 }
 
 
-class Truth:
+class Truth(OneSet):
     """The equations as they are written, for simulations."""
 
     def __init__(self, function: Callable[..., Any], found: FunnelDesign, given: int) -> None:
         self.rates = Rates(function, found.model.n, found.model.m, np.zeros((given, 2)), (), ())
         self.uncertain = found.model.uncertain[:given]
-
-    def span(self, t: float) -> int:
-        """There is one set of equations."""
-        del t
-        return 0
 
     def __call__(
         self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None

@@ -15,7 +15,7 @@ from fractions import Fraction
 import numpy as np
 
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.errors import Undecided
+from nlsid_core.errors import CertificateRejected
 from nlsid_core.polynomial import Gram, Polynomial
 
 U = 2.0**-53  # unit roundoff
@@ -25,6 +25,10 @@ SLACK = 1 + 1e-9  # covers the roundings made in the bounds: at most 4e6 of rela
 # says that something went wrong before.
 RESIDUAL_RATIO = 2**16
 Summands = tuple[IntArray, FloatArray, FloatArray]  # exponents, and the two factors of each product
+
+
+class Undecided(CertificateRejected):
+    """Not decided in floating point; the kernel may decide it. Never a proof."""
 
 
 @np.errstate(over="ignore", under="ignore", invalid="ignore")  # infinities are undecided below

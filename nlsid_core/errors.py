@@ -51,10 +51,6 @@ class CertificateRejected(NlsidError):  # noqa: N818 - a verdict, not a fault
     """A proof does not prove its claim."""
 
 
-class Undecided(CertificateRejected):
-    """Not decided in the mode that was asked for; another mode may decide it. Never a proof."""
-
-
 class CertificateMismatch(CertificateRejected):
     """A proof is about another model, policy or funnel than the files beside it."""
 

@@ -36,17 +36,21 @@ class Dynamics(Protocol):
         """ẋ (N, n)."""
 
 
-@dataclass(frozen=True)
-class TrueDynamics:
-    """rate(X, U) -> ẋ (N, n): what a Taylor model stands for, without uncertainty."""
-
-    rate: Callable[[FloatArray, FloatArray], FloatArray]
-    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+class OneSet:
+    """Equations that hold from the first to the last second."""
 
     def span(self, t: float) -> int:
         """There is one set of equations."""
         del t
         return 0
+
+
+@dataclass(frozen=True)
+class TrueDynamics(OneSet):
+    """rate(X, U) -> ẋ (N, n): what a Taylor model stands for, without uncertainty."""
+
+    rate: Callable[[FloatArray, FloatArray], FloatArray]
+    uncertain: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __call__(
         self, t: float, X: ArrayLike, U: ArrayLike, W: ArrayLike | None, *, span: int | None

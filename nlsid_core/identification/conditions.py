@@ -172,16 +172,6 @@ def centred(
     return Inequality(filled(E0.T @ H1 + H1.T @ E0 - E0.T @ E0), domain)
 
 
-def centred_increments(
-    h: Polynomials, centre: Polynomials, v: Sequence[str], *, domain: Domain = ()
-) -> Inequality:
-    """2(e₀ - ê₀)'(h - ĥ) ≥ |e₀ - ê₀|². Source: Proposition 2.7, (2.14)."""
-    hat, _ = _second(v)
-    moved, moved_0 = h - _substituted(h, hat), centre - _substituted(centre, hat)
-    p = 2 * (moved_0 @ moved) - moved_0 @ moved_0
-    return Inequality(filled(np.array([[p]], dtype=object)), _both(domain, hat), _gaps(v))
-
-
 def box(names: Sequence[str], ends: Sequence[Sequence[Number] | tuple[Number, Number]]) -> Domain:
     """low ≤ x ≤ high of states and inputs: (x - low)(high - x) ≥ 0; ends (low, high) each."""
     if len(names) != len(ends):

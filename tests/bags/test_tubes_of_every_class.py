@@ -36,9 +36,31 @@ from tests.identified_bags import (
 RUNS = 6
 
 
+def designed(config: Path, bags: Path, out: Path) -> Path:
+    """The funnel's file that the two steps write for the bags of a folder."""
+    settings = load_config(config)
+    identify_bags([bags / f"run_{k}" for k in range(RUNS)], settings, out, progress=silent)
+    design_funnel_files(out / documents.MODEL, settings, out)
+    return out / documents.FUNNEL
+
+
 @pytest.fixture(scope="module")
 def one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_saturating_bags(tmp_path_factory.mktemp("one"))
+
+
+@pytest.fixture(scope="module")
+def linear_funnel(one: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a linear model's proved tube, with everything it needs beside it."""
+    folder = tmp_path_factory.mktemp("linear")
+    config = write_config(folder / "config.yaml", ONE["linear"], **FUNNEL)
+    return designed(config, one, folder / "out")
+
+
+@pytest.fixture
+def linear(linear_funnel: Path) -> Proved[AnyDesign]:
+    """The same, loaded."""
+    return documents.load_proved(linear_funnel)
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +77,10 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
 ) -> None:
     folder, counts = (one, {}) if name in ONE else (two, {"outputs": 2, "inputs": 2})
     path = write_config(tmp_path / "config.yaml", (ONE | TWO)[name], **counts, **FUNNEL)
-    config, out = load_config(path), tmp_path / "out"
-    bags = [folder / f"run_{k}" for k in range(RUNS)]
-    identify_bags(bags, config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    assert "for ever" in check(out / documents.FUNNEL_PROOF).statement
-    proved = documents.load_proved(out / documents.FUNNEL)
-    replayed = replay_bag(proved, bags[5], centre=Centre.COMMAND, forecast=6 * PERIOD)
+    funnel = designed(path, folder, tmp_path / "out")
+    assert "for ever" in check(funnel.parent / documents.FUNNEL_PROOF).statement
+    proved = documents.load_proved(funnel)
+    replayed = replay_bag(proved, folder / "run_5", centre=Centre.COMMAND, forecast=6 * PERIOD)
     assert [len(fan) for fan in replayed.fans[:3]] == [7, 7, 7]
     assert len(replayed.forecasts) > len(replayed.judged)
     assert all(entry.kept for entry in replayed.forecasts)
@@ -72,18 +91,14 @@ def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
 
 
 def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
-    one: Path, tmp_path: Path
+    linear_funnel: Path, tmp_path: Path
 ) -> None:
-    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
-    config, out = load_config(path), tmp_path / "out"
-    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
     kept = np.setdiff1d(np.arange(300), [100, 101, 102])
     y = np.zeros((300, 2))
     y[:, 0] = 0.01 * np.random.default_rng(0).standard_normal(300)
     gap = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gap")
     bag = write_joint_bag(tmp_path, gap)
-    held = ["monitor", "--replay", "--funnel", str(out / documents.FUNNEL), str(bag)]
+    held = ["monitor", "--replay", "--funnel", str(linear_funnel), str(bag)]
     done = CliRunner().invoke(app, held)
     assert done.exit_code == 2, done.output
     assert "not judged from 1.000 s on: 3 samples are missing" in done.output
@@ -98,31 +113,17 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     assert done.output.count("not judged from") == UNJUDGED_SAID == 3
     last = f"the last from {PERIOD * 250:.3f} s on"
     assert f"gaps: not judged later either: 2 more, {last}" in done.output
-    replayed = replay_bag(documents.load_proved(out / documents.FUNNEL), bag, centre=Centre.COMMAND)
+    replayed = replay_bag(documents.load_proved(linear_funnel), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
     assert [k for k, r in enumerate(replayed.readings) if r.reason == LOST] == [100, 101, 102]
     assert replayed.span - replayed.judged_span == pytest.approx(0.03)
     assert {r.status for r in replayed.readings[103:]} == {Status.INSIDE}, "the run goes on"
 
 
-@pytest.fixture
-def linear(one: Path, tmp_path: Path) -> Proved[AnyDesign]:
-    """The proved tube of a linear model."""
-    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
-    config, out = load_config(path), tmp_path / "out"
-    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return documents.load_proved(out / documents.FUNNEL)
-
-
 def test_forecasts_of_a_bag_are_counted_and_a_faulty_output_leaves_them(
-    one: Path, tmp_path: Path
+    one: Path, linear_funnel: Path, tmp_path: Path
 ) -> None:
-    path = write_config(tmp_path / "config.yaml", ONE["linear"], **FUNNEL)
-    config, out = load_config(path), tmp_path / "out"
-    identify_bags([one / f"run_{k}" for k in range(RUNS)], config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    held = ["monitor", "--replay", "--funnel", str(out / documents.FUNNEL), "--forecast", "0.2"]
+    held = ["monitor", "--replay", "--funnel", str(linear_funnel), "--forecast", "0.2"]
     done = CliRunner().invoke(app, [*held, str(one / "run_5")])
     said = re.search(r"under the commands that came, hold (\d+) of (\d+) samples", done.output)
     assert said is not None, done.output
@@ -130,7 +131,7 @@ def test_forecasts_of_a_bag_are_counted_and_a_faulty_output_leaves_them(
     y = np.zeros((60, 2))
     y[40:, 0] = 50.0
     trial = Trajectory(t=PERIOD * np.arange(60), y=y, u=np.zeros((60, 1)), name="step")
-    bag, proved = write_joint_bag(tmp_path, trial), documents.load_proved(out / documents.FUNNEL)
+    bag, proved = write_joint_bag(tmp_path, trial), documents.load_proved(linear_funnel)
     replayed = replay_bag(proved, bag, centre=Centre.COMMAND, forecast=0.2)
     left = [entry.t for entry in replayed.forecasts if not entry.kept]
     assert left[0] == pytest.approx(40 * PERIOD)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.rigorous import bound_holds
+from benchmarks.rigorous import Undecided, bound_holds
 from examples import satellite
 from nlsid_core.errors import (
     CertificateRejected,
@@ -11,7 +11,6 @@ from nlsid_core.errors import (
     Infeasible,
     ShapeError,
     SolverError,
-    Undecided,
 )
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
 from nlsid_core.proofs import decide

@@ -135,8 +135,6 @@ def test_proposition_2_7_contains_its_centre_and_not_its_negative() -> None:
     for sign, contained in ((1.0, True), (0.6, True), (-1.0, False)):
         e = np.array([sign * centre[0]])
         assert feasible(conditions.centred(e, centre, ["x"]), names=("x",)) == contained
-        pairs = conditions.centred_increments(e, centre, ["x"])
-        assert feasible(pairs, names=("x", "x~")) == contained
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:

@@ -3,7 +3,11 @@
 import json
 import signal
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from subprocess import Popen
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -12,6 +16,8 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TwistStamped
+from rclpy.client import Client
+from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -25,20 +31,25 @@ EXCITATION = "nlsid_ros.excitation"
 LIMITS: dict[str, object] = {"lowest": -0.1, "highest": 0.4, "slew": 2.0, "fade": 0.2}
 
 
+class Excited(NamedTuple):
+    """A node that hears (sent: stamp in ns, command) the excitation that runs in a process."""
+
+    node: Node
+    spin_until: Callable[[Callable[[], bool]], None]
+    running: Popen[str]
+    start: Client
+    sent: list[tuple[int, float]]
+
+
 @pytest.fixture(autouse=True)
 def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
     use_domain_of_this_run(monkeypatch)
 
 
-def excite(
-    parameters: dict[str, object], *, stop_after: float | None = None
-) -> tuple[list[tuple[int, float]], list[str]]:
-    """(stamp, command) of everything sent after ~/start, and what was said to have been done."""
+@contextmanager
+def heard(parameters: dict[str, object]) -> Iterator[Excited]:
+    """The node at work and waiting for ~/start, heard on its topic."""
     sent: list[tuple[int, float]] = []
-    did: list[str] = []
-
-    def hear_experiment(message: String) -> None:
-        did.append(message.data)
 
     def hear(message: TwistStamped) -> None:
         stamp = message.header.stamp
@@ -49,11 +60,24 @@ def excite(
         process(EXCITATION, **(LIMITS | parameters)) as running,
     ):
         node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
-        node.create_subscription(String, "/excitation/experiment", hear_experiment, qos.DOCUMENT)
         start = node.create_client(Trigger, "/excitation/start")
-        halt = node.create_client(Trigger, "/excitation/stop")
         spin_until(start.service_is_ready)
         spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+        yield Excited(node, spin_until, running, start, sent)
+
+
+def excite(
+    parameters: dict[str, object], *, stop_after: float | None = None
+) -> tuple[list[tuple[int, float]], list[str]]:
+    """(stamp, command) of everything sent after ~/start, and what was said to have been done."""
+    did: list[str] = []
+
+    def hear_experiment(message: String) -> None:
+        did.append(message.data)
+
+    with heard(parameters) as (node, spin_until, running, start, sent):
+        node.create_subscription(String, "/excitation/experiment", hear_experiment, qos.DOCUMENT)
+        halt = node.create_client(Trigger, "/excitation/stop")
         settled = time.monotonic() + 0.5
         spin_until(lambda: time.monotonic() > settled)
         assert not sent, "nothing moves before it is asked to"
@@ -137,51 +161,28 @@ def test_asked_to_stop_it_returns_to_rest_no_faster_than_allowed() -> None:
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ended_by_a_signal_it_leaves_the_robot_at_rest(how: signal.Signals) -> None:
-    sent: list[float] = []
-
-    def hear(message: TwistStamped) -> None:
-        sent.append(message.twist.linear.x)
-
-    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0, "lowest": 0.3}
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(EXCITATION, **(LIMITS | steps | {"rest": 0.3})) as running,
-    ):
-        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
-        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
+    steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0}
+    with heard(steps | {"lowest": 0.3, "rest": 0.3}) as (_, spin_until, running, start, sent):
         start.call_async(Trigger.Request())
-        spin_until(lambda: bool(sent) and sent[-1] > 0.35)
+        spin_until(lambda: bool(sent) and sent[-1][1] > 0.35)
         running.send_signal(how)
-        spin_until(lambda: running.poll() is not None and sent[-1] == 0.3)
+        spin_until(lambda: running.poll() is not None and sent[-1][1] == 0.3)
         assert running.returncode == 0
-    assert np.abs(np.diff(sent)).max() <= 2.0 * 0.02 * (1 + 1e-9)
+    assert np.abs(np.diff([u for _, u in sent])).max() <= 2.0 * 0.02 * (1 + 1e-9)
 
 
 def test_held_up_for_a_while_it_ends_and_does_not_set_the_robot_in_motion_again() -> None:
     """What is late is not played on; a base that stops when no command comes rests by then."""
-    sent: list[float] = []
     said: dict[str, bytes] = {}
-
-    def hear(message: TwistStamped) -> None:
-        sent.append(message.twist.linear.x)
 
     def hear_status(message: DiagnosticArray) -> None:
         said[message.status[0].message] = message.status[0].level
 
     steps: dict[str, object] = {"kind": "steps", "period": 0.02, "pause": 0.0}
-    with (
-        node_here("test_robot") as (node, spin_until),
-        process(EXCITATION, **(LIMITS | steps)) as running,
-    ):
-        node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
+    with heard(steps) as (node, spin_until, running, start, sent):
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
-        spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
         start.call_async(Trigger.Request())
-        spin_until(lambda: bool(sent) and sent[-1] > 0.2)
+        spin_until(lambda: bool(sent) and sent[-1][1] > 0.2)
         running.send_signal(signal.SIGSTOP)
         later = time.monotonic() + 1.5
         spin_until(lambda: time.monotonic() > later)
@@ -189,7 +190,7 @@ def test_held_up_for_a_while_it_ends_and_does_not_set_the_robot_in_motion_again(
         running.send_signal(signal.SIGCONT)
         spin_until(lambda: any("before this node's clock; 0.1 s are allowed" in s for s in said))
         spin_until(lambda: len(sent) > before)
-        assert set(sent[before:]) == {0.0}
+        assert {u for _, u in sent[before:]} == {0.0}
         assert said[next(s for s in said if "s are allowed" in s)] == DiagnosticStatus.ERROR
         stop(running)
 

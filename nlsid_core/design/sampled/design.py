@@ -5,7 +5,6 @@ the tube: where starts in the inlet get to. Every step of both is one semidefini
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Protocol, TypeAlias
 
 import numpy as np
@@ -151,11 +150,6 @@ def assume(
     )
     refuse_assumption(model, assumption)
     return assumption
-
-
-def undisturbed(assumption: DisturbanceAssumption) -> DisturbanceAssumption:
-    """The same with nothing to disturb, to compare with."""
-    return replace(assumption, bound=0.0, measured=0.0)
 
 
 class FunnelStep(Protocol):
