@@ -341,9 +341,10 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     for replay in replays:
         worst, bad = replay.worst, replay.first_bad
         colour = COLOURS[replay.verdict]
+        alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
         table.add_row(
             replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]",
+            f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
             "-" if worst is None else f"{worst.margin:.3f}",
             "-" if worst is None else f"{worst.t:.3f} s",
             "-" if worst is None else worst.worst_axis,
