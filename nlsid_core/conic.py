@@ -152,9 +152,12 @@ def solve_all(
 
 
 def svec(matrix: FloatArray) -> FloatArray:
-    """Upper triangle column by column, off-diagonal entries times √2; keeps inner products."""
-    i, j = triangle(len(matrix))
-    return np.asarray(matrix[i, j] * np.where(i == j, 1.0, SQRT2))
+    """Upper triangles of (…, n, n) column by column, off-diagonal entries times √2.
+
+    Keeps inner products.
+    """
+    i, j = triangle(matrix.shape[-1])
+    return np.asarray(matrix[..., i, j] * np.where(i == j, 1.0, SQRT2))
 
 
 def smat(vector: FloatArray) -> FloatArray:

@@ -300,7 +300,8 @@ def forecasts(replay: Replay, design: AnyDesign) -> Iterator[str]:
     whole = [entry for entry in ends if entry.ahead == longest]
     yield (
         f"{replay.name}: {len(ends)} forecasts, under the commands that came, hold "
-        f"{sum(kept)} of {len(kept)} samples; their half-width after {longest:.3g} s:"
+        f"{sum(kept)} of {len(kept)} samples that they reach, of {len(replay.readings)} in all; "
+        f"half-width after {longest:.3g} s:"
     )
     for i, name in enumerate(signal_names(design)):
         halves = [(entry.high[i] - entry.low[i]) / 2.0 for entry in whole]
@@ -341,9 +342,10 @@ def replay_table(replays: Sequence[Replay]) -> Table:
     for replay in replays:
         worst, bad = replay.worst, replay.first_bad
         colour = COLOURS[replay.verdict]
+        alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
         table.add_row(
             replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]",
+            f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
             "-" if worst is None else f"{worst.margin:.3f}",
             "-" if worst is None else f"{worst.t:.3f} s",
             "-" if worst is None else worst.worst_axis,

@@ -228,7 +228,7 @@ class Watch:
                 self.lost += lost
                 self.filled += bool(sample.filled)
                 judged_now = reading.status is not Status.UNKNOWN
-                self.judged = 0 if reading.starts else self.judged + judged_now
+                self.judged = 0 if reading.waits else self.judged + judged_now
                 self._held = sample.stamp_ns, u
                 if self._steps:
                     self._look_ahead(reading, np.atleast_1d(u))

@@ -164,6 +164,9 @@ def propose(
         ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
         section = {"model": "state_affine", "lags": 2, "input_range": ranges}
         proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
+    if len(responses) > 1:
+        section["method"] = "sem_certified"
+        proposal.why["method"] = "steps among stable models, the quickest for several responses"
     proposal.content["identification"] = section
     trials = _tried(proposal, bags, definitions)
     proposal.walls += trials.apart

@@ -60,6 +60,7 @@ MOST_FILLED: Final = 0.05  # of the samples: with more, data are invented rather
 LOST: Final = "the sample is lost: no message of it came"
 FILLED: Final = "filled in"  # how the reason of a sample begins that nobody measured
 NOT_FINITE: Final = "not a finite number"
+LEAP: Final = 1000  # samples in a row of which every one would be said to be missing
 HISTORY: Final = 2**16  # values kept of a signal while no sample comes: a minute at 1 kHz
 
 
@@ -261,6 +262,8 @@ class Sampler:
             self._take_stamp(stamp_ns)
             values = [kept.value_at(stamp_ns) for kept in self._kept]
             self._released_ns = stamp_ns
+            if self.on_grid:
+                self._leap(values[:n])
             if all(map(math.isfinite, values)):
                 self._started = True
             elif not self._started:
@@ -319,6 +322,20 @@ class Sampler:
         else:
             del self._waiting[0]
 
+    def _leap(self, responses: Sequence[float]) -> None:
+        """Where a response has no value for more than LEAP samples, the grid goes on at its next.
+
+        Hours without a message, or a clock that was set, are one sample that is missing.
+        """
+        ends = [
+            self._kept[k].after(self._released_ns)
+            for k, value in enumerate(responses)
+            if not math.isfinite(value)
+        ]
+        if self._next_ns is not None and ends and (end := max(ends)) < math.inf:
+            skipped = int(end - self._next_ns) // self.period_ns
+            self._next_ns += self.period_ns * skipped if skipped > LEAP else 0
+
     def _why(self, stamp_ns: int, values: Sequence[float]) -> str:
         k = next(k for k, value in enumerate(values) if not math.isfinite(value))
         return f"{self._signals[k]}: {self._kept[k].why(stamp_ns)}"
@@ -370,6 +387,11 @@ class _Kept:
             del self.stamps[0], self.values[0], self.targets[:1]
         if self.first_ns is None and math.isfinite(value):
             self.first_ns = stamp_ns
+
+    def after(self, stamp_ns: float) -> float:
+        """The first stamp after `stamp_ns`; infinite if there is none yet."""
+        at = bisect_right(self.stamps, stamp_ns)
+        return self.stamps[at] if at < len(self.stamps) else math.inf
 
     def is_certain(self, stamp_ns: int) -> bool:
         """Whether nothing that is still to come changes the value at `stamp_ns`."""

@@ -8,18 +8,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.linalg import LinAlgError
 
+from nlsid_core import conic
 from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.bounded_set import BoundedSet
+from nlsid_core.identification.certified_descent import Outputs, Step, descend
 from nlsid_core.identification.matrix_set import MatrixSet
-from nlsid_core.identification.newton import Descent, Point, minimise
+from nlsid_core.identification.newton import Point, minimise
 from nlsid_core.identification.rse import Bound
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.identification.state_affine import StateAffineRows
 from nlsid_core.models import StateAffineModel
 
-RENEWALS = 10  # of the set in the last step
+IN_ONE_SET = 8  # steps of the descent before the set is renewed
 STOP = 1e-4  # relative decrease of J that ends the iteration
 
 
@@ -58,32 +62,88 @@ def certified_simulation_error(
         previous = found.point.J
 
 
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """A `StableSet` of matrices F z' ⪰ 0 in z' = [1; θ; extra], p projected out of the error."""
+
+    error: SimulationError
+    F: FloatArray
+    cones: tuple[conic.Cone, ...]
+
+    def outputs(self, theta: FloatArray) -> Outputs | None:
+        """r = L⁻¹(errors θ - Q p) at the best p, and its derivatives."""
+        try:
+            point = self.error.at(theta)
+        except LinAlgError:
+            return None
+        return Outputs(point.residual, self.error.slopes(point))
+
+    def cost(self, theta: FloatArray) -> float:
+        """|r|²."""
+        try:
+            return self.error.at(theta).J
+        except LinAlgError:
+            return np.inf
+
+    def inside(self, step: Step) -> FloatArray:
+        """θ of the step's cone program, in v = u/|r| and the set's other unknowns."""
+        n, size = len(step.D), float(np.linalg.norm(step.r))
+        moved, of_extra = self.F[:, 1 : 1 + n], self.F[:, 1 + n :]
+        units = 1.0 / np.maximum(np.linalg.norm(of_extra, axis=0), np.finfo(float).tiny)
+        A = np.hstack([moved * (size / step.D), of_extra * units])
+        quadratic = 2.0 * (step.R.T @ step.R + step.damping * np.eye(n))
+        unmoved = sp.csc_matrix((len(units), len(units)))
+        program = conic.ConeProgram(
+            P=sp.block_diag([sp.csc_matrix(quadratic), unmoved], format="csc"),
+            q=np.concatenate([2.0 * step.R.T @ step.r / size, np.zeros(len(units))]),
+            A=sp.csc_matrix(-A),
+            b=self.F[:, 0] + moved @ step.theta,
+            cones=self.cones,
+        )
+        v = conic.solve(program, "clarabel refined").x[:n]
+        return np.asarray(step.theta + v * (size / step.D))
+
+
+def _steps(error: SimulationError, inside: BoundedSet | MatrixSet, theta: FloatArray) -> _Steps:
+    """In units in which the matrices are I at θ, which is strictly inside."""
+    z, blocks, cones = np.concatenate([theta, inside.extra]), [], []
+    for part in inside.inequalities():
+        order = part.F.shape[-1]
+        F = part.F.reshape(len(part.F), -1, order, order)
+        W = np.linalg.inv(np.linalg.cholesky(part.at(z).reshape(-1, order, order)))
+        F = W @ F @ W.transpose(0, 2, 1)
+        blocks += [conic.svec(F[:, k]).T for k in range(F.shape[1])]
+        cones += [conic.Cone("psd", order)] * F.shape[1]
+    return _Steps(error, np.concatenate(blocks), tuple(cones))
+
+
 def descend_certified(
-    problem: StateAffineRows, model: StateAffineModel, proof: StabilityProof
+    problem: StateAffineRows, model: StateAffineModel, proof: StabilityProof, *, steps: int = 40
 ) -> StateAffineModel:
     """The last step: a local minimum of the simulation error itself inside the certified set.
 
     From a model of the problem's class with its proof; the result is proved too and its simulation
     error on the problem's data is never above the model's. The set is renewed while that goes on
-    lowering it. Raises ShapeError as `certified_simulation_error` does.
+    lowering it; steps: in all sets, at most. Raises ShapeError as `certified_simulation_error`.
     """
-    inside: BoundedSet | MatrixSet = _set_of(problem).of_proof(problem, model, proof)
-    objective, best = SimulationError(problem.rows), model
+    inside = _set_of(problem).of_proof(problem, model, proof)
+    error, best = SimulationError(problem.rows), model
     theta = _left_parameters(model)
-    J = objective.at(theta).J
-    for _ in range(RENEWALS):
-        inequalities, z = inside.inequalities(), np.concatenate([theta, inside.extra])
-        if not np.isfinite(sum(part.barrier(z) for part in inequalities)):
+    J = error.at(theta).J
+    for _ in range(0, steps, IN_ONE_SET):
+        try:
+            steps_inside = _steps(error, inside, theta)
+        except LinAlgError:
             break  # proved at a rate slower than the set's
-        found = Descent(objective, inequalities, len(theta)).path(z)
-        if found.point.J >= J * (1.0 - STOP):
+        found = descend(steps_inside, theta, steps=IN_ONE_SET)
+        if found is None or (point := error.at(found)).J >= J * (1.0 - STOP):
             break
-        theta, J = found.point.theta, found.point.J
-        lower = problem.model(theta, found.point.p)
-        if prove_stability(lower) is None:
+        theta, J = found, point.J
+        lower = problem.model(theta, point.p)
+        proved = prove_stability(lower)
+        if proved is None:
             break
-        best = lower
-        inside = inside.renewed(theta, found.extra)
+        best, inside = lower, _set_of(problem).of_proof(problem, lower, proved)
     return best
 
 

@@ -193,13 +193,18 @@ def _on_boundary(bound: Convex, descent: "Descent", start: FloatArray, found: Mi
 
 
 def _past_boundary(bound: Convex, descent: "Descent", z: FloatArray) -> Minimum | None:
-    """The minimiser inside K ≻ 0, if the path of `Repulsion` from z leads to it."""
+    """The minimiser that the path of `Repulsion` from z leads to; None if it does not converge.
+
+    On the boundary that is the end of the path, unless Newton goes lower from there.
+    """
     here = descent.objective.at(z[: descent.parameters])
     away = descent.path(z, barrier=Repulsion(bound, here))
     if not away.converged:
         return None
     found = descent.freely(_unknowns(away))
-    return replace(found, steps=descent.steps) if found.is_inside else None
+    if found.is_inside:
+        return replace(found, steps=descent.steps)
+    return replace(found, converged=True, steps=descent.steps, on_boundary=True)
 
 
 def _vanishing(point: Point) -> FloatArray:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky_banded
+from scipy.linalg import LinAlgError, cho_solve, cholesky_banded
 from scipy.linalg.lapack import dgbtrf, dgbtrs, dtbtrs
 
 from nlsid_core.arrays import FloatArray
@@ -47,12 +47,23 @@ class SimulationError:
 
     def derivatives(self, point: Point) -> tuple[FloatArray, FloatArray]:
         """Gradient, and the Hessian of Gauss and Newton."""
+        V = self._moved(point)
+        return 2.0 * V.T @ point.x, point.curvature(V)
+
+    def slopes(self, point: Point) -> FloatArray:
+        """(N, n): the derivatives of the residual at the best p, as Gauss and Newton take them."""
+        J = point.factor.half_solve(self._moved(point), overwrite=True)
+        inner = cho_solve(point.normal, point.projected.T @ J, check_finite=False)
+        return np.asarray(J - point.projected @ inner)
+
+    def _moved(self, point: Point) -> FloatArray:
+        """(N, n): ε_i - G_i r."""
         rows = self.rows
         r = point.residual if self._root is None else sparse(self._root) @ point.residual
         V = rows.errors.copy(order="F")
         for D, group, weights in rows.groups:
             V[:, group] -= weights * shift(r, D)[:, None]
-        return 2.0 * V.T @ point.x, point.curvature(V)
+        return V
 
 
 @dataclass(frozen=True, eq=False)

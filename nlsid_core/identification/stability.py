@@ -376,7 +376,7 @@ def _program(
     basis[np.arange(len(rows)), rows, columns] = basis[np.arange(len(rows)), columns, rows] = 1.0
     entries = np.eye((m + n) * m).reshape(-1, m + n, m)
     size = len(basis) + len(vertices) * len(entries) + 1
-    inner = _triangles(_gap(F, basis, rate, m))
+    inner = conic.svec(_gap(F, basis, rate, m))
     blocks, cones = [], []
     for i, Es in enumerate(vertices):
         place = len(basis) + i * len(entries)
@@ -384,8 +384,8 @@ def _program(
             X = entries @ E
             part = np.zeros((inner.shape[1], size))
             part[:, : len(basis)] = inner.T
-            part[:, place : place + len(entries)] = _triangles(X + X.transpose(0, 2, 1)).T
-            part[:, -1] = -_triangles(np.eye(m + n)[None])[0]
+            part[:, place : place + len(entries)] = conic.svec(X + X.transpose(0, 2, 1)).T
+            part[:, -1] = -conic.svec(np.eye(m + n)[None])[0]
             blocks.append(sp.csc_matrix(-part))
             cones.append(conic.Cone("psd", m + n))
     trace = np.zeros((1, size))
@@ -409,14 +409,6 @@ def _program(
     q = np.zeros(size)
     q[-1] = -1.0
     return conic.ConeProgram(sp.csc_matrix((size, size)), q, A, b, tuple(cones)), basis
-
-
-def _triangles(M: FloatArray) -> FloatArray:
-    """(count, size, size) as rows of upper triangles, column by column, off-diagonal times √2."""
-    size = M.shape[-1]
-    columns, rows = np.tril_indices(size)
-    weights = np.where(rows == columns, 1.0, conic.SQRT2)
-    return np.asarray(M[:, rows, columns] * weights)
 
 
 def _radius(search: _Search, leaves: Sequence[Leaf]) -> float:

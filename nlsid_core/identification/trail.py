@@ -32,6 +32,8 @@ from nlsid_core.progress import Progress, silent
 T = TypeVar("T", bound=Model)
 W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
+WORK = 8e9  # rows times squared left parameters, of all bounds together: a minute or two
+FEWEST_BOUNDS = 3  # from every start, however large the problem is
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +106,22 @@ class Trail(Generic[T]):
         """The iterates of the robust simulation error; the first and the best are candidates.
 
         starts: left parameters with their names, at which a first bound is made exact; from each
-        it is iterated too, and the iterate of the least simulation error is kept. within: the
-        nearest left parameters that are allowed, at which an iterate that is not is taken.
+        it is iterated too, and the iterate of the least simulation error is kept. Of a large
+        problem there are fewer bounds from every start, by `WORK`. within: the nearest left
+        parameters that are allowed, at which an iterate that is not is taken.
         """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
         if first is None and final is None:
             return
+        begun = (("", None), *(() if final is None else starts))
+        affordable = int(WORK / (len(rows) * len(rows.offsets) ** 2 * len(begun)))
         iterations = 1 if final is None else final.iterations
+        if iterations > max(FEWEST_BOUNDS, affordable):
+            iterations = max(FEWEST_BOUNDS, affordable)
+            log.info("a large problem: %d bounds from each of %d starts", iterations, len(begun))
         error = SimulationError(rows)
         started, best, failure = time.process_time(), None, SolverError("no iterate")
-        for start, theta in (("", None), *(() if final is None else starts)):
+        for start, theta in begun:
             steps: list[Step] = []
             try:
                 for last in robust_simulation_error(rows, start=theta, iterations=iterations):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Final, NamedTuple
 
+FADES: Final = "the start fades"
 _NUMBER: Final = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 
 
@@ -59,9 +60,14 @@ class Reading(NamedTuple):
     half_widths: Sequence[float] = ()
 
     @property
-    def starts(self) -> bool:
+    def waits(self) -> bool:
         """Whether a run is still to begin."""
         return self.status is Status.UNKNOWN and self.reason.startswith("waiting for ")
+
+    @property
+    def starts(self) -> bool:
+        """Whether it is of the samples that a run's measured start is made of."""
+        return self.waits and FADES not in self.reason
 
     @property
     def numbers(self) -> dict[str, float]:

@@ -25,7 +25,7 @@ from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
 from nlsid_core.running.grid import TOLERANCE, early
-from nlsid_core.running.reading import Level, Reading, Status, unsaid
+from nlsid_core.running.reading import FADES, Level, Reading, Status, unsaid
 from nlsid_core.running.start import start_in_motion
 from nlsid_core.running.stepping import Stepper
 
@@ -190,11 +190,10 @@ class TubeRun:
             return f"{y.shape} outputs and {u.shape} inputs at t = {t:g} s"
         if all(map(math.isfinite, (*y.tolist(), *u.tolist()))):
             return ""
-        for values, signals, why in ((y, self._stepper.y, "it is {}".format),
-                                     (u, self._stepper.u, unsaid)):  # fmt: skip
+        for values, signals in ((y, self._stepper.y), (u, self._stepper.u)):
             for value, signal in zip(values.tolist(), signals, strict=True):
                 if not math.isfinite(value):
-                    return f"no {signal.name} at t = {t:g} s ({why(value)}): nothing is claimed"
+                    return f"no {signal.name} at t = {t:g} s ({unsaid(value)}): nothing is claimed"
         return ""
 
     def _without(self, u: FloatArray, fault: str) -> str:
@@ -229,7 +228,7 @@ class TubeRun:
                 return self._unknown(t, y, f"{refused}, at t = {t:g} s")
             self._k = 0
             ended = f", after {self._ended}" if self._ended else ""
-            return self._unknown(t, y, f"{STARTING} {self.lags} samples: the start fades{ended}")
+            return self._unknown(t, y, f"{STARTING} {self.lags} samples: {FADES}{ended}")
         self._start.append((y, u))
         if len(self._start) >= self.lags:
             ys, us = (np.array(part) for part in zip(*self._start, strict=True))

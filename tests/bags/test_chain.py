@@ -354,6 +354,18 @@ def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Pa
     assert parts.unjudged == (past, nan)
 
 
+def test_while_a_start_in_motion_fades_nothing_is_judged_and_the_verdict_says_so(
+    chain: Path,
+) -> None:
+    proved = documents.load_proved_funnel(chain / documents.FUNNEL)
+    whole = replay(chain, trial("05"))
+    moving = replay_bag(proved, trial("05"), centre=Centre.MOTION)
+    assert moving.first_bad is None
+    assert moving.verdict == Status.UNKNOWN.value
+    assert moving.reason.endswith(": the start fades")
+    assert 0.0 < moving.judged_span < whole.judged_span == whole.span < moving.span
+
+
 @pytest.mark.parametrize("name", TEST)
 def test_every_test_trial_is_inside_with_the_assumption_kept(chain: Path, name: str) -> None:
     result = replay(chain, trial(name))

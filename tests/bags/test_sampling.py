@@ -98,6 +98,23 @@ def interleaved(
     return [(int(k), *next(left[k])) for k in which]
 
 
+@pytest.mark.parametrize("seconds", [60, 1_700_000_000])
+def test_over_a_clock_that_was_set_the_grid_goes_on_at_the_next_message(seconds: int) -> None:
+    """However long nothing came, one or two samples say so."""
+    sampler = Sampler([f"{Y}|linear(0.2 s)"], [f"{U}|hold(1 s)"], period=0.05)
+    first = [50 * MS * k for k in range(100)]
+    later = [stamp + seconds * 1000 * MS + 20 * MS for stamp in first]
+    samples = fed(sampler, [(k, at, 1.0) for at in first + later for k in (1, 0)])
+    assert len(samples) < 205
+    assert {s.stamp_ns % (50 * MS) for s in samples} == {0}
+    known = [s.stamp_ns for s in samples if not s.missing]
+    assert [at for at in known if at <= first[-1]] == first
+    assert [at for at in known if at > first[-1]] == [
+        at for at in range(later[0] // (50 * MS) * 50 * MS, later[-1], 50 * MS) if at >= later[0]
+    ]
+    assert sum(bool(s.missing) for s in samples) in (1, 2)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["none", "hold", "linear"]))
 def test_samples_are_what_the_rule_says_in_any_order_of_arrival(seed: int, rule: str) -> None:

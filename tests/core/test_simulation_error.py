@@ -313,6 +313,21 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     assert fit.proof.rate < 1.0
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_among_poles_at_the_slowest_rate_the_last_step_is_not_above_the_iterates(seed: int) -> None:
+    """The truth forgets more slowly than a trial can tell: the limit on the rate is active."""
+    rng = np.random.default_rng(seed)
+    poles = [r * np.exp(s * 1j * a) for r, a in ((0.9995, 0.3), (0.99, 0.9)) for s in (1, -1)]
+    u = rng.standard_normal(600)
+    y = lfilter([0.0, 0.1, 0.2, 0.1], np.poly(poles).real, u)
+    y += 0.1 * np.std(y) * rng.standard_normal(600)
+    data = Dataset((Trajectory(t=0.1 * np.arange(600), y=y, u=u),))
+    fit = identify(data, LinearClass(4), method=CertifiedSem(10))
+    assert fit.errors["train"]["sem_certified"] <= fit.errors["train"]["rse"] * (1 + 1e-9)
+    assert fit.errors["train"]["rse"] < 20.0
+    assert fit["rse"].proof is not None
+
+
 def test_iterates_from_a_given_start_go_on_to_the_minimum() -> None:
     regression = build_regression(two_resonances(1, noise=0.1), 4)
     start = dict(stable_starts(regression.dataset, 4))["from a longer model"]

@@ -92,7 +92,7 @@ def test_outputs_may_be_missing_while_the_start_fades_and_commands_may_not() -> 
     u = u.copy()
     u[3] = math.nan
     said = readings("linear", Centre.MOTION, y, u)
-    assert said[samples + 3].reason.endswith("it is nan): nothing is claimed")
+    assert said[samples + 3].reason.endswith("(missing, or not a number): nothing is claimed")
     alone = readings("linear", Centre.MOTION, moving("linear")[0], u)
     assert alone[3].reason.endswith("(missing, or not a number): nothing is claimed")
     assert said[samples + 4].status is Status.INSIDE
