@@ -313,6 +313,15 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     assert fit.proof.rate < 1.0
 
 
+def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = two_resonances(1, noise=0.1)
+    whole = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    monkeypatch.setattr(trail, "WORK", 1.0)
+    short = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    assert len(whole.history.steps) > trail.FEWEST_BOUNDS == len(short.history.steps)
+    assert whole.errors["train"]["rse"] < short.errors["train"]["rse"] < 18.0
+
+
 @pytest.mark.parametrize("seed", [1, 3])
 def test_among_poles_at_the_slowest_rate_the_last_step_is_not_above_the_iterates(seed: int) -> None:
     """The truth forgets more slowly than a trial can tell: the limit on the rate is active."""
