@@ -19,6 +19,7 @@ from nlsid_core.identification import (
     identify,
     newton,
     prove_stability,
+    trail,
 )
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
