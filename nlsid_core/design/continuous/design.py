@@ -12,8 +12,9 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
-from nlsid_core.design.continuous.held import Hold, fastest
+from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Goal, Setting, prepare
@@ -57,6 +58,7 @@ class ContinuousSearch:
         )
 
 
+_Found: TypeAlias = tuple[Setting, ContinuousFunnel, Proved, float]
 FunnelDesign: TypeAlias = Design[VectorField, ContinuousPolicy, ContinuousFunnel, ContinuousSearch]
 
 
@@ -179,7 +181,7 @@ def validity_caps(
     return caps
 
 
-def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+def _found(setting: Setting, progress: Progress) -> _Found:
     """ρ by the backward sweep, and its proof; where inputs are held, for bounds of their change.
 
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
@@ -198,33 +200,45 @@ def _found(setting: Setting, progress: Progress) -> tuple[Setting, ContinuousFun
         expansion, free = None, _free(setting, progress)
     hold = setting.hold
     assert hold is not None
-    periods, span = hold.tried(), float(setting.policy.t[-1] - setting.policy.t[0])
-    if min(periods) > span:
-        raise DataError(f"the hold of {min(periods):g} s is longer than the motion of {span:g} s")
-    for period in periods:
+    span = float(setting.policy.t[-1] - setting.policy.t[0])
+    if hold.shortest > span:
+        raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
+
+    def held(period: float) -> _Found:
+        return _held(setting, expansion, replace(hold, period=period), free, progress)
+
+    if not hold.longest:
+        return held(hold.period)
+    return _longest(hold, held)
+
+
+def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
+    period, found = hold.period, None
+    while found is None:
         try:
-            found = _held(setting, expansion, replace(hold, period=period), free, progress)
+            found = held(period)
         except Infeasible:
-            if period == periods[-1]:
+            if period <= hold.shortest:
                 raise
-            continue
-        break
-    if len(periods) > 1:  # between what was proved and what was not
+            period /= 2**0.5
+    for longer in (LONGEST, 2**0.5 * period) if period == hold.period else ():
         with suppress(Infeasible):
-            longer = replace(hold, period=period * 2**0.5)
-            found = _held(setting, expansion, longer, free, progress)
+            return held(longer)
     return found
 
 
 def _held(
     setting: Setting, expansion: Expansion | None, hold: Hold, free: FloatArray, progress: Progress
-) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+) -> _Found:
     """The funnel for one hold, within scaled copies of the free one.
 
     A smaller copy has its own expansion, which leaves out less and has room for what is held.
     """
     steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
     widths: FloatArray = np.zeros((len(P) - 1, field.m))
+    t = policy.t
+    reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
     for scale in SCALES:
         if expansion is not None and scale < 1:
             rho = scale * free
@@ -249,6 +263,10 @@ def _held(
             return _swept(setting, np.minimum(caps, outer.rho), progress)
         except (Infeasible, DataError) as error:
             refusal = error
+        if isinstance(refusal, NoFunnel):
+            if refusal.diagnosis.t >= reached:  # a smaller copy gets no farther back in time
+                break
+            reached = refusal.diagnosis.t
     k, i = np.unravel_index(np.argmax(widths), widths.shape)
     plan = (
         hold.period
@@ -276,9 +294,7 @@ def _free(setting: Setting, progress: Progress) -> FloatArray:
     return rho
 
 
-def _swept(
-    setting: Setting, caps: FloatArray, progress: Progress
-) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> _Found:
     """ρ by the backward sweep, and its proof; with a larger margin where that fails."""
     steps, policy, P = setting.steps, setting.policy, setting.P
     pairs = sections(steps, policy, P)
@@ -311,7 +327,7 @@ def proved_for(
     setting: Setting,
     rho_final: float,
     search: Callable[[float], tuple[Setting, FloatArray, list[Ends] | None]],
-) -> tuple[Setting, ContinuousFunnel, Proved, float]:
+) -> _Found:
     """The ρ that `search` finds for a margin, and its proof; margins grow until there is one."""
     margin = setting.margin(rho_final)
     proved: Proved | None = None

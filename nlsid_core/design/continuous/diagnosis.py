@@ -11,7 +11,7 @@ import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.lstep import LSteps, Section
-from nlsid_core.errors import SolverError
+from nlsid_core.errors import Infeasible, SolverError
 
 NOISE = 1e-6  # of the linear part: less is rounding
 CLOSE = 1e-4  # of the boundary's size: there differences of rates are linear
@@ -69,6 +69,14 @@ class Diagnosis:
             f"closed loop lets V fall by {self.linear:.3g} 1/s, and "
             f"{taking or 'nothing else is lost'}. Because of {cause}: {ADVICE[self.dominant]}"
         )
+
+
+class NoFunnel(Infeasible):
+    """No ρ at an instant; diagnosis: why."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        super().__init__(str(diagnosis))
+        self.diagnosis = diagnosis
 
 
 def diagnosed(

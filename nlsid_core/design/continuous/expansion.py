@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.diagnosis import Diagnosis, diagnosed
+from nlsid_core.design.continuous.diagnosis import Diagnosis, NoFunnel, diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section, section_at
 from nlsid_core.design.continuous.sweep import ACCEPT, LOWEST, Ends
 from nlsid_core.dynamics import Nominal
@@ -214,7 +214,7 @@ class _Interval:
                 return rho, known
             most, fall = rho * fall, fall * fall
             rho = most
-        raise Infeasible(str(self.diagnosis(known)))
+        raise NoFunnel(self.diagnosis(known))
 
     def bracketed(self, rho: float, known: Ends, most: float) -> float:
         """The largest ρ ≤ most, to 1 %, at which the bound leaves the margin; or 0."""

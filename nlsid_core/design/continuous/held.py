@@ -36,7 +36,7 @@ QUARTICS = (0.03, 0.1, 0.3, 1.0, 3.0)  # λ₁ over the cubic part's size
 LEAST_QUARTIC = 1e-3  # of the linear part's size
 GOLDEN = (5**0.5 - 1) / 2
 SEARCHES = 40  # of a golden section: to 1e-8 of its bracket
-LONGEST, HALVINGS = 0.064, 9  # s, down to a quarter of a millisecond
+FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
 SETTLED = 1.005  # of the rates before: ROOM holds what is left
 
@@ -66,12 +66,13 @@ class Hold:
             raise OptionError("hold", hold, "seconds above 0, 'largest' or None")
         if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
             raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
-        period = hold if isinstance(hold, float) else LONGEST if longest else 0.0
+        period = hold if isinstance(hold, float) else FIRST if longest else 0.0
         return cls(period, bounds, longest)
 
-    def tried(self) -> list[float]:
-        """The periods to try, the longest first."""
-        return [self.period / 2**i for i in range(HALVINGS if self.longest else 1)]
+    @property
+    def shortest(self) -> float:
+        """The shortest period to try, s."""
+        return SHORTEST if self.longest else self.period
 
     def claim(self) -> Json:
         """The members of the claim."""

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.design.continuous.diagnosis import diagnosed
+from nlsid_core.design.continuous.diagnosis import NoFunnel, diagnosed
 from nlsid_core.design.continuous.lstep import LSteps, Section
-from nlsid_core.errors import Infeasible
 from nlsid_core.progress import Progress, silent
 from nlsid_core.sos.sphere import SphereSolution
 
@@ -115,7 +114,7 @@ def _largest(
     if best is None:
         levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
         rho = max(levels, key=lambda r: slack(r, steps.predicted(section, here(r), duals)))
-        raise Infeasible(str(diagnosed(steps, [section], [here(rho)], (after - rho) / h)))
+        raise NoFunnel(diagnosed(steps, [section], [here(rho)], (after - rho) / h))
     return feasible, best
 
 
