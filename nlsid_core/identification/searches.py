@@ -150,8 +150,9 @@ def state_affine(
     if problem.rows.errors.size > MOST_ENTRIES:
         beside = [m for m in task.comparators if isinstance(m, LeastSquares)]
         left_out = ", ".join(m.name for m in task.comparators if m not in beside)
-        log.warning("%d rows of %d unknowns: no comparison with %s; ask for one to have it",
-                    *problem.rows.errors.shape, left_out)  # fmt: skip
+        if left_out:
+            log.warning("%d rows of %d unknowns: no comparison with %s; ask for one to have it",
+                        *problem.rows.errors.shape, left_out)  # fmt: skip
         task = replace(task, comparators=tuple(beside))
     trail: Trail[StateAffineModel] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: state_affine_equation_error(problem))

@@ -32,8 +32,8 @@ from nlsid_core.progress import Progress, silent
 T = TypeVar("T", bound=Model)
 W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
-WORK = 8e9  # rows times squared left parameters, of all bounds together: a minute or two
-FEWEST_BOUNDS = 3  # from every start, however large the problem is
+WORK = 5e9  # rows times squared left parameters, of all bounds together: a minute or two
+FEWEST_BOUNDS = 3  # from every start, however large the problem is, and from the identity there
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ class Trail(Generic[T]):
 
         starts: left parameters with their names, at which a first bound is made exact; from each
         it is iterated too, and the iterate of the least simulation error is kept. Of a large
-        problem there are fewer bounds from every start, by `WORK`. within: the nearest left
+        problem there are fewer bounds, by `WORK`. within: the nearest left
         parameters that are allowed, at which an iterate that is not is taken.
         """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
@@ -116,15 +116,18 @@ class Trail(Generic[T]):
         begun = (("", None), *(() if final is None else starts))
         affordable = int(WORK / (len(rows) * len(rows.offsets) ** 2 * len(begun)))
         iterations = 1 if final is None else final.iterations
-        if iterations > max(FEWEST_BOUNDS, affordable):
-            iterations = max(FEWEST_BOUNDS, affordable)
-            log.info("a large problem: %d bounds from each of %d starts", iterations, len(begun))
+        is_large = iterations > max(FEWEST_BOUNDS, affordable)
+        if is_large:
+            others = (affordable * len(begun) - FEWEST_BOUNDS) // max(1, len(begun) - 1)
+            iterations = min(iterations, max(FEWEST_BOUNDS, others))
+            log.info("a large problem: %d bounds from each stable start", iterations)
         error = SimulationError(rows)
         started, best, failure = time.process_time(), None, SolverError("no iterate")
         for start, theta in begun:
             steps: list[Step] = []
             try:
-                for last in robust_simulation_error(rows, start=theta, iterations=iterations):
+                least = FEWEST_BOUNDS if is_large and theta is None and starts else iterations
+                for last in robust_simulation_error(rows, start=theta, iterations=least):
                     steps.append(Step(f"iterate {len(steps) + 1} {start}".rstrip(), last.J))
                     if theta is None and len(steps) == 1 and first is not None:
                         seconds, found = time.process_time() - started, model(last)

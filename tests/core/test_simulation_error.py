@@ -19,6 +19,7 @@ from nlsid_core.identification import (
     identify,
     newton,
     prove_stability,
+    trail,
 )
 from nlsid_core.identification.banded import Rows
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
@@ -311,6 +312,15 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     fit = identify(data, model_class, method=Rse(), comparators=())
     assert fit.errors["train"]["rse"] < least
     assert fit.proof.rate < 1.0
+
+
+def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = two_resonances(1, noise=0.1)
+    whole = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    monkeypatch.setattr(trail, "WORK", 1.0)
+    short = identify(data, StateAffineClass(4), method=Rse(), comparators=())
+    assert len(whole.history.steps) > trail.FEWEST_BOUNDS == len(short.history.steps)
+    assert whole.errors["train"]["rse"] < short.errors["train"]["rse"] < 18.0
 
 
 @pytest.mark.parametrize("seed", [1, 3])
