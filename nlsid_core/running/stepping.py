@@ -140,6 +140,10 @@ class _StateAffine:
             for row in values:
                 table[place[first], :, k * p : k * p + values.shape[2]] += row
                 first += 1
+        # A constant G_0 is divided out once.
+        self._solved = not model.G[0].exponents.any()
+        if self._solved:
+            table = np.linalg.solve(model.G[0].coefficients.sum(axis=0), table)
         self._table = table.reshape(len(exponents), -1)
         self._point = np.ones((1, len(model.window) + 1))
         self._refuses = model.on_out_of_range == "refuse"
@@ -158,7 +162,12 @@ class _StateAffine:
         self._point[0, :-1] = scaled[self._rows, self._columns]
         found = (self._products(self._point) @ self._table).reshape(p, -1)
         right = x @ found[:, p:-1].T + found[:, -1]
-        after = right / -found[0, 0] if p == 1 else np.linalg.solve(found[:, :p], -right.T).T
+        if self._solved:
+            after = -right
+        elif p == 1:
+            after = right / -found[0, 0]
+        else:
+            after = np.linalg.solve(found[:, :p], -right.T).T
         return after * model.y_scale + model.y_offset, _shifted(after, x)
 
 

@@ -284,7 +284,8 @@ class TubeRun:
             self._spent = self._rho * self._spent + used
             sizes = np.abs(deviation) / widths
             spent = (self._spent / level).tolist()
-            peaks = (used / (self._peak * np.maximum(g, 1.0))).tolist()
+            peaks = (used / self._peak if g is self._unmoved else
+                     used / (self._peak * np.maximum(g, 1.0))).tolist()  # fmt: skip
         self._x, self._k = after, self._k + 1
         followed = all(math.isfinite(entry) for row in self._g.values() for entry in row)
         nominal = tuple(simulated.tolist())
@@ -390,8 +391,13 @@ class TubeRun:
             self._names[row.index(size)], nominal, measured,
             Level.TUBE if size <= 1.0 else Level.NONE, reason, self._assuming[i],
             away + innovation, alarm,
-            tuple(widths[lasting].min(axis=0).tolist()) if self._follow else (),
+            self._narrowest(widths, lasting) if self._follow else (),
         )  # fmt: skip
+
+    def _narrowest(self, widths: FloatArray, lasting: list[int]) -> tuple[float, ...]:
+        """(p,) the least half-widths of these tubes."""
+        rows = widths[lasting[0]] if len(lasting) == 1 else widths[lasting].min(axis=0)
+        return tuple(rows.tolist())
 
     def _reached(self, steps: int) -> FloatArray:
         """(tubes, p) of `reach` after so many steps; found for twice as many where they are new."""
