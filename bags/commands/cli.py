@@ -537,6 +537,9 @@ def monitor(
             out.print(line, soft_wrap=True, markup=False, highlight=False)
         if entry.first_bad is not None:
             out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
+        left = entry.first_outside
+        if left is not None and left is not entry.first_bad:
+            out.print(f"{entry.name}: outside at {left.t:.3f} s, the first time", soft_wrap=True)
         if (alarm := entry.first_alarm) is not None:
             said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
             out.print(said, soft_wrap=True)

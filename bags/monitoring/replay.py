@@ -119,6 +119,11 @@ class Replay:
         return next((r for r in self.judged if r.status is not Status.INSIDE), None)
 
     @property
+    def first_outside(self) -> Reading | None:
+        """The first reading that is outside; often the assumption is violated before."""
+        return next((r for r in self.judged if r.status is Status.OUTSIDE), None)
+
+    @property
     def first_alarm(self) -> Reading | None:
         """The first reading with a second alarm, which is no verdict."""
         return next((r for r in self.judged if r.alarm), None)

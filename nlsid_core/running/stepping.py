@@ -143,7 +143,7 @@ class _StateAffine:
         # A constant G_0 is divided out once.
         self._solved = not model.G[0].exponents.any()
         if self._solved:
-            table = np.linalg.solve(model.G[0].coefficients.sum(axis=0), table)
+            table[:] = np.linalg.solve(model.G[0].coefficients.sum(axis=0), table)
         self._table = table.reshape(len(exponents), -1)
         self._point = np.ones((1, len(model.window) + 1))
         self._refuses = model.on_out_of_range == "refuse"

@@ -350,6 +350,9 @@ def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Pa
     ):
         found = replace(whole, readings=readings)
         assert (found.verdict, found.reason) == (verdict.value, reason)
+    violated = outside._replace(status=Status.ASSUMPTION_VIOLATED)
+    both = replace(whole, readings=(waiting, violated, inside, outside, outside))
+    assert (both.first_bad, both.first_outside) == (violated, outside)
     parts = replace(whole, readings=(waiting, inside, past, past, nan))
     assert parts.unjudged == (past, nan)
 
