@@ -162,10 +162,11 @@ class _StateAffine:
         self._point[0, :-1] = scaled[self._rows, self._columns]
         found = (self._products(self._point) @ self._table).reshape(p, -1)
         right = x @ found[:, p:-1].T + found[:, -1]
-        after = -right
-        if not self._solved:
-            lead = found[:, :p]
-            after = after / lead[0, 0] if p == 1 else np.linalg.solve(lead, after.T).T
+        after: FloatArray = -right
+        if not self._solved and p == 1:
+            after /= found[0, 0]
+        elif not self._solved:
+            after = np.asarray(np.linalg.solve(found[:, :p], after.T).T)
         return after * model.y_scale + model.y_offset, _shifted(after, x)
 
 
