@@ -191,8 +191,9 @@ def one_in_parts(bag: Path, cache: Path, seconds: float) -> list[Path]:
 
 def parts(bag: Path, seconds: float) -> list[Path]:
     """The bag cut every so many seconds, once."""
-    made = sorted(bag.parent.glob(f"{bag.stem}_part_[0-9][0-9]"))
-    return made or split(bag, bag.parent / f"{bag.stem}_part", every=seconds)
+    name = f"{bag.stem}_of_{PARTS}"
+    made = sorted(bag.parent.glob(f"{name}_[0-9][0-9]"))
+    return made or split(bag, bag.parent / name, every=seconds)
 
 
 ROBOTS = (
