@@ -107,7 +107,7 @@ def test_no_output_of_thousands_leaves_its_forecast(name: str, peak: bool) -> No
     model, funnel = alone(name, peak=peak)
     most, count = 0.0, 0
     for kind in ("spent", "random", "sign"):
-        y, u = attack(model, funnel, kind, 3000, seed=2)
+        y, u = attack(model, funnel, kind, 1500, seed=2)
         for k, forecast in forecasts(model, funnel, y, u):
             part = used(forecast, y[k + 1 :])
             most, count = max(most, float(part.max(initial=0.0))), count + len(part)
