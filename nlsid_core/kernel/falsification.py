@@ -30,6 +30,7 @@ HIDDEN = Fraction(1, 2**64)  # part of the energy that is given up for what roun
 MAX_PRODUCTS = 10**6  # of matrices and polynomials, long numbers counted several times
 LONG = 11  # a product of numbers of b bits counts 1 + (b >> LONG)^2 times
 MAX_TERMS = 10**5  # of a level, at all samples of a run
+SLOW = "the model's polynomials take too long to evaluate at so many samples"
 
 Step = tuple[Matrix, Matrix, Matrix, Matrix]  # C, d, A, f of one sample: ŷ = C x + d, x⁺ = A x + f
 
@@ -127,10 +128,12 @@ def _least(
     n, p = len(tube.P), len(tube.R)
     X = [[Fraction(int(i == j)) for j in range(n + 1)] for i in range(n)]
     Q, error, lost = zero(n + 1), Fraction(0), Fraction(0)
+    size = (n + 1) ** 2 * (n + p)
+    work.spend(size * len(window.y), "the window has too many samples to decide")
     for k, (y, weight) in enumerate(zip(window.y, weights, strict=True), window.first):
         C, d, A, f = step(k)
-        long = max(_bits(M) for M in (C, d, A, f, [y], tube.L, tube.R)) + 2 * _bits(X)
-        work.spend((n + 1) ** 2 * (n + p) * (1 + (long >> LONG) ** 2), "too many samples")
+        longest = max(_bits(M) for M in (C, d, A, f, [y], tube.L, tube.R))
+        work.spend(size * (longest >> LONG) ** 2, "the model's steps have too long numbers")
         E = combined(_last(n, [[a - b[0]] for a, b in zip(y, d, strict=True)]), product(C, X), -1)
         off = _size(C) * error + ULP
         Q = combined(Q, congruence(_rounded(E), tube.R), weight)
@@ -234,7 +237,7 @@ def _state_affine(model: Node, window: Window, work: Work) -> Callable[[int], St
         w = [scaled_input(k - delay, i) for i, delay in places]
         values = [_value(powers, c, w, work) for powers, c in blocks]
         whole = [[entry for block in values[1:] for entry in block[i]] for i in range(p)]
-        work.spend(p**2 * (n + p) * (1 + (p * max(map(_bits, values)) >> LONG) ** 2), "too long")
+        work.spend(p**2 * (n + p) * (1 + (p * max(map(_bits, values)) >> LONG) ** 2), SLOW)
         solved = [[-entry for entry in row] for row in _solved(values[0], whole)]
         C = [[s * entry for entry in row[:n]] for row, s in zip(solved, y_scale, strict=True)]
         d = [[s * row[n] + o] for row, s, o in zip(solved, y_scale, y_offset, strict=True)]
@@ -253,7 +256,7 @@ def _value(
         raise Rejected(f"a falsification is for models of degree {MAX_POWER} at most")
     bits = MAX_POWER * _bits([w])
     entries = len(coefficients[0]) * len(coefficients[0][0]) + len(w)
-    work.spend(len(powers) * entries * (1 + (bits >> LONG) ** 2), "the model has too many terms")
+    work.spend(len(powers) * entries * (1 + (bits >> LONG) ** 2), SLOW)
     found = scaled(coefficients[0], Fraction(0))
     for row, coefficient in zip(powers, coefficients, strict=True):
         factors = (value**power for value, power in zip(w, row, strict=True) if power)
