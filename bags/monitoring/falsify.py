@@ -13,6 +13,7 @@ import numpy as np
 from bags.designs import documents
 from bags.designs.design import WiredTube
 from bags.monitoring.replay import Definitions, samples_of
+from bags.recordings.folders import trial_name
 from bags.recordings.remote import place
 from bags.signals.reader import bag_digest
 from bags.signals.sampling import Sample
@@ -20,8 +21,10 @@ from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DocumentError
 from nlsid_core.kernel import Verdict
-from nlsid_core.running.falsification import falsifications
+from nlsid_core.running.falsification import falsifications, refuse_unfalsifiable
 from nlsid_core.running.grid import TOLERANCE
+
+__all__ = ["Certificate", "falsified", "falsify", "recorded", "refuse_unfalsifiable"]
 
 SUFFIX = ".falsification.json"
 
@@ -59,7 +62,7 @@ def falsify(
     for binding in bindings.values():
         about[binding["file"]] = proof.with_name(binding["file"]).read_bytes()
     tube = {"file": proof.name, "digest": files.digest(about[proof.name])}
-    recording = {"name": place(bag).name, "digest": bag_digest(bag)}
+    recording = {"name": trial_name(place(bag)), "digest": bag_digest(bag)}
     for begins, y, u in _runs(design, samples_of(design, bag, definitions)):
         for found in falsifications(design.model, design.funnel, y, u, begins):
             document = proofs.proof_document(found.claim({"tube": tube}, recording), found.proof())
@@ -68,6 +71,18 @@ def falsify(
             except CertificateRejected:
                 continue  # too narrow for exact numbers, or too long
     return None
+
+
+def falsified(
+    funnel: Path, bag: Path, folder: Path, definitions: Definitions | None = None
+) -> Iterator[str]:
+    """`falsify`, its certificate saved in `folder`, in words."""
+    found, name = falsify(funnel, bag, definitions=definitions), trial_name(bag)
+    if found is None:
+        yield f"{name}: no certificate was found: some start of the observer may explain it"
+        return
+    yield f"{name}: {found.verdict}"
+    yield f"wrote {found.save(folder, name)}"
 
 
 def recorded(path: Path, bag: Path | str, *, definitions: Definitions | None = None) -> str:

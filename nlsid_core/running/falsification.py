@@ -66,11 +66,7 @@ def falsifications(
     y (N, p), u (N, n_u): consecutive samples, the first being number `begins` of its recording; y
     is NaN where nobody measured. Raises DataError for models that are not affine in their states.
     """
-    if not isinstance(model, AFFINE):
-        raise DataError(
-            "samples are held against every state of an observer only for models that are affine "
-            f"in it, linear and state_affine ones; this is a {type(model).__name__}"
-        )
+    refuse_unfalsifiable(model)
     for number, tube in enumerate(funnel.tubes, 1):
         if tube.samples is not None:
             continue
@@ -88,6 +84,15 @@ def falsifications(
                 yield Falsification(
                     number, begins + run, begins + a, u[run : end + 1], y[a : end + 1], *weights
                 )
+
+
+def refuse_unfalsifiable(model: object) -> None:
+    """DataError for models that are not affine in their states."""
+    if not isinstance(model, AFFINE):
+        raise DataError(
+            "samples are held against every state of an observer only for models that are affine "
+            f"in it, linear and state_affine ones; this is a {type(model).__name__}"
+        )
 
 
 def _lengths(least: int, most: int) -> list[int]:
