@@ -140,6 +140,8 @@ def _least(
         lost += weight * off**2
         X = _rounded(combined(combined(product(A, X), product(tube.L, E)), _last(n, f)))
         error = _up(_size(combined(A, product(tube.L, C), -1)) * error) + ULP
+        if error > 1:  # so that X, which grows as it does, has no long numbers either
+            raise Rejected("the window is too long: rounding could hide its state")
     lost *= sum((tube.R[i][i] for i in range(p)), Fraction(0)) * p * (n + 1) / HIDDEN
     ones = block_diagonal(*[[[Fraction(1)]]] * (n + 1))
     Q = combined(scaled(Q, 1 - HIDDEN), ones, -lost)
