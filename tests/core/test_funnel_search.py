@@ -16,7 +16,7 @@ from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
-from nlsid_core.design.continuous.pieces import prove_pieces
+from nlsid_core.design.continuous.pieces import proof_basis, prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.vstep import improve
 from nlsid_core.designs import Design
@@ -197,8 +197,8 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     forms = KnotForms(setting.steps, setting.policy, funnel, ends, margin=0.0)
     largest = {}
     for trust in (0.05, 0.2):
-        D = improve(forms.samples, forms.pairs, 8, forms.basis, weights=np.ones(8),
-                    margins=forms.margins, trust=trust)  # fmt: skip
+        D = improve(forms.samples, forms.pairs, 8, proof_basis(setting.steps.program),
+                    weights=np.ones(8), margins=forms.margins, trust=trust)  # fmt: skip
         largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()
         assert largest[trust] <= trust + 1e-4
     assert largest[0.05] == pytest.approx(0.05, rel=0.01)

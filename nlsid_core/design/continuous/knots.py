@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.closed_loop import batches, error_at_end
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.design.continuous.lstep import LSteps, coordinates
@@ -34,7 +34,6 @@ class KnotForms:
     ) -> None:
         n, v = funnel.n, len(steps.vertices)
         self.n, self.vertices = n, v
-        self.basis: IntArray = np.vstack([monomials_of(n, q) for q in range(3)])
         nonlinear = steps.nonlinear
         self.frames = [
             np.sqrt(rho) * coordinates(P, nonlinear)
@@ -65,15 +64,13 @@ class KnotForms:
                 scale = np.sqrt(funnel.rho[other] / funnel.rho[own])
                 across = scale * np.linalg.solve(self.frames[other], self.frames[own])
                 sign = 1 if end == 0 else -1
-                bare = Sample(own, other, 1 / self.h[k], sign, y, np.zeros(_count(n, 2)), across)
-                target = affine_form(bare).constant
+                bare = affine_form(Sample(own, other, 1 / self.h[k], sign, y, across))
+                target = bare.constant.copy()
                 target[0] += growth
                 m = solution.m + growth
                 _, mu = end_proof(steps.program, solution, _by_degree(target, n), 1.0, m,
                                   constant=CONSTANT)  # fmt: skip
-                self.samples.append(
-                    affine_form(Sample(own, other, 1 / self.h[k], sign, y, mu, across))
-                )
+                self.samples.append(bare.with_multiplier(mu, n))
                 self.pairs.append((own, other))
                 self.margins.append(min(margin, KEEP * m))
 

@@ -14,7 +14,7 @@ import numpy as np
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
-from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
+from nlsid_core.design.continuous.pieces import Proved, proof_basis, prove_pieces, unsolved
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
 from nlsid_core.errors import DataError, Infeasible, SolverError
@@ -68,10 +68,12 @@ def enlarge_shape(
     P = funnel.P / rho[:, None, None]
     present = replace(funnel, P=(P + P.transpose(0, 2, 1)) / 2, rho=np.ones(len(rho)))
     found = [present]
+    ends = solve_ends(steps, policy, present, executor=executor)
     for iteration in range(iterations):
-        candidate = _enlarged(steps, policy, present, margin, objective, found[0].P, executor)
-        if candidate is None:
+        enlarged = _enlarged(steps, policy, present, ends, margin, objective, found[0].P, executor)
+        if enlarged is None:
             break
+        candidate, ends = enlarged
         growth = candidate.volume_integral() / present.volume_integral()
         present = candidate
         found.append(present)
@@ -111,13 +113,16 @@ def _enlarged(
     steps: LSteps,
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
+    ends: list[Ends],
     margin: float,
     objective: str,
     reference: FloatArray,
     executor: Executor | None,
-) -> ContinuousFunnel | None:
-    """One V-step for all knots but the last; None if none was found or it does not hold."""
-    ends = solve_ends(steps, policy, funnel, executor=executor)
+) -> tuple[ContinuousFunnel, list[Ends]] | None:
+    """One V-step for all knots but the last, with its L-steps; None if none was found that holds.
+
+    ends: the L-steps of the funnel it starts from.
+    """
     forms = KnotForms(steps, policy, funnel, ends, margin=margin)
     h = np.diff(funnel.t)
     share = (np.r_[h, 0] + np.r_[0, h])[:-1] / 2
@@ -127,8 +132,9 @@ def _enlarged(
     if objective == "reference":
         copies = np.array([T.T @ P @ T for T, P in zip(forms.frames, reference[:-1], strict=False)])
     try:
-        D = improve(forms.samples, forms.pairs, len(weights), forms.basis, weights=weights,
-                    margins=forms.margins, trust=TRUST, reference=copies)  # fmt: skip
+        D = improve(forms.samples, forms.pairs, len(weights), proof_basis(steps.program),
+                    weights=weights, margins=forms.margins, trust=TRUST,
+                    reference=copies)  # fmt: skip
     except SolverError:
         return None
     for part in (1.0, 0.5, 0.2):
@@ -138,18 +144,7 @@ def _enlarged(
             new = inverse.T @ (np.eye(len(inverse)) + part * change) @ inverse
             moved[k] = (new + new.T) / 2
         candidate = replace(funnel, P=moved)
-        if _holds(steps, policy, candidate, margin / 4):
-            return candidate
+        ends = solve_ends(steps, policy, candidate, executor=executor)
+        if min(s.m for pair in ends for s in (*pair.start, *pair.end)) >= margin / 4:  # ρ = 1
+            return candidate, ends
     return None
-
-
-def _holds(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, margin: float
-) -> bool:
-    """True if every L-step at the knots of a funnel with ρ = 1 leaves the margin."""
-    for k in range(len(funnel.t) - 1):
-        for end in (0, 1):
-            section = section_at(steps, policy, funnel.P, k, float(end))
-            if min(s.m for s in steps.solve(section, float(funnel.rho[k + end]))) < margin:
-                return False
-    return True
