@@ -153,11 +153,11 @@ def levels(forms: KnotForms, k: int, after: float) -> list[tuple[FloatArray, Flo
     constant is -Ẇ/ρ° + μ(1 - |z|²), so c/ρ° = it + ρ̇/ρ° + μ(ρ/ρ° - 1).
     """
     result = []
-    half = len(forms.h) * forms.vertices
+    half = len(forms.h) * forms.cases
     for end in (0, 1):
         present = forms.rho[k + end]
-        for v in range(forms.vertices):
-            sample = forms.samples[end * half + k * forms.vertices + v]
+        for v in range(forms.cases):
+            sample = forms.samples[end * half + k * forms.cases + v]
             mu = sample.mu
             constant, slope = sample.constant.copy(), np.zeros_like(sample.constant)
             constant[0] += after / forms.h[k] / present

@@ -2,14 +2,23 @@
 
 from typing import Any
 
-import cvxpy as cp
+import cvxpy
 import numpy as np
 import pytest
 
 from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.design.continuous.graded import monomials_of
-from nlsid_core.design.continuous.vstep import Affine, Sample, affine_form, improve
+from nlsid_core.design.continuous.vstep import (
+    Affine,
+    Sample,
+    affine_form,
+    improve,
+    squares_along,
+)
+from nlsid_core.errors import SolverError
 from nlsid_core.polynomial.values import monomial_values
+
+cp: Any = cvxpy  # its functions are not typed
 
 
 def powers(n: int, degree: int) -> IntArray:
@@ -37,6 +46,32 @@ def test_c_is_what_the_derivative_of_w_says(n: int, sign: int) -> None:
     expected = -W_rate + monomial_values(powers(n, 2), z) @ mu * (1 - W)
     c = form.constant + form.own @ triangle(own) + form.others @ triangle(other)
     np.testing.assert_allclose(monomial_values(powers(n, 4), z) @ c, expected, rtol=1e-10)
+
+
+def test_what_bounds_pushes_is_taken_to_first_order_in_d() -> None:
+    rng = np.random.default_rng(3)
+    n, step = 3, 1e-6
+    g, scale, z = rng.normal(size=(n, 2)), np.array([0.7, 0.2]), rng.normal(size=(20, n))
+    D = (lambda A: (A + A.T) / 2)(rng.normal(size=(n, n)))
+
+    def bound(part: float) -> FloatArray:
+        return np.asarray(np.square(z @ (np.eye(n) + part * D) @ g) @ scale)
+
+    slope = monomial_values(powers(n, 4), z) @ (squares_along(g, scale) @ triangle(D))
+    np.testing.assert_allclose(slope, (bound(step) - bound(-step)) / (2 * step), rtol=1e-6)
+
+
+def test_bounds_are_kept() -> None:
+    samples, pairs = contracting(4)
+    rows = np.array([[0.9, 0.0], [0.5, 0.7]])
+    options: dict[str, Any] = {"weights": np.ones(3), "margins": [0.05] * 6, "trust": 0.4}
+    free = improve(samples, pairs, 3, powers(2, 2), **options)
+    kept = improve(samples, pairs, 3, powers(2, 2), bounds=[rows, rows[:1], rows[:0]], **options)
+    assert np.einsum("ri,ij,rj->r", rows, np.linalg.inv(np.eye(2) + free[0]), rows).max() > 1.01
+    for k, count in enumerate((2, 1, 0)):
+        reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(np.eye(2) + kept[k]), rows)
+        assert (reach[:count] <= 1).all()
+    np.testing.assert_allclose(kept[2], free[2], atol=0.1)
 
 
 def contracting(knots: int) -> tuple[list[Affine], list[tuple[int, int]]]:
@@ -101,8 +136,6 @@ def test_the_optimum_is_that_of_a_general_solver(kind: str) -> None:
 
 
 def test_margins_that_nothing_keeps_are_said() -> None:
-    from nlsid_core.errors import SolverError
-
     samples, pairs = contracting(4)
     with pytest.raises(SolverError, match="keeps the margins"):
         improve(samples, pairs, 3, powers(2, 2), weights=np.ones(3), margins=[50.0] * 6, trust=0.4)

@@ -6,6 +6,7 @@ P_κ = T⁻ᵀ(I + D)T⁻¹ changes c(z) = -Ẇ + μ(1 - W) linearly in D; c - m
 Source: thesis (6.8); the linearised-volume objective needs the trust region.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -104,6 +105,19 @@ def affine_form(sample: Sample) -> Affine:
     return Affine((own + others) @ tables.diagonal, own, others, none)
 
 
+def squares_along(along: FloatArray, scale: FloatArray) -> FloatArray:
+    """(M₄, d): what D adds at first order to Σ_j scale_j (z'(I + D)g_j)², along: (n, J) the g_j."""
+    n = len(along)
+    tables = _tables(n)
+    result = np.zeros((int(tables.quadratic.max()) + 1, len(tables.p)))
+    outer: FloatArray = 2 * (along * scale) @ along.T  # z'g z'Dg, twice
+    for a, b in ((tables.p, tables.q), (tables.q, tables.p)):
+        for column, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
+            np.add.at(result[:, column], tables.linear[i, 1 : n + 1],
+                      outer[j] * tables.twice[column] / 2)  # fmt: skip
+    return result
+
+
 def improve(
     samples: list[Affine],
     knots: list[tuple[int, int]],
@@ -113,13 +127,14 @@ def improve(
     weights: FloatArray,
     margins: list[float],
     trust: float,
+    bounds: Sequence[FloatArray] = (),
     reference: FloatArray | None = None,
 ) -> FloatArray:
     """D (free, n, n) for the free knots 0..free-1; D = 0 for knots beyond.
 
     samples and knots: c at each sample, and (own, other) knot, neighbours. basis: (k, n) exponents
     of v. margins: what c keeps above zero at each sample, in 1/s. weights: (free,) of each knot's
-    volume.
+    volume. bounds: per free knot (R, n) rows r: |r'z| ≤ 1 in the set, I + D ⪰ rr'.
     reference: (free, n, n) matrices of the reference ellipsoids in the knots' coordinates: then the
     objective is Σ weights·r with I + D ⪯ r·reference; else the linearised volume. trust: of |D|.
     Raises SolverError if it ends at no point that keeps the margins.
@@ -131,6 +146,11 @@ def improve(
     # F (free, L, 1 + unknowns, n, n): trust·I ± D, and r·reference - I - D.
     rows = [np.concatenate([trust * np.eye(n)[None], sign * units]) for sign in (1.0, -1.0)]
     F = np.repeat(np.array(rows)[None], free, axis=0)
+    most = max((len(r) for r in bounds), default=0)
+    inside = np.tile(np.concatenate([np.eye(n)[None], units]), (free, most, 1, 1, 1))
+    for place, directions in zip(inside, bounds, strict=False):
+        place[: len(directions), 0] -= directions[:, :, None] * directions[:, None]
+    F = np.concatenate([F, inside], axis=1)
     cost = np.tile(np.trace(units, axis1=1, axis2=2), (free, 1))
     x = np.zeros((free, d))
     if reference is not None:
