@@ -8,6 +8,7 @@ import numpy as np
 from nlsid_core import files, proofs
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design import OutputTubeDesign
+from nlsid_core.errors import CertificateRejected
 from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.models import StableModel
 from nlsid_core.running.falsification import falsifications
@@ -56,7 +57,7 @@ def found(made: OutputTubeDesign) -> tuple[Json, dict[str, Json]]:
         document = proofs.proof_document(each.claim(binding(about), RECORDING), each.proof())
         try:
             proofs.decide(document, about)
-        except proofs.CertificateRejected:
+        except CertificateRejected:
             continue
         return document, about
     raise AssertionError("no falsification was found")

@@ -48,7 +48,9 @@ def is_falsified(claim: Json, proof: Json, about: Mapping[str, Json]) -> bool:
     level, rho = exact(tube["level"]), exact(tube["rho"])
     single = exact(tube["peak"]["level"]) if "peak" in tube else Fraction(0)
     most = sum((w * level * now for w, now in zip(energy, g, strict=True)), Fraction(0))
-    most += sum((w * single * max(now, 1) for w, now in zip(peak, g, strict=True)), Fraction(0))
+    most += sum(
+        (w * single * max(now, Fraction(1)) for w, now in zip(peak, g, strict=True)), Fraction(0)
+    )
     n = len(tube["P"])
     units = [[Fraction(int(i == j)) for i in range(n)] for j in range(n)]
     runs = [innovations(model, tube, u, y, run, first, x) for x in ([Fraction(0)] * n, *units)]
