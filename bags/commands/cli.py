@@ -385,8 +385,6 @@ def check(
     read, so that nothing was decided about it, or if the second kernel was asked and has no opinion
     of it.
     """
-    from bags.monitoring.falsify import recorded
-
     status = 0
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
@@ -395,6 +393,8 @@ def check(
             word, _, rest = said.partition(" ")
             typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
             if recording is not None:
+                from bags.monitoring.falsify import recorded
+
                 typer.echo(f"  compared: {recorded(path, recording)}")
             if second:
                 opinion = second_kernel.opinion(path)
