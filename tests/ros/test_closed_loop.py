@@ -22,15 +22,10 @@ from bags.recordings.bag import Bag
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test, stop
 
 pytestmark = ros_test
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 class Loop:

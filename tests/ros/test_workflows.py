@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,6 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.chain.steps import design_funnel_files, identify_bags
@@ -35,7 +34,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import ROOT, SpinUntil, call, node_here, process, ros_test
 
 pytestmark = ros_test
 
@@ -46,7 +45,7 @@ PATIENT = ["stale_after:=1.0", "command_wait:=0.5"]  # the machine may be busy w
 class Operator:
     """Hears what the nodes say and calls their services."""
 
-    def __init__(self, node: Node, spin_until: Callable[[Callable[[], bool]], None]) -> None:
+    def __init__(self, node: Node, spin_until: SpinUntil) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[str]] = {}
         self.values: dict[str, dict[str, str]] = {}
@@ -71,12 +70,8 @@ class Operator:
 
     def asks(self, service: str) -> str:
         """Call a std_srvs/Trigger; why it did not succeed, empty if it did."""
-        client = self.node.create_client(Trigger, service)
-        self.spin_until(client.service_is_ready)
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        self.node.destroy_client(client)
-        return "" if answer.result().success else str(answer.result().message)
+        answer = call(self.node, self.spin_until, service)
+        return "" if answer.success else str(answer.message)
 
     def waits(self, seconds: float) -> None:
         """Let time pass."""
@@ -85,8 +80,7 @@ class Operator:
 
 
 @pytest.fixture
-def operator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Operator]:
-    use_domain_of_this_run(monkeypatch)
+def operator() -> Iterator[Operator]:
     with node_here("test_operator") as (node, spin_until):
         yield Operator(node, spin_until)
 
