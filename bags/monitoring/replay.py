@@ -248,9 +248,8 @@ def announced_runs(
 def _fed(
     watch: Watch, bag: Path, definitions: Definitions | None, *, announced: bool
 ) -> Iterator[list[Stamped]]:
-    """What `watch` says to every message, in log order."""
-    design = watch.design
-    digest = design.digest
+    """What `watch` says to every message, by log time; as recorded where it goes back itself."""
+    digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         for topic in watch.pairing.topics:
             kind = source.types_on(topic)
@@ -259,7 +258,9 @@ def _fed(
             except BagError as error:
                 raise BagError(f"{bag}: {error}") from error
         run_topics = _run_topics(source) if announced else []
-        for message in source.messages([*run_topics, *watch.pairing.topics]):
+        topics = watch.pairing.topics
+        set_back = watch.pairing.clock == "log" and bool(source.log_order(topics).back)
+        for message in source.messages([*run_topics, *topics], as_recorded=set_back):
             if message.topic in run_topics:
                 run = _run(message, source)
                 if run.funnel == digest:

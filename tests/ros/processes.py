@@ -65,6 +65,15 @@ def stop(running: subprocess.Popen[str], how: signal.Signals = signal.SIGINT) ->
     return output
 
 
+def refusal(module: str, **parameters: object) -> str:
+    """What a node prints that refuses its parameters: it ends by itself, with exit status 1."""
+    with process(module, **parameters) as running:
+        output = running.communicate(timeout=STARTED)[0]
+    assert running.returncode == 1, output
+    assert "Traceback" not in output
+    return output
+
+
 @contextmanager
 def node_here(name: str) -> Iterator[tuple[Node, SpinUntil]]:
     """A node in this process, and a function that spins it until a condition holds."""

@@ -179,25 +179,6 @@ def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
         stop(monitor)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"stale_after": -0.1}, "parameter stale_after (s without a response, or"),
-        ({"stale_after": "soon"}, "parameter stale_after"),
-        ({"nominal": "profil"}, "profil"),
-    ],
-)
-def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
-    robot: Robot, parameters: dict[str, object], message: str
-) -> None:
-    with process(MONITOR, **parameters, __node="misconfigured") as node:
-        output = node.communicate(timeout=20)[0]
-    assert robot.node is not None
-    assert node.returncode == 1
-    assert message in output
-    assert "Traceback" not in output
-
-
 def test_a_recorder_that_waits_for_simulated_time_says_so(robot: Robot, tmp_path: Path) -> None:
     settings: dict[str, object] = {"topics": "[/odom]", "bag": tmp_path / "bag"}
     with process("nlsid_ros.trajectory_recorder", **settings, use_sim_time=True) as recorder:

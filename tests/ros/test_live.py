@@ -19,6 +19,8 @@ from nlsid_core.progress import silent
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
+from tests.ros.processes import STARTED
+
 pytestmark = pytest.mark.ros
 
 
@@ -88,7 +90,7 @@ def test_the_publisher_refuses_what_is_not_proved(
     parameter = f"funnel:={tmp_path / documents.FUNNEL}"
     done = subprocess.run(
         [sys.executable, "-m", "nlsid_ros.funnel_publisher", "--ros-args", "-p", parameter],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=STARTED, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert "not published, not proved" in done.stderr + done.stdout

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 
 from nlsid_core.arrays import FloatArray
 from nlsid_ros import qos
-from tests.ros.processes import ROOT, call, node_here, process, ros_test, stop
+from tests.ros.processes import ROOT, STARTED, call, node_here, process, refusal, ros_test, stop
 
 pytestmark = ros_test
 MUJOCO = pytest.mark.skipif(
@@ -146,10 +146,7 @@ def test_a_push_is_seen_and_only_where_it_acts() -> None:
     ],
 )
 def test_a_plant_that_cannot_be_made_says_why(parameters: dict[str, object], said: str) -> None:
-    with process("nlsid_ros.plant", **parameters) as running:
-        output = running.communicate(timeout=30)[0]
-    assert running.returncode == 1
-    assert said in output
+    assert said in refusal("nlsid_ros.plant", **parameters)
 
 
 def test_without_mujoco_its_robots_are_an_error_that_names_the_extra(tmp_path: Path) -> None:
@@ -162,7 +159,7 @@ def test_without_mujoco_its_robots_are_an_error_that_names_the_extra(tmp_path: P
     script = tmp_path / "without_mujoco.py"
     script.write_text(f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{hidden}")
     done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=STARTED, check=False
     )
     assert done.returncode == 1
     assert "pip install 'nlsid[sim]'" in done.stderr

@@ -34,7 +34,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import ROOT, SpinUntil, call, node_here, process, ros_test
+from tests.ros.processes import ROOT, STARTED, SpinUntil, call, node_here, process, ros_test
 
 pytestmark = ros_test
 
@@ -108,7 +108,7 @@ def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> 
         with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
             operator.hears("funnel_monitor", "inside")
             operator.hears("funnel_monitor", "unknown: no speed for 1 s")
-            assert player.wait(timeout=20) == 0
+            assert player.wait(timeout=STARTED) == 0
     assert not operator.has_said("funnel_monitor", "outside")
     assert not operator.has_said("funnel_monitor", "violated")
 
@@ -191,7 +191,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
         with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
             operator.hears("funnel_monitor", "inside")
             operator.spin_until(lambda: {stamp for stamp, _ in expected} <= heard.keys())
-            assert player.wait(timeout=20) == 0
+            assert player.wait(timeout=STARTED) == 0
         operator.hears("funnel_monitor", "unknown: no speed for 1 s")
     assert len(expected) > 100
     assert [(stamp, heard[stamp]) for stamp, _ in expected] == expected
@@ -367,7 +367,7 @@ def test_what_is_recorded_and_excited_is_what_the_configuration_names(
 def called(*service: str) -> "subprocess.CompletedProcess[str]":
     """`nlsid call`."""
     command = [sys.executable, "-m", "bags.commands.cli", "call", *service]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=STARTED, check=False)
 
 
 def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
@@ -385,7 +385,7 @@ def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     command = [sys.executable, "-m", "bags.commands.cli", "live", "closed_loop"]
     done = subprocess.run(
         [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
-        capture_output=True, text=True, cwd=ROOT, timeout=60, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=STARTED, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     assert "'plants:=true' is not one of the arguments of closed_loop.launch.xml" in done.stderr
