@@ -49,7 +49,8 @@ SHAPES: tuple[Callable[[FloatArray], FloatArray], ...] = (  # of φ at the start
 )
 ROOM = 1.3  # times the range of y: where the maps end, and the largest of the inputs imitated
 SIZES = (0.9, 1.5)  # of these inputs, in those of the trials
-IMITATED, LENGTH, HELD_BACK = 96, 500, 24  # inputs imitated, samples of each, and others to judge
+LENGTH = 500  # samples of an input that is imitated
+MOST_IMITATED = 10_000
 FITTED = 30_000  # samples of the trials that the stages are fitted to, beside them
 LOOP_STEPS, LOOP_TOLERANCE = 60, 1e-4
 TOLERANCE = 2e-3  # relative gain of a step of the stages
@@ -63,6 +64,7 @@ class FeedbackClass:
 
     lags: of output and inputs, 1 to 8. intervals: of the map's spline, 1 to 30 (1 is a cubic).
     stages: of the unrolled equation that are tried, 1 to 8; each is one map of the proof.
+    imitated: inputs that nobody recorded, on which the stages do as the loop does, 0 to 10000.
     start_samples: at the start of a trial, that show its first state and are not scored, 1 to
     10000. seed: of the inputs that are imitated.
     """
@@ -70,6 +72,7 @@ class FeedbackClass:
     lags: int = 3
     intervals: int = 4
     stages: int = 4
+    imitated: int = 96
     start_samples: int = 20
     seed: int = 0
     kind: ClassVar[type[CellNetwork]] = CellNetwork
@@ -78,6 +81,7 @@ class FeedbackClass:
         require_whole(self, "lags", 1, MOST_LAGS)
         require_whole(self, "intervals", 1, MOST_INTERVALS)
         require_whole(self, "stages", 1, MAX_MAPS)
+        require_whole(self, "imitated", 0, MOST_IMITATED)
         require_whole(self, "start_samples", 1, MOST_START_SAMPLES)
         require_whole(self, "seed", 0, 2**31)
         if self.start_samples < self.lags:
@@ -183,7 +187,7 @@ def imitated(
     return made
 
 
-def identify_loop_only(
+def identify_unproved(
     train: Dataset, model_class: FeedbackClass, *, transient: int
 ) -> CellNetwork:
     """The loop as a network, which may be proved or not. Raises as `identify_feedback`."""
@@ -222,7 +226,7 @@ def identify_feedback(
     known = _known(first_loop, first_basis, few_trials, model_class)
     others = Scaled.of(judged, model_class, transient, scaled).trials
     rng = np.random.default_rng(model_class.seed + 1)
-    unseen = imitated(first_loop, first_basis, few_trials, HELD_BACK, rng)
+    unseen = imitated(first_loop, first_basis, few_trials, model_class.imitated // 4, rng)
     stages, history, best = _linear(known, model_class.lags, slowest), [], np.inf
     chosen = stages
     further = replace(first_loop, a=_within(first_loop.a, slowest))
@@ -255,7 +259,7 @@ def _known(
 ) -> list[Trial]:
     """What stages are fitted to: trials, and what the loop makes of inputs that nobody recorded."""
     rng = np.random.default_rng(model_class.seed)
-    return [*_shortened(trials), *imitated(loop, basis, trials, IMITATED, rng)]
+    return [*_shortened(trials), *imitated(loop, basis, trials, model_class.imitated, rng)]
 
 
 def _linear(known: Sequence[Trial], lags: int, radius: float) -> list[Stage]:

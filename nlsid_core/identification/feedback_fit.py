@@ -85,7 +85,7 @@ class Basis:
 class Stage:
     """a (n,), b (n+1, q), c, and of what the map gives e (n+1,), phi (J,), both empty without one.
 
-    e[0] of a loop is 0 and stays it.
+    Of a loop e[0] = 0.
     """
 
     a: FloatArray
@@ -118,27 +118,37 @@ def lagged(signal: FloatArray, lags: int) -> FloatArray:
     return rows
 
 
+def moving_sum(b: FloatArray, signal: FloatArray) -> FloatArray:
+    """Σ_k b_k signal(t - k) of (…, N), zero before it begins."""
+    found = b[0] * signal
+    for k, weight in enumerate(b[1:], 1):
+        found[..., k:] += weight * signal[..., :-k]
+    return np.asarray(found)
+
+
 def simulate_loop(loop: Stage, basis: Basis, u: FloatArray, start: FloatArray) -> FloatArray:
     """y (N,) from its first n samples; held at DIVERGED where it grows beyond all measure."""
     n = len(loop.a)
     forcing = (loop.c + np.einsum("ktq,kq->t", lagged(u, n), loop.b)).tolist()
     values, per, low = (basis.rows @ loop.phi).tolist(), KNOTS / (basis.high - basis.low), basis.low
-    rises = np.diff(values).tolist()
-    terms = list(zip(loop.a.tolist(), loop.e[1:].tolist(), strict=True))
+    rises, last = [*np.diff(values).tolist(), 0.0], float(KNOTS)
+    terms = list(zip(range(1, n + 1), loop.a.tolist(), loop.e[1:].tolist(), strict=True))
 
     def mapped(y: float) -> float:
-        position = min(max((y - low) * per, 0.0), float(KNOTS))
-        i = min(int(position), KNOTS - 1)
-        return float(values[i] + (position - i) * rises[i])
+        position = min(max((y - low) * per, 0.0), last)
+        i = int(position)
+        return values[i] + (position - i) * rises[i]  # type: ignore[no-any-return]
 
     y = start.tolist()
     w = [mapped(value) for value in y]
     for t in range(n, len(forcing)):
         value = forcing[t]
-        for k, (a, e) in enumerate(terms, 1):
+        for k, a, e in terms:
             value += a * y[t - k] + e * w[t - k]
-        y.append(min(max(value, -DIVERGED), DIVERGED))
-        w.append(mapped(y[-1]))
+        if not -DIVERGED < value < DIVERGED:
+            value = min(max(value, -DIVERGED), DIVERGED)
+        y.append(value)
+        w.append(mapped(value))
     return np.array(y)
 
 
@@ -151,7 +161,7 @@ def loop_sensitivities(
     none = np.zeros((1, N))
     direct = np.concatenate([
         lagged(y, n)[1:], lagged(trial.u, n).transpose(0, 2, 1).reshape(-1, N), none + 1.0, none,
-        lagged(loop.phi @ responses, n)[1:], lfilter([0.0, *loop.e[1:]], [1.0], responses),
+        lagged(loop.phi @ responses, n)[1:], moving_sum(loop.e, responses),
         np.zeros((n, N)),
     ])  # fmt: skip
     direct[:, :n] = 0.0
@@ -175,8 +185,8 @@ def simulate_stages(
         forcing = stage.c + np.einsum("ktq,kq->t", inputs, stage.b)
         if ys:
             ws.append(stage.phi @ basis.responses(ys[-1]))
-            forcing += lfilter(stage.e, [1.0], ws[-1])
-        forcing[:n] = lfilter(A, [1.0], trial.start)
+            forcing += moving_sum(stage.e, ws[-1])
+        forcing[:n] = moving_sum(A, trial.start)
         ys.append(lfilter([1.0], A, forcing))
     return ys, ws
 
@@ -194,8 +204,8 @@ def stage_sensitivities(
         if k:
             before = basis.slopes(stage.phi, ys[k - 1]) * moved
             direct = [
-                lfilter(stage.e, [1.0], before), *direct, lagged(ws[k - 1], n),
-                lfilter(stage.e, [1.0], basis.responses(ys[k - 1])),
+                moving_sum(stage.e, before), *direct, lagged(ws[k - 1], n),
+                moving_sum(stage.e, basis.responses(ys[k - 1])),
             ]  # fmt: skip
         forcing = np.concatenate(direct)
         forcing[:, :n] = 0.0

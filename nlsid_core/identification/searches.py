@@ -15,7 +15,11 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
-from nlsid_core.identification.feedback import FeedbackClass, identify_feedback, identify_loop_only
+from nlsid_core.identification.feedback import (
+    FeedbackClass,
+    identify_feedback,
+    identify_unproved,
+)
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import (
     ImplicitClass,
@@ -254,7 +258,7 @@ def feedback(train: Dataset, model_class: FeedbackClass, task: Task) -> Trail[Ce
     trail: Trail[CellNetwork] = Trail(
         task, prove_stability, f"held-back error, rms [{_unit(train)}]"
     )
-    fitted, judged = (train, task.validation) if task.validation else hold_out(train)
+    fitted, judged = hold_out(train)
 
     def search(method: CertifiedSem) -> tuple[CellNetwork, Proof]:
         model, proof, steps = identify_feedback(
@@ -265,7 +269,7 @@ def feedback(train: Dataset, model_class: FeedbackClass, task: Task) -> Trail[Ce
         trail.history = History(trail.history.value, steps)
         return model, proof
 
-    trail.add(Sem, lambda _: identify_loop_only(train, model_class, transient=task.transient))
+    trail.add(Sem, lambda _: identify_unproved(train, model_class, transient=task.transient))
     trail.add_proved(CertifiedSem, search)
     return trail
 
@@ -446,7 +450,7 @@ OFFERS: dict[type, Offer] = {
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     CellClass: Offer(cells, (CertifiedSem,), ()),
-    FeedbackClass: Offer(feedback, (CertifiedSem, Sem), (Sem,), needs_validation=True),
+    FeedbackClass: Offer(feedback, (CertifiedSem, Sem), (Sem,)),
     MonotoneClass: Offer(
         monotone,
         (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),
