@@ -25,7 +25,6 @@ ONE: dict[str, dict[str, Any]] = {
     "block_cascade": {"model": "block_cascade", "orders": [2, 1], "phases": [1],
                       "intervals": [8], "starts": 4, "transient": 60},
     "cells": {"model": "cells", "intervals": 4},
-    "feedback": {"model": "feedback", "lags": 2, "stages": 2},
     "monotone": {"model": "monotone", "lags": 2, "method": "rie"},
     "implicit": {"model": "implicit", "lags": 2},
 }  # fmt: skip

@@ -187,9 +187,7 @@ def imitated(
     return made
 
 
-def identify_unproved(
-    train: Dataset, model_class: FeedbackClass, *, transient: int
-) -> CellNetwork:
+def identify_unproved(train: Dataset, model_class: FeedbackClass, *, transient: int) -> CellNetwork:
     """The loop as a network, which may be proved or not. Raises as `identify_feedback`."""
     scaled = Scaled.of(train, model_class, transient)
     error, loop, basis, trials = identify_loop(scaled, model_class)
@@ -325,7 +323,11 @@ def network_of(
             into.append(y)
     x = _states(stages, basis, trials, closed)
     middle, spread = x.mean(axis=0), x.std(axis=0)
-    C = np.cov((x - middle).T).reshape(size, size) + 1e-9 * np.diag(spread**2) + 1e-12 * np.eye(size)
+    C = (
+        np.cov((x - middle).T).reshape(size, size)
+        + 1e-9 * np.diag(spread**2)
+        + 1e-12 * np.eye(size)
+    )
     T = cholesky(C, lower=True) * min(1.0, PRIOR / max(error, SMALLEST))
     inside = slice(m, m + size)
 
@@ -365,11 +367,12 @@ def _states(
     n, found = len(stages[0].a), []
     for trial in trials:
         if closed:
-            ys = [simulate_loop(stages[0], basis, trial.u, trial.start)]
-            ws = [stages[0].phi @ basis.responses(ys[0])]
+            y_loop = simulate_loop(stages[0], basis, trial.u, trial.start)
+            ys: list[FloatArray] = [y_loop]
+            ws: list[FloatArray] = [np.asarray(stages[0].phi @ basis.responses(y_loop))]
         else:
             ys, ws = simulate_stages(stages, basis, trial)
-            ws = [np.zeros(len(trial.u)), *ws]
+            ws.insert(0, np.zeros(len(trial.u)))
         columns = []
         for stage, y, w in zip(stages, ys, ws, strict=True):
             past, inputs, maps = lagged(y, n), lagged(trial.u, n), lagged(w, n)
@@ -400,7 +403,7 @@ def _saturated(basis: Basis, phi: FloatArray) -> PiecewiseLinear:
 def _within(a: FloatArray, radius: float) -> FloatArray:
     """The coefficients with poles outside the circle reflected, and slower ones at the radius."""
     theta = reflected(np.concatenate([[1.0], -a]), 0.999 * radius)
-    return -theta[1:] / theta[0]
+    return np.asarray(-theta[1:] / theta[0])
 
 
 def _shortened(trials: Sequence[Trial]) -> list[Trial]:

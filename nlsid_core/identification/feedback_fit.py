@@ -179,12 +179,14 @@ def simulate_stages(
     stages: Sequence[Stage], basis: Basis, trial: Trial
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Every stage's y (N,), all with the same first samples, and what the maps give (N,)."""
-    inputs, ys, ws = lagged(trial.u, len(stages[0].a)), [], []
+    inputs = lagged(trial.u, len(stages[0].a))
+    ys: list[FloatArray] = []
+    ws: list[FloatArray] = []
     for stage in stages:
         n, A = len(stage.a), np.concatenate([[1.0], -stage.a])
         forcing = stage.c + np.einsum("ktq,kq->t", inputs, stage.b)
         if ys:
-            ws.append(stage.phi @ basis.responses(ys[-1]))
+            ws.append(np.asarray(stage.phi @ basis.responses(ys[-1])))
             forcing += moving_sum(stage.e, ws[-1])
         forcing[:n] = moving_sum(A, trial.start)
         ys.append(lfilter([1.0], A, forcing))

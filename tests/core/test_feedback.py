@@ -40,15 +40,15 @@ def fit() -> Fit[CellNetwork]:
 
 
 def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None:
-    """The loop to its noise, unproved; unrolled and proved, 6 % where linear models have 20 %."""
-    fresh, louder = trials([0.08, 0.2], seed=1), trials([0.22], seed=2)
+    """The loop to its noise, unproved; unrolled and proved, 5 % where linear models have 20 %."""
+    fresh, louder = trials([0.12, 0.22], seed=1), trials([0.28], seed=2)
     loop, proved = (next(c for c in fit.candidates if c.method.name == name)
                     for name in ("sem", "sem_certified"))  # fmt: skip
     assert loop.proof is None
     assert loop.error_percent(fresh) < 150 * NOISE
     assert proved.proof is not None
-    assert proved.error_percent(fresh) < 6.0
-    assert proved.error_percent(louder) < 9.0
+    assert proved.error_percent(fresh) < 5.0
+    assert proved.error_percent(louder) < 12.0
     straight = identify(trials(AMPLITUDES), LinearClass(3), method=Sem(), comparators=())
     assert straight.chosen.error_percent(fresh) > 20.0
     proofs.decide(fit.proof.document(fit.model, "m.json"), {"m.json": fit.model.document()})
@@ -59,6 +59,7 @@ def test_the_history_says_what_every_map_gained(fit: Fit[CellNetwork]) -> None:
     first, second, _ = fit.history.steps
     assert (first.what, second.what) == ("1 map", "2 maps")
     assert second.value < 0.7 * first.value
+    assert fit.history.value.startswith("held-back error")
 
 
 def test_a_slower_proof_than_the_kernel_can_decide_is_refused(fit: Fit[CellNetwork]) -> None:
@@ -115,6 +116,7 @@ def test_the_sensitivities_are_those_of_finite_differences() -> None:
     ys, ws = simulate_stages(stages, basis, trial)
     J, at = stage_sensitivities(stages, basis, trial, ys, ws), 0
     for k, stage in enumerate(stages):
+
         def last(one: Stage, k: int = k) -> np.ndarray:
             changed = [*stages[:k], one, *stages[k + 1 :]]
             return simulate_stages(changed, basis, trial)[0][-1]
@@ -145,12 +147,12 @@ def test_the_network_simulates_what_was_fitted() -> None:
 
 def test_several_layers_are_proved_by_their_weights(fit: Fit[CellNetwork]) -> None:
     """P couples no stage with another, so that no program has to be solved."""
-    n = SMALL.lags
+    n, proof = SMALL.lags, prove_stability(fit.model)
+    assert proof is not None
     for i in range(len(fit.model.start) // n):
-        rows = fit.proof.P[i * n : (i + 1) * n]
+        rows = proof.P[i * n : (i + 1) * n]
         assert not rows[:, : i * n].any()
         assert not rows[:, (i + 1) * n :].any()
-    assert prove_stability(fit.model) is not None
 
 
 @pytest.mark.slow
@@ -163,8 +165,13 @@ def test_a_tube_of_many_maps_is_proved() -> None:
     assert "for ever" in str(tube.verdict)
 
 
-@pytest.mark.parametrize("key, value", [("lags", 0), ("lags", 9), ("stages", 0), ("stages", 9),
-                                        ("intervals", 0), ("start_samples", 2), ("seed", -1)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("lags", 0), ("lags", 9), ("stages", 0), ("stages", 9), ("intervals", 0),
+        ("imitated", -1), ("start_samples", 2), ("seed", -1),
+    ],
+)  # fmt: skip
 def test_options_that_make_no_sense_are_refused(key: str, value: int) -> None:
     with pytest.raises(OptionError, match=key):
         FeedbackClass(**{key: value})
