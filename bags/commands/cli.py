@@ -543,8 +543,8 @@ def monitor(
         if (alarm := entry.first_alarm) is not None:
             said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
             out.print(said, soft_wrap=True)
-        if entry.filled:
-            out.print(f"{entry.name}: {entry.said_filled}", soft_wrap=True)
+        for said in filter(None, (entry.said_filled, entry.said_wide)):
+            out.print(f"{entry.name}: {said}", soft_wrap=True)
         for reading in entry.unjudged[:UNJUDGED_SAID]:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)

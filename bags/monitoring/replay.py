@@ -4,7 +4,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
@@ -23,6 +25,9 @@ from nlsid_core.running.reading import Reading, Status, cause
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
+
+
+MOST_WIDE: Final = 0.05  # of the samples: a tube wider than the signal in more is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +78,27 @@ class Replay:
         """The same in words, of how many; empty if there is none."""
         count = sum(not reading.starts for reading in self.readings)
         return said_filled(self.filled, count)
+
+    @property
+    def said_wide(self) -> str:
+        """In how many samples the tube is wider than all that was measured here; empty if few."""
+        judged = [r for r in self.judged if r.measured]
+        widths = np.array(
+            [list(r.half_widths) or [self.half_width] * len(r.measured) for r in judged]
+        )
+        if not widths.any():
+            return ""
+        ranges = np.ptp(np.array([r.measured for r in judged]), axis=0)
+        share = (widths > ranges).mean(axis=0)
+        worst = int(np.argmax(share))
+        if share[worst] <= MOST_WIDE:
+            return ""
+        which = f" of output {worst}" if len(share) > 1 else ""
+        return (
+            f"in {100 * share[worst]:.0f} % of the samples judged the half-width{which} is more "
+            f"than the whole range measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
+            + ": the tube says nothing there"
+        )
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:
