@@ -1,7 +1,7 @@
 (* How far a list of polynomials is apart at two points: a bound on all coefficients of each degree. *)
 From Coq Require Import ZArith Reals List Lra Lia.
 From Verified Require Import Integers Forms Polynomials Positive Claim Condition Definite Tubes
-  Increments Near Words.
+  Increments Near Samples Words.
 Import ListNotations.
 Open Scope R_scope.
 

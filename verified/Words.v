@@ -1,11 +1,9 @@
 (* Norms of lists of reals; how far monomials of one degree are apart at two points, all together:
    by the words that they are made of. *)
 From Coq Require Import ZArith Reals List Lra Lia.
-From Verified Require Import Forms Claim Tubes.
+From Verified Require Import Forms Claim Tubes Samples.
 Import ListNotations.
 Open Scope R_scope.
-
-Definition norm (v : list R) : R := sqrt (dot v v).
 
 Lemma dot_self v : 0 <= dot v v.
 Proof. induction v as [|a v IH]; cbn; [lra|]. pose proof (Rle_0_sqr a). unfold Rsqr in *. lra. Qed.

@@ -1,0 +1,294 @@
+(* Why every motion that starts in a sampled funnel stays in it: by induction over the samples. *)
+From Coq Require Import ZArith Reals List Lra Lia.
+From Verified Require Import Integers Forms Polynomials Positive Claim Condition Definite Funnel
+  Goal Valid Tubes Increments Near Samples Words Curvature Steps.
+Import ListNotations.
+Open Scope R_scope.
+
+Lemma nonneg_val a : nonneg a = true -> 0 <= val a.
+Proof.
+  unfold nonneg, val. intros H. apply Z.leb_le in H. apply Rmult_le_pos; [now apply (IZR_le 0)|].
+  left. now apply Rinv_0_lt_compat, IZR_lt.
+Qed.
+Lemma positive_val a : positive a = true -> 0 < val a.
+Proof. intros H. apply val_positive. now apply Z.ltb_lt. Qed.
+Lemma plus_length a b : length a = length b -> length (plus a b) = length a.
+Proof. apply zip_length. Qed.
+Lemma at_plus M a b : length a = length b -> at_ M (plus a b) = plus (at_ M a) (at_ M b).
+Proof.
+  intros H. induction M as [|row M IH]; [reflexivity|].
+  change (at_ (row :: M) ?z) with (dot (map val row) z :: at_ M z). rewrite IH.
+  unfold plus at 1. rewrite dot_plus by auto. reflexivity.
+Qed.
+Lemma at_products A B z : at_ (nproducts A B) z = at_ A (at_ B z).
+Proof.
+  unfold nproducts, at_ at 1 2, image, vals. rewrite !map_map. apply map_ext. intros row.
+  apply dot_combination.
+Qed.
+Lemma total_self c M z : total (map (fun row => (vscale c row, row)) M) z = val c * dot (at_ M z) (at_ M z).
+Proof.
+  induction M as [|row M IH]; [cbn; ring|].
+  change (at_ (row :: M) z) with (dot (map val row) z :: at_ M z).
+  cbn [map total dot]. rewrite IH, dot_vscale. ring.
+Qed.
+Lemma npow_val a k : val (npow a k) = val a ^ k.
+Proof. induction k as [|k IH]; cbn [npow pow]; [apply val_none|]. now rewrite val_mul, IH. Qed.
+Lemma nspread_val m t q : val (nspread m t q) = spread m (val t) (val q).
+Proof.
+  induction m as [|m IH]; cbn [nspread spread]; [apply val_nzero|].
+  now rewrite val_add, val_mul, npow_val, IH.
+Qed.
+Lemma nstretch_val gammas far near : forall m,
+  val (nstretch m gammas far near) = stretch m gammas (val far) (val near).
+Proof.
+  induction gammas as [|g gammas IH]; intros m; cbn [nstretch stretch]; [apply val_nzero|].
+  now rewrite val_add, val_mul, nspread_val, IH.
+Qed.
+
+(* T z = x has a solution *)
+Lemma dot_zeros_first i : forall row pre z, length pre = i ->
+  forallb (fun a : num => Z.eqb (fst a) 0) (firstn i row) = true -> (i <= length row)%nat ->
+  dot (map val row) (pre ++ z) = dot (map val (skipn i row)) z.
+Proof.
+  induction i as [|i IH]; intros row [|q pre] z L H Hr; try discriminate; [reflexivity|].
+  destruct row as [|a row]; [cbn in Hr; lia|]. cbn in H. apply andb_prop in H as [A B].
+  cbn [app map dot skipn]. rewrite IH; auto; [|cbn in Hr; lia].
+  apply Z.eqb_eq in A. unfold val at 1. rewrite A. unfold Rdiv. ring.
+Qed.
+Lemma echelon_onto n M : forall i, echelon i M = true -> (i + length M = n)%nat ->
+  (forall row, In row M -> length row = n) -> forall x, length x = length M ->
+  exists z, length z = length M /\ forall pre, length pre = i -> at_ M (pre ++ z) = x.
+Proof.
+  induction M as [|row M IH]; intros i H Hn Hr x Hx.
+  { exists []. destruct x; [|discriminate]. split; auto. }
+  destruct x as [|x0 x]; [discriminate|]. cbn in H. apply andb_prop in H as [H1 H2].
+  apply andb_prop in H1 as [H0 H1]. cbn [length] in *.
+  destruct (IH (S i) H2 ltac:(lia) (fun r Hin => Hr r (or_intror Hin)) x ltac:(lia)) as [z [Lz Hz]].
+  pose proof (Hr row (or_introl eq_refl)) as Lr.
+  set (a := val (nth i row nzero)).
+  assert (Ha : a <> 0).
+  { unfold a, val. intros C. apply Bool.negb_true_iff, Z.eqb_neq in H1. apply H1.
+    apply Rmult_integral in C as [C|C]; [now apply eq_IZR in C|].
+    exfalso. apply (Rinv_neq_0_compat (IZR (Zpos (snd (nth i row nzero))))); [|exact C].
+    apply Rgt_not_eq. now apply IZR_lt. }
+  set (z0 := (x0 - dot (map val (skipn (S i) row)) z) / a).
+  exists (z0 :: z). split; [cbn [length]; congruence|]. intros pre Lp.
+  change (at_ (row :: M) ?v) with (dot (map val row) v :: at_ M v). f_equal.
+  - rewrite (dot_zeros_first i) by (auto; lia).
+    assert (E : skipn i row = nth i row nzero :: skipn (S i) row).
+    { assert (Hi : (i < length row)%nat) by lia. clear - Hi. revert i Hi.
+      induction row as [|b row IH]; intros [|i] Hi; cbn [length skipn nth] in *; try lia; [reflexivity|].
+      apply IH. lia. }
+    rewrite E. cbn [map dot]. fold a. unfold z0. field. exact Ha.
+  - replace (pre ++ z0 :: z) with ((pre ++ [z0]) ++ z) by now rewrite <- app_assoc.
+    apply Hz. rewrite app_length. cbn. lia.
+Qed.
+
+Section Stepwise.
+Context {K : Ints}.
+Notation means z := (Polynomials.means 0 (env z)).
+
+Lemma means_flinear M z zs v : Forall2 (means z) zs v -> Forall2 (means z) (flinear M zs) (at_ M v).
+Proof.
+  intros H. unfold flinear, at_, image, vals. rewrite map_map. apply Forall2_map2. intros row.
+  apply means_fdot; auto. apply Forall2_map2. intros a. apply means_fnum.
+Qed.
+Lemma means_nums z l : Forall2 (means z) (map fnum l) (map val l).
+Proof. apply Forall2_map2. intros a. apply means_fnum. Qed.
+Lemma means_minus z a b v w : Forall2 (means z) a v -> Forall2 (means z) b w ->
+  Forall2 (means z) (zip fsub a b) (minus v w).
+Proof. apply (Forall2_zip (means z) (means z)). intros. now apply means_sub. Qed.
+
+Variables (m : map_file) (p : track_file) (s : sampled_file) (w : links).
+Notation n := (order m).
+Definition fbar (k : nat) (xi : list R) : list R :=
+  minus (maps_to m (plus (row k (states p)) xi) (minus (row k (inputs p)) (times k (feedback p) xi)))
+    (row (S k) (states p)).
+
+Lemma means_fmoved k z xi v : Forall2 (means z) xi v -> Forall2 (means z) (fmoved m p k xi) (fbar k v).
+Proof.
+  intros H. unfold fmoved, fbar. apply means_minus; [|apply means_nums].
+  unfold maps_to. apply Forall2_map2. intros e. apply means_frate, means_ftable. apply Forall2_app.
+  - unfold plus. apply (Forall2_zip (means z) (means z)); [|apply means_nums|exact H].
+    intros. now apply means_add.
+  - apply means_minus; [apply means_nums|]. now apply means_flinear.
+Qed.
+
+Hypothesis accepted : sampled_ok m p s w = true.
+
+Lemma parts : sizes_ok m p s w = true /\ form_ok s = true /\
+  (forall k, (k <= steps p)%nat -> sample_ok m p s k = true) /\
+  forall k, (k < steps p)%nat -> exists l,
+    link_ok m p s (basis w) (ball_basis w) (products (basis w)) k l = true.
+Proof.
+  unfold sampled_ok in accepted. apply andb_prop in accepted as [H1 H2].
+  apply andb_prop in H1 as [S1 S2]. apply andb_prop in H2 as [H2 H3].
+  rewrite forallb_forall in H2, H3. repeat split; auto.
+  - intros k Hk. apply H2, in_seq. lia.
+  - intros k Hk. assert (L : length (linked w) = steps p).
+    { unfold sizes_ok in S1. apply andb_prop in S1 as [_ S1]. apply andb_prop in S1 as [_ S1].
+      apply andb_prop in S1 as [_ S1]. apply andb_prop in S1 as [_ S1]. now apply Nat.eqb_eq in S1. }
+    assert (G : forall N a (l : list link), length l = N -> (a <= k < a + N)%nat ->
+      exists x, In (k, x) (combine (seq a N) l)).
+    { clear. induction N as [|N IH]; intros a [|x l] L H; try discriminate; try lia.
+      destruct (Nat.eq_dec a k) as [->|D]; [exists x; now left|].
+      destruct (IH (S a) l ltac:(now injection L) ltac:(lia)) as [y Hy]. exists y. now right. }
+    destruct (G (steps p) O (linked w) L ltac:(lia)) as [l Hl]. exists l. apply (H3 _ Hl).
+Qed.
+Lemma shaped_nth k a b c (M : matrix) : shaped a b M = true -> (k < a)%nat -> c = b ->
+  length (map val (nth k M [])) = c.
+Proof.
+  intros H Hk ->. apply shaped_is in H as [L H]. rewrite map_length. apply H, nth_In. lia.
+Qed.
+Lemma row_states k : (k <= steps p)%nat -> length (row k (states p)) = n.
+Proof.
+  intros Hk. destruct parts as [S1 _]. unfold sizes_ok in S1. apply andb_prop in S1 as [_ S1].
+  apply andb_prop in S1 as [S1 _]. apply andb_prop in S1 as [S1 _]. apply andb_prop in S1 as [_ S1].
+  apply (shaped_nth k _ _ _ _ S1); auto. lia.
+Qed.
+Lemma maps_length x u : length (maps_to m x u) = n.
+Proof. unfold maps_to, equations_of. now rewrite !map_length, seq_length. Qed.
+Lemma fbar_length k xi : (k < steps p)%nat -> length (fbar k xi) = n.
+Proof.
+  intros Hk. unfold fbar. rewrite minus_length; rewrite maps_length; auto.
+  now rewrite row_states by lia.
+Qed.
+Lemma response_shape k : (k < steps p)%nat -> length (nth k (responses s) []) = n.
+Proof.
+  intros Hk. destruct parts as [S1 _]. unfold sizes_ok in S1. apply andb_prop in S1 as [_ S1].
+  apply andb_prop in S1 as [_ S1]. apply andb_prop in S1 as [_ S1]. apply andb_prop in S1 as [S1 _].
+  apply andb_prop in S1 as [L S1]. apply Nat.eqb_eq in L. rewrite forallb_forall in S1.
+  assert (Hin : In (nth k (responses s) []) (responses s)) by (apply nth_In; lia).
+  apply S1, shaped_is in Hin. apply Hin.
+Qed.
+Lemma scale_facts k : (k <= steps p)%nat -> shaped n n (scale_at s k) = true /\
+  0 < val (radius_at (tube_radii s) k) /\ 0 < val (radius_at (inlet_radii s) k).
+Proof.
+  intros Hk. destruct parts as [_ [_ [S1 _]]]. specialize (S1 k Hk). unfold sample_ok in S1.
+  apply andb_prop in S1 as [S1 _]. apply andb_prop in S1 as [A B].
+  apply andb_prop in A as [A _]. apply andb_prop in B as [B1 B2].
+  repeat split; auto; now apply positive_val.
+Qed.
+Lemma size_is k z : size s k z = norm (at_ (scale_at s k) z).
+Proof. reflexivity. Qed.
+Lemma bound_nonneg : 0 <= val (bound s).
+Proof. destruct parts as [_ [H _]]. apply andb_prop in H as [H _]. now apply nonneg_val. Qed.
+
+(* What is bent. *)
+Definition bent (k : nat) (xi : list R) : list R :=
+  let g := at_ (scale_at s (S k)) (fbar k xi) in
+  match assumed_form s with
+  | Response => minus g (at_ (scale_at s (S k)) (times k (responses s) xi))
+  | _ => g
+  end.
+
+Lemma kappa_sound ST kap z : kappa_ok m ST kap = true -> length z = n ->
+  norm z <= val kap * norm (at_ ST z).
+Proof.
+  intros H Hz. apply andb_prop in H as [H1 H2]. apply nonneg_val in H1.
+  apply (semidefinite_sound _ _ z) in H2. rewrite form_triangle, total_app, !total_self in H2.
+  rewrite at_units, val_mul, val_opp, val_none in H2 by auto.
+  apply norm_below; [apply Rmult_le_pos; auto; apply norm_nonneg|].
+  replace (val kap * norm (at_ ST z) * (val kap * norm (at_ ST z)))
+    with (val kap * val kap * (norm (at_ ST z) * norm (at_ ST z))) by ring.
+  rewrite norm_squared. lra.
+Qed.
+
+Lemma link_sound k l (radii : list num) (c : chain) :
+  link_ok m p s (basis w) (ball_basis w) (products (basis w)) k l = true -> (k < steps p)%nat ->
+  (radii = tube_radii s /\ c = of_tube l \/ radii = inlet_radii s /\ c = of_inlet l) ->
+  exists more, added s l (radius_at radii k) = Some more /\
+  val (reach c) + val more <= radius radii (S k) /\ 0 <= val (kappa l) /\
+  Forall (fun g => 0 <= val g) (curvature l) /\
+  (forall xi, length xi = n -> size s k xi <= radius radii k ->
+    norm (at_ (scale_at s (S k)) (fbar k xi)) <= val (reach c)) /\
+  (forall xi y, length xi = n -> length y = n -> size s k xi <= radius radii k ->
+    size s k y <= val (bound s) ->
+    norm (minus (bent k (plus xi y)) (bent k xi)) <= val (stretched s l (radius_at radii k)) * size s k y).
+Proof.
+  intros H Hk Hc. unfold link_ok in H. cbn zeta in H.
+  set (T := frame l) in *. set (zs := fstate n) in *. set (xs := flinear T zs) in *.
+  set (g := flinear (scale_at s (S k)) (fmoved m p k xs)) in *.
+  set (y0 := flinear (scale_at s k) xs) in *. set (q := match assumed_form s with Response => _ | _ => _ end) in *.
+  apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [H1 HK]. apply andb_prop in H1 as [HT HE].
+  apply andb_prop in H2 as [HC H2]. apply andb_prop in H2 as [H2 H3].
+  assert (Hch : chain_ok s (basis w) (ball_basis w) (products (basis w)) k l (fdot g g) (fdot y0 y0) radii c = true).
+  { destruct Hc as [[-> ->]|[-> ->]]; auto. }
+  clear H2 H3. unfold chain_ok in Hch. cbn zeta in Hch.
+  destruct (expanded _ _ _) as [sigma|] eqn:Es; [|discriminate].
+  destruct (added s l (radius_at radii k)) as [more|] eqn:Ea; [|discriminate].
+  apply andb_prop in Hch as [B1 B2]. apply andb_prop in B1 as [B0 B1].
+  apply nonneg_val in B0. apply num_leb_le in B1. rewrite val_add in B1.
+  assert (Hr : 0 <= radius radii k).
+  { destruct (scale_facts k ltac:(lia)) as [_ [A B]]. destruct Hc as [[-> _]|[-> _]]; unfold radius, radius_at, nzero in *; lra. }
+  apply shaped_is in HT as [LT RT].
+  assert (Onto : forall xi, length xi = n -> exists z, length z = n /\ at_ T z = xi).
+  { intros xi Hxi. destruct (echelon_onto n T O HE ltac:(lia) RT xi ltac:(lia)) as [z [Lz Hz]].
+    exists z. split; [lia|]. exact (Hz [] eq_refl). }
+  assert (Means : forall z, length z = n ->
+    Forall2 (means z) xs (at_ T z) /\ Forall2 (means z) g (at_ (scale_at s (S k)) (fbar k (at_ T z))) /\
+    Forall2 (means z) y0 (at_ (scale_at s k) (at_ T z)) /\ Forall2 (means z) q (bent k (at_ T z))).
+  { intros z Hz. assert (A : Forall2 (means z) xs (at_ T z)).
+    { apply means_flinear. unfold zs. rewrite <- Hz. apply means_fstate. }
+    assert (B : Forall2 (means z) g (at_ (scale_at s (S k)) (fbar k (at_ T z)))).
+    { now apply means_flinear, means_fmoved. }
+    repeat split; auto; [now apply means_flinear|].
+    unfold q, bent. destruct (assumed_form s); auto. apply means_minus; auto.
+    now apply means_flinear, means_flinear. }
+  exists more. split; auto. split; [exact B1|].
+  assert (HK0 : 0 <= val (kappa l)) by (apply andb_prop in HK as [HK _]; now apply nonneg_val).
+  assert (Kap : forall z, length z = n -> norm z <= val (kappa l) * size s k (at_ T z)).
+  { intros z Hz. rewrite size_is, <- at_products. now apply (kappa_sound _ _ z HK). }
+  split; auto. split.
+  { destruct (Means (repeat 0 n) (repeat_length _ _)) as [_ [_ [_ M0]]].
+    now destruct (curvature_sound n q (curvature l) _ _ _ _ HC (repeat_length _ _) (repeat_length _ _) M0 M0). }
+  split.
+  - intros xi Hxi Hs. destruct (Onto xi Hxi) as [z [Lz <-]]. destruct (Means z Lz) as [_ [Mg [My _]]].
+    apply norm_below; auto.
+    destruct (expanded_val 0 (env z) _ _ _ _ ltac:(lra) Es) as [v [Hv Hv0]].
+    assert (P := is_nonneg_sound 0 (env z) _ _ _ _ _ ltac:(lra) B2
+      (means_sub _ _ _ _ _ _ (means_sub _ _ _ _ _ _ (means_fnum _ _ _) (means_fdot _ _ _ _ _ _ Mg Mg))
+        (means_mul _ _ _ _ _ _ Hv (means_sub _ _ _ _ _ _ (means_fnum _ _ _) (means_fdot _ _ _ _ _ _ My My))))).
+    rewrite !val_mul in P.
+    rewrite size_is in Hs. rewrite <- (norm_squared (at_ (scale_at s k) (at_ T z))) in P.
+    set (a := norm (at_ (scale_at s k) (at_ T z))) in *.
+    pose proof (norm_nonneg (at_ (scale_at s k) (at_ T z))) as Ha. fold a in Ha.
+    change (val (radius_at radii k)) with (radius radii k) in P.
+    assert (D : 0 <= radius radii k * radius radii k - a * a).
+    { pose proof (Rmult_le_compat a _ a _ Ha Ha Hs Hs). lra. }
+    pose proof (Rmult_le_pos _ _ Hv0 D). lra.
+  - intros xi y Hxi Hy Hs Hb. destruct (Onto xi Hxi) as [z [Lz <-]]. destruct (Onto y Hy) as [u [Lu <-]].
+    rewrite <- at_plus by congruence.
+    assert (Lzu : length (plus z u) = n) by (rewrite plus_length; congruence).
+    destruct (Means z Lz) as [_ [_ [_ Mq]]]. destruct (Means _ Lzu) as [_ [_ [_ Mq']]].
+    destruct (curvature_sound n q (curvature l) _ _ _ _ HC Lz Lzu Mq Mq') as [Hg C].
+    eapply Rle_trans; [exact C|].
+    assert (E : minus (plus z u) z = u).
+    { clear - Lz Lu. revert u Lu. rewrite <- Lz. clear Lz. induction z as [|a z IH]; intros [|b u] L;
+        try discriminate; auto. cbn. unfold minus, plus in IH. rewrite IH by (now injection L). f_equal. ring. }
+    rewrite E. clear E C.
+    pose proof (Kap z Lz) as Nz. pose proof (Kap u Lu) as Nu. pose proof (norm_nonneg z) as N0.
+    pose proof (norm_nonneg (plus z u)). pose proof (norm_nonneg u).
+    pose proof (norm_plus z u ltac:(congruence)) as Np.
+    set (su := size s k (at_ T u)) in *. set (sz := size s k (at_ T z)) in *.
+    assert (0 <= su) by (unfold su; rewrite size_is; apply norm_nonneg).
+    assert (0 <= sz) by (unfold sz; rewrite size_is; apply norm_nonneg).
+    unfold stretched. rewrite val_mul, nstretch_val, val_add, !val_mul.
+    change (val (radius_at radii k)) with (radius radii k).
+    set (kap := val (kappa l)) in *.
+    assert (A1 : norm z <= kap * radius radii k).
+    { eapply Rle_trans; [exact Nz|]. now apply Rmult_le_compat_l. }
+    assert (A2 : norm u <= kap * val (bound s)).
+    { eapply Rle_trans; [exact Nu|]. now apply Rmult_le_compat_l. }
+    eapply Rle_trans.
+    { apply Rmult_le_compat_l; auto. apply (stretch_mono (curvature l) 1 _ _
+        (kap * radius radii k + kap * val (bound s)) (kap * radius radii k)); auto; lra. }
+    set (st := stretch _ _ _ _).
+    assert (0 <= st).
+    { unfold st. clear - Hg A1 A2 N0 H0. generalize 1%nat as j.
+      assert (0 <= kap * radius radii k) by lra. assert (0 <= kap * val (bound s)) by lra.
+      induction Hg; intros j; cbn; [lra|]. apply Rplus_le_le_0_compat; auto. apply Rmult_le_pos; auto.
+      apply spread_nonneg; lra. }
+    replace (kap * st * su) with (kap * su * st) by ring. now apply Rmult_le_compat_r.
+Qed.
+End Stepwise.
