@@ -199,7 +199,7 @@ Lemma link_sound k l (radii : list num) (c : chain) :
   (radii = tube_radii s /\ c = of_tube l \/ radii = inlet_radii s /\ c = of_inlet l) ->
   exists more, added s l (radius_at radii k) = Some more /\
   val (reach c) + val more <= radius radii (S k) /\ 0 <= val (kappa l) /\
-  Forall (fun g => 0 <= val g) (curvature l) /\
+  0 <= val (stretched s l (radius_at radii k)) /\
   (forall xi, length xi = n -> size s k xi <= radius radii k ->
     norm (at_ (scale_at s (S k)) (fbar k xi)) <= val (reach c)) /\
   (forall xi y, length xi = n -> length y = n -> size s k xi <= radius radii k ->
@@ -239,9 +239,17 @@ Proof.
   assert (HK0 : 0 <= val (kappa l)) by (apply andb_prop in HK as [HK _]; now apply nonneg_val).
   assert (Kap : forall z, length z = n -> norm z <= val (kappa l) * size s k (at_ T z)).
   { intros z Hz. rewrite size_is, <- at_products. now apply (kappa_sound _ _ z HK). }
-  split; auto. split.
+  pose proof bound_nonneg as Hbound.
+  assert (Hg : Forall (fun g => 0 <= val g) (curvature l)).
   { destruct (Means (repeat 0 n) (repeat_length _ _)) as [_ [_ [_ M0]]].
     now destruct (curvature_sound n q (curvature l) _ _ _ _ HC (repeat_length _ _) (repeat_length _ _) M0 M0). }
+  assert (Hst : 0 <= stretch 1 (curvature l) (val (kappa l) * radius radii k + val (kappa l) * val (bound s))
+      (val (kappa l) * radius radii k)).
+  { pose proof (Rmult_le_pos _ _ HK0 Hr). pose proof (Rmult_le_pos _ _ HK0 Hbound).
+    clear - Hg H H0. generalize 1%nat as j. induction Hg; intros j; cbn; [lra|].
+    apply Rplus_le_le_0_compat; auto. apply Rmult_le_pos; auto. apply spread_nonneg; lra. }
+  split; auto. split.
+  { unfold stretched. rewrite val_mul, nstretch_val, val_add, !val_mul. now apply Rmult_le_pos. }
   split.
   - intros xi Hxi Hs. destruct (Onto xi Hxi) as [z [Lz <-]]. destruct (Means z Lz) as [_ [Mg [My _]]].
     apply norm_below; auto.
@@ -261,7 +269,7 @@ Proof.
     rewrite <- at_plus by congruence.
     assert (Lzu : length (plus z u) = n) by (rewrite plus_length; congruence).
     destruct (Means z Lz) as [_ [_ [_ Mq]]]. destruct (Means _ Lzu) as [_ [_ [_ Mq']]].
-    destruct (curvature_sound n q (curvature l) _ _ _ _ HC Lz Lzu Mq Mq') as [Hg C].
+    destruct (curvature_sound n q (curvature l) _ _ _ _ HC Lz Lzu Mq Mq') as [_ C].
     eapply Rle_trans; [exact C|].
     assert (E : minus (plus z u) z = u).
     { clear - Lz Lu. revert u Lu. rewrite <- Lz. clear Lz. induction z as [|a z IH]; intros [|b u] L;
@@ -283,12 +291,133 @@ Proof.
     eapply Rle_trans.
     { apply Rmult_le_compat_l; auto. apply (stretch_mono (curvature l) 1 _ _
         (kap * radius radii k + kap * val (bound s)) (kap * radius radii k)); auto; lra. }
-    set (st := stretch _ _ _ _).
-    assert (0 <= st).
-    { unfold st. clear - Hg A1 A2 N0 H0. generalize 1%nat as j.
-      assert (0 <= kap * radius radii k) by lra. assert (0 <= kap * val (bound s)) by lra.
-      induction Hg; intros j; cbn; [lra|]. apply Rplus_le_le_0_compat; auto. apply Rmult_le_pos; auto.
-      apply spread_nonneg; lra. }
+    set (st := stretch _ _ _ _) in *.
     replace (kap * st * su) with (kap * su * st) by ring. now apply Rmult_le_compat_r.
+Qed.
+
+(* Motions. *)
+Lemma plus_minus a b : length a = length b -> plus b (minus a b) = a.
+Proof.
+  revert b. unfold plus, minus. induction a as [|x a IH]; intros [|y b] L; try discriminate; auto.
+  cbn. rewrite IH by (now injection L). f_equal. ring.
+Qed.
+Lemma plus_comm a : forall b, plus a b = plus b a.
+Proof.
+  unfold plus. induction a as [|x a IH]; intros [|y b]; auto. cbn. rewrite IH. f_equal. ring.
+Qed.
+Lemma motion_length x d : motion m p x d -> forall k, (k <= steps p)%nat -> length (x k) = n.
+Proof.
+  intros [H0 H] [|k] Hk; auto. destruct (H k ltac:(lia)) as [Ld ->].
+  rewrite plus_length; rewrite maps_length; auto.
+Qed.
+Lemma off_length x d k : motion m p x d -> (k <= steps p)%nat -> length (off p k (x k)) = n.
+Proof.
+  intros H Hk. unfold off. pose proof (motion_length x d H k Hk).
+  rewrite minus_length; auto. now rewrite row_states.
+Qed.
+Lemma off_next x d k : motion m p x d -> (k < steps p)%nat ->
+  length (d k) = n /\ off p (S k) (x (S k)) = plus (fbar k (off p k (x k))) (d k).
+Proof.
+  intros Hm Hk. pose proof (motion_length x d Hm k ltac:(lia)) as Lx. destruct Hm as [_ H].
+  destruct (H k Hk) as [Ld E]. split; auto. unfold off at 1. rewrite E, minus_plus_left.
+  - unfold fbar. assert (G : plus (row k (states p)) (off p k (x k)) = x k).
+    { apply plus_minus. now rewrite row_states by lia. }
+    rewrite G. reflexivity.
+  - rewrite maps_length, row_states by lia. reflexivity.
+  - now rewrite maps_length.
+Qed.
+Lemma size_plus k a b : length a = length b -> size s k (plus a b) <= size s k a + size s k b.
+Proof.
+  intros L. rewrite !size_is, at_plus by auto. apply norm_plus. now rewrite !at_length.
+Qed.
+Lemma size_nonneg k z : 0 <= size s k z.
+Proof. apply norm_nonneg. Qed.
+
+Definition a_chain (radii : list num) : Prop := radii = tube_radii s \/ radii = inlet_radii s.
+Lemma chain_step radii k : a_chain radii -> (k < steps p)%nat -> exists b l more,
+  added s l (radius_at radii k) = Some more /\ b + val more <= radius radii (S k) /\
+  0 <= val (stretched s l (radius_at radii k)) /\
+  (forall xi, length xi = n -> size s k xi <= radius radii k ->
+    norm (at_ (scale_at s (S k)) (fbar k xi)) <= b) /\
+  (forall xi y, length xi = n -> length y = n -> size s k xi <= radius radii k ->
+    size s k y <= val (bound s) ->
+    norm (minus (bent k (plus xi y)) (bent k xi)) <= val (stretched s l (radius_at radii k)) * size s k y).
+Proof.
+  intros Hr Hk. destruct parts as [_ [_ [_ L]]]. destruct (L k Hk) as [l Hl].
+  assert (C : exists c, radii = tube_radii s /\ c = of_tube l \/ radii = inlet_radii s /\ c = of_inlet l).
+  { destruct Hr as [->| ->]; eauto. }
+  destruct C as [c C]. destruct (link_sound k l radii c Hl Hk C) as [more [A [B [_ D]]]].
+  exists (val (reach c)), l, more. auto.
+Qed.
+
+Lemma stays_peak radii x d : a_chain radii -> assumed_form s = Peak -> motion m p x d ->
+  size s O (off p O (x O)) <= radius radii O -> forall k, (k <= steps p)%nat ->
+  (forall j, (j < k)%nat -> size s (S j) (d j) <= val (bound s)) ->
+  size s k (off p k (x k)) <= radius radii k.
+Proof.
+  intros Hc Hf Hm H0. induction k as [|k IH]; intros Hk Hd; auto.
+  destruct (chain_step radii k Hc ltac:(lia)) as [b [l [more [A [B [_ [C _]]]]]]].
+  unfold added in A. rewrite Hf in A. injection A as <-.
+  specialize (IH ltac:(lia) (fun j Hj => Hd j (Nat.lt_lt_succ_r _ _ Hj))).
+  destruct (off_next x d k Hm ltac:(lia)) as [Ld ->].
+  pose proof (off_length x d k Hm ltac:(lia)) as Lo.
+  eapply Rle_trans. { apply size_plus. now rewrite fbar_length by lia. }
+  pose proof (C _ Lo IH) as D. rewrite <- size_is in D. pose proof (Hd k ltac:(lia)). lra.
+Qed.
+
+Lemma response_length d k : (forall j, (j < k)%nat -> length (d j) = n) -> (k <= steps p)%nat ->
+  length (response m s d k) = n.
+Proof.
+  intros Hd Hk. destruct k as [|k]; [apply repeat_length|]. cbn [response].
+  assert (L : length (times k (responses s) (response m s d k)) = n).
+  { change (length (at_ (nth k (responses s) []) (response m s d k)) = n).
+    rewrite at_length. apply response_shape. lia. }
+  rewrite plus_length; auto. now rewrite L, Hd by lia.
+Qed.
+Lemma stays_response radii x d : a_chain radii -> assumed_form s = Response -> motion m p x d ->
+  size s O (off p O (x O)) <= radius radii O -> forall k, (k <= steps p)%nat ->
+  (forall j, (j <= k)%nat -> size s j (response m s d j) <= val (bound s)) ->
+  size s k (minus (off p k (x k)) (response m s d k)) <= radius radii k.
+Proof.
+  intros Hc Hf Hm H0.
+  assert (Ld : forall k, (k < steps p)%nat -> length (d k) = n).
+  { intros k Hk. now destruct (off_next x d k Hm Hk). }
+  induction k as [|k IH]; intros Hk Hd.
+  { cbn [response]. replace (minus _ _) with (off p O (x O)); auto.
+    pose proof (off_length x d O Hm ltac:(lia)) as L. unfold minus. fold n. rewrite <- L.
+    clear. induction (off p O (x O)) as [|a l IH]; auto. cbn. rewrite <- IH. f_equal. ring. }
+  destruct (chain_step radii k Hc ltac:(lia)) as [b [l [more [A [B [S0 [C D]]]]]]].
+  unfold added in A. rewrite Hf in A. injection A as <-. rewrite val_mul in B.
+  specialize (IH ltac:(lia) (fun j Hj => Hd j ltac:(lia))).
+  destruct (off_next x d k Hm ltac:(lia)) as [Ldk ->].
+  pose proof (off_length x d k Hm ltac:(lia)) as Lo.
+  pose proof (response_length d k (fun j Hj => Ld j ltac:(lia)) ltac:(lia)) as Lr.
+  set (o := off p k (x k)) in *. set (r := response m s d k) in *. cbn [response]. fold r.
+  assert (LA : length (times k (responses s) r) = n).
+  { change (length (at_ (nth k (responses s) []) r) = n). rewrite at_length. apply response_shape. lia. }
+  pose proof (fbar_length k o ltac:(lia)) as LF.
+  rewrite minus_plus by congruence.
+  set (xi := minus o r) in *. assert (Lxi : length xi = n) by (unfold xi; rewrite minus_length; congruence).
+  assert (Eo : plus xi r = o).
+  { unfold xi. rewrite plus_comm. apply plus_minus. congruence. }
+  pose proof (Hd k ltac:(lia)) as Hrk. fold r in Hrk.
+  specialize (C xi Lxi IH). specialize (D xi r Lxi Lr IH Hrk). rewrite Eo in D.
+  pose proof (fbar_length k xi ltac:(lia)) as LFx.
+  rewrite size_is, at_minus by congruence. unfold bent in D. rewrite Hf in D.
+  rewrite <- Eo in D at 2.
+  change (times k (responses s) ?v) with (at_ (nth k (responses s) []) v) in *.
+  rewrite at_plus in D by congruence.
+  set (M := scale_at s (S k)) in *. set (AA := nth k (responses s) []) in *.
+  rewrite at_plus in D by (rewrite !at_length; reflexivity).
+  assert (E : minus (at_ M (fbar k o)) (at_ M (at_ AA r)) =
+    plus (at_ M (fbar k xi)) (minus (minus (at_ M (fbar k o)) (plus (at_ M (at_ AA xi)) (at_ M (at_ AA r))))
+      (minus (at_ M (fbar k xi)) (at_ M (at_ AA xi))))).
+  { apply (nth_ext _ _ 0 0).
+    - repeat first [rewrite plus_length | rewrite minus_length | rewrite at_length]; auto.
+    - intros i _. repeat first [rewrite nth_plus | rewrite nth_minus];
+        repeat first [rewrite plus_length | rewrite minus_length | rewrite at_length]; auto. ring. }
+  rewrite E. eapply Rle_trans.
+  { apply norm_plus. repeat first [rewrite plus_length | rewrite minus_length | rewrite at_length]; auto. }
+  pose proof (Rmult_le_compat_l _ _ _ S0 Hrk). lra.
 Qed.
 End Stepwise.
