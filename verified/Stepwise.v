@@ -420,4 +420,236 @@ Proof.
   { apply norm_plus. repeat first [rewrite plus_length | rewrite minus_length | rewrite at_length]; auto. }
   pose proof (Rmult_le_compat_l _ _ _ S0 Hrk). lra.
 Qed.
+
+(* The motion that the disturbance would not have. *)
+Fixpoint alone (x0 : list R) (k : nat) : list R :=
+  match k with O => x0 | S j => fbar j (alone x0 j) end.
+Lemma alone_length x0 k : length x0 = n -> (k <= steps p)%nat -> length (alone x0 k) = n.
+Proof. intros H Hk. destruct k; auto. apply fbar_length. lia. Qed.
+Lemma mixed a delta mu c lam E : 0 <= a -> 0 <= delta -> 0 <= mu -> 1 <= c -> 0 <= lam -> a * a <= E ->
+  c * (mu * mu) <= (c - 1) * lam -> (mu * a + delta) * (mu * a + delta) <= lam * E + c * delta ^ 2.
+Proof.
+  intros Ha Hd Hm Hc Hl HE H.
+  assert (Haa : 0 <= a * a) by now apply Rmult_le_pos.
+  assert (Hdd : 0 <= delta * delta) by now apply Rmult_le_pos.
+  assert (U : 0 <= lam * (a * a)) by now apply Rmult_le_pos.
+  assert (W : 0 <= c * (c - 1) * (delta * delta)).
+  { apply Rmult_le_pos; auto. apply Rmult_le_pos; lra. }
+  assert (D : 2 * c * mu * a * delta <= lam * (a * a) + c * (c - 1) * (delta * delta)).
+  { apply square_below; [lra|].
+    pose proof (Rmult_le_compat_l (4 * c * ((a * a) * (delta * delta))) _ _
+      ltac:(apply Rmult_le_pos; [lra|now apply Rmult_le_pos]) H) as G.
+    pose proof (Rle_0_sqr (lam * (a * a) - c * (c - 1) * (delta * delta))) as Q. unfold Rsqr in Q. lra. }
+  pose proof (Rmult_le_compat_r (a * a) _ _ Haa H) as G.
+  pose proof (Rmult_le_compat_l lam _ _ Hl HE) as G2.
+  apply (Rmult_le_reg_l c); [lra|].
+  pose proof (Rmult_le_compat_l c _ _ ltac:(lra) G2). cbn [pow]. lra.
+Qed.
+Lemma stays_energy radii x d : a_chain radii ->
+  (assumed_form s = Energy \/ assumed_form s = Fading) -> motion m p x d ->
+  size s O (off p O (x O)) <= radius radii O -> forall k, (k <= steps p)%nat ->
+  (forall j, (j <= k)%nat -> sqrt (energy s d j) <= val (bound s)) ->
+  let y := alone (off p O (x O)) k in
+  size s k y <= radius radii k /\
+  size s k (minus (off p k (x k)) y) * size s k (minus (off p k (x k)) y) <= energy s d k.
+Proof.
+  intros Hc Hf Hm H0. cbn zeta. pose proof (off_length x d O Hm ltac:(lia)) as L0.
+  assert (Gains : 1 <= val (weighs s) /\ 0 <= val (forgets_by s)).
+  { destruct parts as [_ [G _]]. unfold form_ok in G. apply andb_prop in G as [_ G].
+    assert (G' : andb (num_leb none (weighs s)) (nonneg (forgets_by s)) = true) by (destruct Hf as [E|E]; now rewrite E in G).
+    apply andb_prop in G' as [A B]. apply num_leb_le in A. rewrite val_none in A. split; auto. now apply nonneg_val. }
+  destruct Gains as [Gc Gl].
+  assert (Hbent : forall k v, bent k v = at_ (scale_at s (S k)) (fbar k v)).
+  { intros k v. unfold bent. destruct Hf as [E|E]; now rewrite E. }
+  induction k as [|k IH]; intros Hk Hd.
+  { cbn [alone energy]. split; auto.
+    assert (E : at_ (scale_at s O) (minus (off p O (x O)) (off p O (x O))) = minus (at_ (scale_at s O) (off p O (x O))) (at_ (scale_at s O) (off p O (x O)))).
+    { now apply at_minus. }
+    rewrite size_is, norm_squared, E. generalize (at_ (scale_at s O) (off p O (x O))). clear.
+    unfold minus. induction l as [|a l IH]; cbn; [lra|]. replace (a - a) with 0 by ring. lra. }
+  destruct (chain_step radii k Hc ltac:(lia)) as [b [l [more [A [B [S0 [C D]]]]]]].
+  unfold added in A.
+  assert (A' : num_leb (nmul (weighs s) (nmul (stretched s l (radius_at radii k)) (stretched s l (radius_at radii k))))
+      (nmul (nsub (weighs s) none) (forgets_by s)) = true /\ more = nzero).
+  { destruct Hf as [E|E]; rewrite E in A; destruct (num_leb _ _); try discriminate; injection A as <-; auto. }
+  clear A. destruct A' as [A ->]. apply num_leb_le in A. rewrite !val_mul, val_sub, val_none in A.
+  rewrite val_nzero in B.
+  destruct (IH ltac:(lia) (fun j Hj => Hd j ltac:(lia))) as [I1 I2]. clear IH.
+  destruct (off_next x d k Hm ltac:(lia)) as [Ldk ->].
+  pose proof (off_length x d k Hm ltac:(lia)) as Lo.
+  pose proof (alone_length (off p O (x O)) k L0 ltac:(lia)) as Ly.
+  cbn [alone]. set (y := alone (off p O (x O)) k) in *. set (o := off p k (x k)) in *.
+  pose proof (fbar_length k y ltac:(lia)) as LFy. pose proof (fbar_length k o ltac:(lia)) as LFo.
+  pose proof (C y Ly I1) as Cy. split. { rewrite size_is. lra. }
+  set (e := minus o y) in *. assert (Le : length e = n) by (unfold e; rewrite minus_length; congruence).
+  assert (Eo : plus y e = o) by (apply plus_minus; congruence).
+  set (a := size s k e) in *. assert (Ha : 0 <= a) by apply size_nonneg.
+  assert (Hb : a <= val (bound s)).
+  { apply Rle_trans with (sqrt (energy s d k)); [|apply Hd; lia].
+    rewrite <- (sqrt_square a) by auto. now apply sqrt_le_1_alt. }
+  specialize (D y e Ly Le I1 Hb). rewrite Eo, !Hbent in D. rewrite <- at_minus in D by congruence.
+  rewrite minus_plus_left by congruence.
+  assert (T : size s (S k) (plus (minus (fbar k o) (fbar k y)) (d k))
+      <= val (stretched s l (radius_at radii k)) * a + size s (S k) (d k)).
+  { eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
+    apply Rplus_le_compat_r. rewrite size_is. exact D. }
+  pose proof (size_nonneg (S k) (plus (minus (fbar k o) (fbar k y)) (d k))) as T0.
+  pose proof (Rmult_le_compat _ _ _ _ T0 T0 T T) as TT. eapply Rle_trans; [exact TT|].
+  cbn [energy]. apply mixed; auto. apply size_nonneg.
+Qed.
+
+(* Any form: the radius, widened. *)
+Lemma adds_val : val (adds s) = widened s.
+Proof. unfold adds, widened. destruct (assumed_form s); auto. apply val_nzero. Qed.
+Theorem stays_within radii x d : a_chain radii -> motion m p x d ->
+  size s O (off p O (x O)) <= radius radii O -> forall k, (k <= steps p)%nat -> assumed m s d k ->
+  size s k (off p k (x k)) <= radius radii k + widened s.
+Proof.
+  intros Hc Hm H0 k Hk Ha. pose proof (off_length x d k Hm Hk) as Lo.
+  pose proof (off_length x d O Hm ltac:(lia)) as L0. unfold assumed, widened in *.
+  destruct (assumed_form s) eqn:Hf.
+  - pose proof (stays_response radii x d Hc Hf Hm H0 k Hk Ha) as H. pose proof (Ha k ltac:(lia)) as Hr.
+    assert (Lr : length (response m s d k) = n).
+    { apply response_length; auto. intros j Hj. now destruct (off_next x d j Hm ltac:(lia)). }
+    rewrite <- (plus_minus (off p k (x k)) (response m s d k)) by congruence.
+    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. } lra.
+  - pose proof (stays_peak radii x d Hc Hf Hm H0 k Hk Ha). lra.
+  - destruct (stays_energy radii x d Hc (or_introl Hf) Hm H0 k Hk Ha) as [A B].
+    set (y := alone _ k) in *. assert (Ly : length y = n) by (apply alone_length; auto).
+    rewrite <- (plus_minus (off p k (x k)) y) by congruence.
+    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
+    apply Rplus_le_compat; auto. apply Rle_trans with (sqrt (energy s d k)); [|apply Ha; lia].
+    rewrite <- (sqrt_square (size _ _ _)) by apply size_nonneg. now apply sqrt_le_1_alt.
+  - destruct (stays_energy radii x d Hc (or_intror Hf) Hm H0 k Hk Ha) as [A B].
+    set (y := alone _ k) in *. assert (Ly : length y = n) by (apply alone_length; auto).
+    rewrite <- (plus_minus (off p k (x k)) y) by congruence.
+    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
+    apply Rplus_le_compat; auto. apply Rle_trans with (sqrt (energy s d k)); [|apply Ha; lia].
+    rewrite <- (sqrt_square (size _ _ _)) by apply size_nonneg. now apply sqrt_le_1_alt.
+Qed.
+
+(* The box of the data, and the half-widths. *)
+Lemma fits_sound S sz rm g z : fits_in S sz rm g = true -> 0 <= val sz ->
+  0 <= val rm /\ Rabs (dot (map val g) z) * val sz <= val rm * norm (at_ S z).
+Proof.
+  intros H Hs. apply andb_prop in H as [H1 H2]. apply nonneg_val in H1. split; auto.
+  apply (semidefinite_sound _ _ z) in H2. rewrite form_triangle in H2. cbn [total] in H2.
+  rewrite total_self, dot_vscale, !val_mul, val_opp, val_mul in H2.
+  pose proof (norm_nonneg (at_ S z)). pose proof (Rabs_pos (dot (map val g) z)).
+  apply square_below; [now apply Rmult_le_pos|].
+  assert (E : Rabs (dot (map val g) z) * Rabs (dot (map val g) z) = dot (map val g) z * dot (map val g) z).
+  { rewrite <- Rabs_mult. apply Rabs_right, Rle_ge. apply (Rle_0_sqr (dot (map val g) z)). }
+  replace (Rabs (dot (map val g) z) * val sz * (Rabs (dot (map val g) z) * val sz))
+    with (Rabs (dot (map val g) z) * Rabs (dot (map val g) z) * (val sz * val sz)) by ring.
+  rewrite E. replace (val rm * norm (at_ S z) * (val rm * norm (at_ S z)))
+    with (val rm * val rm * (norm (at_ S z) * norm (at_ S z))) by ring.
+  rewrite norm_squared. lra.
+Qed.
+Lemma all_widths S sz z : 0 <= val sz -> forall rows widths,
+  forallb (fun e => fits_in S sz (snd e) (fst e)) (combine rows widths) = true ->
+  length rows = length widths -> forall i, (i < length rows)%nat ->
+  0 <= nth i (map val widths) 0 /\
+  Rabs (nth i (at_ rows z) 0) * val sz <= nth i (map val widths) 0 * norm (at_ S z).
+Proof.
+  intros Hs. induction rows as [|g rows IH]; intros [|rm widths] H L i Hi; try discriminate; [cbn in Hi; lia|].
+  cbn in H. apply andb_prop in H as [A B].
+  change (at_ (g :: rows) z) with (dot (map val g) z :: at_ rows z). destruct i as [|i]; cbn [nth map].
+  - now apply fits_sound.
+  - apply IH; auto. cbn in Hi. lia.
+Qed.
+Lemma all_ranges S sz z : 0 < val sz -> norm (at_ S z) <= val sz -> forall rows centres ends,
+  forallb (fun e => fits_in S sz (room (snd (fst e)) (snd e)) (fst (fst e)))
+    (combine (combine rows centres) ends) = true ->
+  length rows = length centres -> length centres = length ends ->
+  in_box (plus (map val centres) (at_ rows z)) ends /\ in_box (minus (map val centres) (at_ rows z)) ends.
+Proof.
+  intros Hs Hz. induction rows as [|g rows IH]; intros [|c centres] [|[lo hi] ends] H L1 L2; try discriminate.
+  { split; constructor. }
+  cbn in H. apply andb_prop in H as [A B]. injection L1 as L1. injection L2 as L2.
+  destruct (IH centres ends B L1 L2) as [P Q]. clear IH B.
+  destruct (fits_sound _ _ _ _ z A ltac:(lra)) as [R0 R1].
+  assert (W : Rabs (dot (map val g) z) <= val (room c (lo, hi))).
+  { apply (Rmult_le_reg_r (val sz)); auto. eapply Rle_trans; [exact R1|]. now apply Rmult_le_compat_l. }
+  unfold room in W. cbn [fst snd] in W.
+  destruct (nmin_below (nsub hi c) (nsub c lo)) as [M1 M2]. rewrite !val_sub in M1, M2.
+  pose proof (Rle_abs (dot (map val g) z)) as G1. pose proof (Rle_abs (- dot (map val g) z)) as G2.
+  rewrite Rabs_Ropp in G2.
+  change (at_ (g :: rows) z) with (dot (map val g) z :: at_ rows z).
+  split; constructor; auto; cbn [fst snd]; lra.
+Qed.
+
+Lemma sample_sound k x d radii : a_chain radii -> motion m p x d -> (k <= steps p)%nat ->
+  size s k (off p k (x k)) <= radius radii k + widened s ->
+  in_data m p k (x k) /\
+  forall i, (i < n)%nat -> 0 <= nth i (row k (half_widths s)) 0 /\
+    Rabs (nth i (off p k (x k)) 0) * (radius (tube_radii s) k + widened s)
+      <= nth i (row k (half_widths s)) 0 * size s k (off p k (x k)).
+Proof.
+  intros Hc Hm Hk Hz. pose proof (off_length x d k Hm Hk) as Lo.
+  pose proof (motion_length x d Hm k Hk) as Lx.
+  destruct parts as [Z1 [_ [S1 _]]]. specialize (S1 k Hk). unfold sample_ok in S1. cbn zeta in S1.
+  destruct (scale_facts k Hk) as [_ [T0 I0]]. pose proof bound_nonneg as B0.
+  assert (W0 : 0 <= widened s) by (unfold widened; destruct (assumed_form s); lra).
+  apply andb_prop in S1 as [_ S1]. apply andb_prop in S1 as [Hw S1]. apply andb_prop in S1 as [Hx Hu].
+  set (t := nadd (radius_at (tube_radii s) k) (adds s)) in *.
+  set (i0 := nadd (radius_at (inlet_radii s) k) (adds s)) in *.
+  assert (Vt : val t = radius (tube_radii s) k + widened s) by (unfold t; now rewrite val_add, adds_val).
+  assert (Vi : val i0 = radius (inlet_radii s) k + widened s) by (unfold i0; now rewrite val_add, adds_val).
+  change (val (radius_at ?l k)) with (radius l k) in T0, I0.
+  set (most := if num_ltb t i0 then i0 else t) in *.
+  assert (Most : val t <= val most /\ val i0 <= val most).
+  { unfold most. destruct (num_ltb t i0) eqn:E; [apply num_ltb_lt in E|apply num_ltb_not in E]; lra. }
+  assert (Hmost : norm (at_ (scale_at s k) (off p k (x k))) <= val most).
+  { rewrite <- size_is. destruct Hc as [-> | ->]; lra. }
+  assert (Pm : 0 < val most) by lra.
+  unfold sizes_ok in Z1. apply andb_prop in Z1 as [Z0 Z1]. apply andb_prop in Z1 as [Z1 Z2].
+  apply andb_prop in Z1 as [Z1 Z3]. apply andb_prop in Z1 as [Zu Zx]. apply andb_prop in Z3 as [Zf Zfs].
+  apply andb_prop in Z2 as [Z2 _]. apply andb_prop in Z2 as [_ Z2]. apply andb_prop in Z2 as [Zw _].
+  assert (Lunits : forall j, length (units j) = j) by (induction j; cbn; auto; now rewrite map_length, IHj).
+  assert (Lrow : forall a b (M : matrix) j, shaped a b M = true -> (j < a)%nat -> length (nth j M []) = b).
+  { intros a b M j H Hj. apply shaped_is in H as [L H]. apply H, nth_In. lia. }
+  split; [split|].
+  - destruct (all_ranges _ _ _ Pm Hmost _ _ _ Hx) as [P _].
+    + rewrite Lunits. symmetry. apply (Lrow _ _ _ _ Zx). lia.
+    + apply (Lrow _ _ _ _ Zx). lia.
+    + rewrite at_units in P by auto. unfold off in P. rewrite plus_minus in P; [exact P|].
+      now rewrite row_states.
+  - intros Hlt. destruct (Nat.ltb_spec k (steps p)) as [_|]; [|lia].
+    assert (Lf : length (nth k (feedback p) []) = length (u_range m)).
+    { apply Nat.eqb_eq in Zf. rewrite forallb_forall in Zfs.
+      assert (Hin : In (nth k (feedback p) []) (feedback p)) by (apply nth_In; lia).
+      apply Zfs, shaped_is in Hin. apply Hin. }
+    destruct (all_ranges _ _ _ Pm Hmost _ _ _ Hu) as [_ P].
+    + rewrite Lf. symmetry. now apply (Lrow _ _ _ _ Zu).
+    + now apply (Lrow _ _ _ _ Zu).
+    + exact P.
+  - intros i Hi. rewrite <- Vt. rewrite size_is.
+    rewrite <- (at_units (off p k (x k)) n Lo) at 1.
+    assert (Pt : 0 <= val t) by lra. apply (all_widths _ _ _ Pt _ _ Hw).
+    + rewrite Lunits. symmetry. apply (Lrow _ _ _ _ Zw). lia.
+    + now rewrite Lunits.
+Qed.
+
+Theorem tube_stays : stays_in_tube m p s.
+Proof.
+  intros x d Hm H0 k Hk Ha. assert (Hc : a_chain (tube_radii s)) by now left.
+  pose proof (stays_within _ x d Hc Hm H0 k Hk Ha) as H.
+  destruct (sample_sound k x d _ Hc Hm Hk H) as [A B]. repeat split; auto; try apply A.
+  intros i Hi. destruct (B i Hi) as [W0 W]. destruct (scale_facts k Hk) as [_ [T0 _]].
+  change (val (radius_at ?l k)) with (radius l k) in T0. pose proof bound_nonneg as B0.
+  assert (0 <= widened s) by (unfold widened; destruct (assumed_form s); lra).
+  apply (Rmult_le_reg_r (radius (tube_radii s) k + widened s)); [lra|].
+  eapply Rle_trans; [exact W|]. now apply Rmult_le_compat_l.
+Qed.
+Theorem inlet_arrives : arrives_from_inlet m p s.
+Proof.
+  intros x d Hm H0 k Hk Ha. assert (Hc : a_chain (inlet_radii s)) by now right.
+  pose proof (stays_within _ x d Hc Hm H0 k Hk Ha) as H.
+  destruct (sample_sound k x d _ Hc Hm Hk H) as [A B]. repeat split; auto; try apply A.
+  intros i Hi. destruct (B i Hi) as [W0 W]. eapply Rle_trans; [exact W|]. now apply Rmult_le_compat_l.
+Qed.
 End Stepwise.
+
+Theorem sampled_theorem {K : Ints} m p s w : sampled_ok m p s w = true ->
+  stays_in_tube m p s /\ arrives_from_inlet m p s.
+Proof. intros H. split; [exact (tube_stays m p s w H)|exact (inlet_arrives m p s w H)]. Qed.
