@@ -258,7 +258,7 @@ def _squares(term: Made) -> dict[str, Any]:
     return {"unit": unit, "scale": scale, "weights": weights[0], "factors": rows}
 
 
-def sampled(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
+def sampled(terms: dict[str, Any], _files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
     """The files of a sampled funnel, and its proof."""
     exponents, coefficients, x_range, u_range = terms["model"].terms
     form, *numbers = terms["funnel"].terms

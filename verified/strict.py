@@ -587,7 +587,7 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
 
 
 def sampled(files: dict[str, tuple[str, Any]]) -> None:
-    """Raise Refused unless the files of a sampled funnel of an explicit model are as its page says."""
+    """Raise Refused unless the files of an explicit model's sampled funnel are as its page says."""
     model, policy, funnel, document = (
         files[role][1] for role in ("model", "policy", "funnel", "proof")
     )
