@@ -26,8 +26,8 @@ from nlsid_core import kernel, proofs, second
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
 from tests.core.kernel import mutations
-from tests.core.kernel.test_sampled_claims import one_step
-from tests.core.test_sampled_funnel import FORGERIES, forged
+from tests.core.kernel.sampled_claims import one_step
+from tests.forged_tracking import FORGERIES, forged
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
 from tests.tracked import designed
 from tests.tracked import write as write_design
