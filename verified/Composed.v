@@ -27,9 +27,6 @@ Definition stated_by (g : stage) : problem := stated (dynamics g) (control g) (t
 Section Composed.
 Context {K : Ints}.
 
-(* Division by a positive number. *)
-Definition ndiv (a b : num) : num :=
-  match fst b with Zpos q => ((fst a * Zpos (snd b))%Z, (snd a * q)%positive) | _ => nzero end.
 Definition starting (g : segment) : list num * list (list num) :=
   (map first_of (nominal g), map (map (fun e => ndiv e (level (start g)))) (shape (start g))).
 Definition aimed (d : problem) (g : segment) : problem :=
@@ -56,27 +53,24 @@ Definition composed_ok (gs : list stage) (ws : list witness) (lambdas : list num
     (andb (forallb (fun e => stage_ok (fst e) (snd e)) (combine gs ws))
       (joined (map stated_by gs) lambdas)).
 
-Lemma ndiv_val a b : 0 < val b -> val (ndiv a b) = val a / val b.
+Lemma first_positive a : 0 < val a -> (0 < fst a)%Z.
 Proof.
-  destruct a as [p q], b as [p' q']. unfold val, ndiv; cbn [fst snd]. intros H.
-  assert (0 < IZR (Zpos q')) by now apply IZR_lt. assert (0 < IZR (Zpos q)) by now apply IZR_lt.
-  assert (P : 0 < IZR p').
-  { apply (Rmult_lt_reg_r (/ IZR (Zpos q'))); [now apply Rinv_0_lt_compat|]. unfold Rdiv in H. lra. }
-  destruct p' as [|p'|p']; [lra| |].
-  - cbn [fst snd]. rewrite Pos2Z.inj_mul, !mult_IZR. field. lra.
-  - apply lt_IZR in P. lia.
+  intros H. apply lt_IZR, (Rmult_lt_reg_r (/ IZR (Zpos (snd a)))).
+  - now apply Rinv_0_lt_compat, IZR_lt.
+  - rewrite Rmult_0_l. exact H.
 Qed.
 Lemma form_divided rho k : 0 < val rho -> forall M y z, triangular k M ->
   form (map (map val) (map (map (fun e => ndiv e rho)) M)) y z * val rho = form (vals M) y z.
 Proof.
-  intros H. induction k as [|k IH]; intros [|row M] y z T; cbn [triangular] in T; try tauto.
+  intros H. pose proof (first_positive rho H) as Hp.
+  induction k as [|k IH]; intros [|row M] y z T; cbn [triangular] in T; try tauto.
   { cbn. ring. }
   destruct T as [L T]. destruct row as [|a b]; [discriminate|]. destruct y as [|y0 y], z as [|z0 z];
     cbn [map vals form]; try ring.
   assert (D : forall v, dot (map val (map (fun e => ndiv e rho) b)) v * val rho = dot (map val b) v).
-  { clear - H. induction b as [|b0 b IH]; intros [|v0 v]; cbn [map dot]; try ring.
-    rewrite ndiv_val by auto. rewrite <- (IH v). field. lra. }
-  specialize (IH M y z T). rewrite ndiv_val by auto. rewrite <- !D. unfold vals in *. rewrite <- IH.
+  { clear - H Hp. induction b as [|b0 b IH]; intros [|v0 v]; cbn [map dot]; try ring.
+    rewrite val_div by auto. rewrite <- (IH v). field. lra. }
+  specialize (IH M y z T). rewrite val_div by auto. rewrite <- !D. unfold vals in *. rewrite <- IH.
   field. lra.
 Qed.
 Lemma first_only gs g g1 rest : gs = g1 :: rest -> linked gs = true ->

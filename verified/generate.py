@@ -64,6 +64,23 @@ class Funnel:
         self.kappa = self.proof.get("kappa", [[]] * self.intervals)
 
 
+class Composition:
+    """The numbers of funnels that follow each other, and the multipliers between them."""
+
+    def __init__(self, document: Any, content: str, folder: Path) -> None:
+        self.files: Files = {"proof": (content, document)}
+        self.multipliers = strict.composition(document)
+        roles = [f"stage{i}" for i in range(1, len(self.multipliers) + 2)]
+        _bound(document["claim"]["about"], folder, " ".join(roles), self.files)
+        self.stages = []
+        for role in roles:
+            text, stage = self.files.pop(role)
+            if strict.proof_of(stage, role) != "continuous_funnel":
+                raise Refused(f"{role} should claim a continuous_funnel")
+            self.stages.append(Funnel(stage, text, folder))
+            self.files |= {f"{role}.{part}": file for part, file in self.stages[-1].files.items()}
+
+
 class Sampled:
     """The numbers of a sampled funnel of an explicit model, and its witnesses."""
 
@@ -210,6 +227,7 @@ class Coq:
     """Terms of Coq; what is defined is named."""
 
     def __init__(self, modules: str) -> None:
+        self.mark = ""  # before every name
         self.lines = [
             "(* Made by generate.py. The theorem is about the numbers below. *)",
             "From Coq Require Import ZArith Reals List Uint63.",
@@ -249,8 +267,8 @@ class Coq:
         return self.made(constructor, *terms)
 
     def named(self, name: str, term: str) -> str:
-        self.lines.append(f"Definition {name} := {term}.")
-        return name
+        self.lines.append(f"Definition {self.mark}{name} := {term}.")
+        return self.mark + name
 
 
 def shifted(n: int, p: int) -> list[list[Fraction]]:
@@ -473,6 +491,20 @@ class Writer:
         low, high = row
         return self.to.pair(self.num(low), self.num(high))
 
+    def composition(self, problem: Composition) -> None:
+        """What the theorem is about, stage by stage, and what is used to decide it."""
+        to, parts = self.to, ("field", "policy", "funnel", "goal")
+        stages, proofs = [], []
+        for i, stage in enumerate(problem.stages, start=1):
+            to.mark = f"stage{i}_"
+            self.problem(stage)
+            proofs.append(to.named("proof", self.witness(stage)))
+            stages.append(to.made("Stage", *(to.mark + part for part in parts)))
+        to.mark = ""
+        to.named("stages", to.listed(stages))
+        to.named("proofs", to.listed(proofs))
+        to.named("multipliers : list num", self.nums(problem.multipliers))
+
     def sampled(self, problem: Sampled) -> None:
         """What the theorem is about: model, policy, funnel."""
         to, model, policy, funnel = self.to, problem.model, problem.policy, problem.funnel
@@ -609,6 +641,13 @@ Theorem near_plan : Forall (stays_near_plan a b b0 c feedback) tubes.
 Proof. exact (plans_proved a b b0 c feedback tubes planned). Qed.
 Print Assumptions near_plan.
 """
+COMPOSED = """\
+Theorem accepted : composed_ok stages proofs multipliers = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem follow : composed (map stated_by stages).
+Proof. exact (composed_theorem stages proofs multipliers accepted). Qed.
+Print Assumptions follow.
+"""
 SAMPLED = """\
 Theorem accepted : sampled_ok model policy funnel proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
@@ -625,21 +664,20 @@ Print Assumptions stable.
 """
 
 
-Problem = Funnel | Increments | Sampled
+Problem = Funnel | Increments | Sampled | Composition
 
 
 def read(path: Path) -> Problem:
     """The numbers of a proof file of a kind that is covered."""
     content = path.read_bytes()
     document = _load(content, path.name)
-    strict.members(document, path.name, "format version claim proof")
-    strict.word(document["format"], "format", ["nlsid/proof"])
-    claim = document["claim"]
-    kind = claim.get("kind") if type(claim) is dict else None
+    kind = strict.proof_of(document, path.name)
     if kind in ("tube", "stability"):
         return Increments(document, content.decode(), path.parent)
     if kind == "sampled_funnel":
         return Sampled(document, content.decode(), path.parent)
+    if kind == "funnel_composition":
+        return Composition(document, content.decode(), path.parent)
     if kind != "continuous_funnel":
         raise NotCovered(f"claims of kind {kind} are not covered by the second kernel")
     return Funnel(document, content.decode(), path.parent)
@@ -653,6 +691,10 @@ def coq(problem: Problem) -> str:
         writer.problem(problem)
         to.named("proof", writer.witness(problem))
         return "\n".join(to.lines) + "\n" + THEOREM
+    if isinstance(problem, Composition):
+        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Composed Data")
+        Writer(to).composition(problem)
+        return "\n".join(to.lines) + "\n" + COMPOSED
     if isinstance(problem, Sampled):
         to = Coq("Integers Forms Polynomials Positive Claim Tubes Samples Steps Stepwise Data")
         writer = Writer(to)
@@ -692,6 +734,7 @@ ASKED = {
     "tube": "data tubes proofs",
     "stability": "data storage rate proof",
     "sampled": "model policy funnel proof",
+    "composed": "stages proofs multipliers",
 }
 
 
@@ -704,9 +747,10 @@ def words(terms: dict[str, Any]) -> str:
 def compared(problem: Problem, text: str) -> dict[str, Any]:
     """The terms of the theorem, which print as the files that it was made of."""
     terms = printed.read(text)
-    write = {Funnel: printed.funnel, Increments: printed.near, Sampled: printed.sampled}[
-        type(problem)
-    ]
+    write = {
+        Funnel: printed.funnel, Increments: printed.near, Sampled: printed.sampled,
+        Composition: printed.composed,
+    }[type(problem)]  # fmt: skip
     printed.differences(write(terms, problem.files), problem.files)
     return terms
 

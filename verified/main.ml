@@ -69,6 +69,9 @@ let rec tree () = match count () with
   | 1 -> let i = count () in let lower = tree () in Split (i, lower, tree ())
   | _ -> failwith "a tree"
 
+let stage () =
+  let dynamics = field () in let control = policy () in let tunnel = funnel () in
+  { dynamics; control; tunnel; aim = maybe (pair nums matrix) () }
 let map () =
   let powers0 = listed (fun () -> listed count) in let coefficients = matrix () in
   let x_range = listed ends in { powers0; coefficients; x_range; u_range = listed ends }
@@ -108,6 +111,8 @@ let () =
     | "stability" ->
       let m = model () in let storage = matrix () in let rate = num () in
       decide_stability m storage rate (tree ())
+    | "composed" ->
+      let gs = listed stage in let ws = listed witness in decide_composed gs ws (nums ())
     | "sampled" ->
       let m = map () in let p = track () in let s = sampled () in decide_sampled m p s (links ())
     | _ -> failwith "a kind" in

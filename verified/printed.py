@@ -195,6 +195,17 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
     }  # fmt: skip
 
 
+def composed(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
+    """The files of funnels that follow each other, and their proofs."""
+    documents: dict[str, Any] = {"proof": {"proof": {"multipliers": number(terms["multipliers"])}}}
+    parts = ("field", "policy", "funnel", "goal")
+    for i, (stage, proof) in enumerate(zip(terms["stages"], terms["proofs"], strict=True), start=1):
+        own = dict(zip(parts, stage.terms, strict=True)) | {"proof": proof}
+        printed = funnel(own, {"proof": files[f"stage{i}.proof"]})
+        documents |= {f"stage{i}.{role}": document for role, document in printed.items()}
+    return documents
+
+
 def _maybe(term: Made) -> tuple[Any, ...]:
     return term.terms
 

@@ -27,7 +27,7 @@ COMMON = 10_000  # bits
 DIGITS, SHIFT, LEVEL, LIMITS, DEGREE = 4000, 400, 16, 3, 7
 BASIS, FACTORS_OF_SQUARES, ROWS = 200, 24, 800
 KNOTS, PIECES, UNCERTAIN, ENTRIES = 10_000, 100_000, 32, 16
-SAMPLES, CURVATURE, STEP_MONOMIALS = 10**6, 64, 1000
+SAMPLES, CURVATURE, STEP_MONOMIALS, STAGES = 10**6, 64, 1000, 100
 SIGNAL = "name unit path"
 EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
 
@@ -402,6 +402,21 @@ def plan(document: dict[str, Any], model: dict[str, Any], tubes: list[Any]) -> N
         (u,) = reals(row, "u", 1)
         need(low <= u <= high, "a plan's input is outside the model's range")
     need(all(matrix(tube["L"], "L", n, 1) == L for tube in tubes), "L is not the policy's")
+
+
+def proof_of(document: Any, where: str) -> Any:
+    """The kind of what a proof file claims."""
+    members(document, where, "format version claim proof")
+    word(document["format"], "format", ["nlsid/proof"])
+    claim = document["claim"]
+    return claim.get("kind") if type(claim) is dict else None
+
+
+def composition(document: Any) -> list[Fraction]:
+    """The multipliers between the stages."""
+    members(document["claim"], "claim", "kind about")
+    proof = members(document["proof"], "proof", "multipliers")
+    return reals(proof["multipliers"], "multipliers", 1, STAGES - 1)
 
 
 def held(files: dict[str, tuple[str, Any]]) -> None:

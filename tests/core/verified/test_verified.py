@@ -178,10 +178,11 @@ MODELS = (
 
 
 SAMPLED = tuple(f"sampled_funnel/{form}" for form in ("response", "peak", "energy", "fading"))
+COMPOSED = "funnel_composition/two"
 
 
 @pytest.mark.parametrize(
-    "name", [*MODELS, *SAMPLED, "continuous_funnel/clipped", "continuous_funnel/pushed"]
+    "name", [*MODELS, *SAMPLED, COMPOSED, "continuous_funnel/clipped", "continuous_funnel/pushed"]
 )
 def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
     """And each of them counts: another one prints as another file."""
@@ -219,7 +220,7 @@ def test_a_file_that_is_not_in_canonical_form_is_refused(tmp_path: Path) -> None
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize("name", [*MODELS, *SAMPLED])
+@pytest.mark.parametrize("name", [*MODELS, *SAMPLED, COMPOSED])
 def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
     done = accepted(CORPUS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
@@ -360,7 +361,8 @@ def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> Non
 def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path) -> None:
     found = mutated(400, tmp_path / "mutant", program.parent / "second")
     assert found["differ"] == {}
-    for kind in ("tube", "stability", "continuous_funnel", "sampled_funnel"):
+    kinds = ("tube", "stability", "continuous_funnel", "sampled_funnel", "funnel_composition")
+    for kind in kinds:
         assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 2
 
 
@@ -479,6 +481,63 @@ def test_sampled_claims_are_decided_as_the_closed_form_decides(
         )
         found, _ = generate.decided(put(files, tmp_path), checker=program.parent / "second")
         assert found == (0 if true else 1)
+
+
+def start_narrower(case: mutations.Case) -> None:
+    """Stage 2 starts 1 % narrower: stage 1 no longer ends inside it."""
+    case.about["stage2.funnel.json"]["rho"][0] *= 0.99
+
+
+def multiplier_raised(case: mutations.Case) -> None:
+    """Past 1 the S-lemma gives nothing."""
+    case.document["proof"]["multipliers"] = [1.01]
+
+
+def multiplier_negative(case: mutations.Case) -> None:
+    """Less than nothing."""
+    case.document["proof"]["multipliers"] = [-0.5]
+
+
+def stages_swapped(case: mutations.Case) -> None:
+    """Proofs and all."""
+    about = case.document["claim"]["about"]
+    about["stage1"], about["stage2"] = about["stage2"], about["stage1"]
+
+
+def stage_repeated(case: mutations.Case) -> None:
+    """Stage 1 follows itself."""
+    about = case.document["claim"]["about"]
+    about["stage2"] = dict(about["stage1"])
+
+
+def stage_of_another_motion(case: mutations.Case) -> None:
+    """Stage 2's equations are driven harder than its own proof allows."""
+    case.about["stage2.policy.json"]["K"] = [
+        [[[-g for g in row] for row in k] for k in ks]
+        for ks in case.about["stage2.policy.json"]["K"]
+    ]
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(
+    "forge",
+    [start_narrower, multiplier_raised, multiplier_negative, stages_swapped, stage_repeated,
+     stage_of_another_motion],
+)  # fmt: skip
+def test_both_kernels_refuse_a_forged_composition(
+    forge: Callable[[mutations.Case], None], program: Path, tmp_path: Path
+) -> None:
+    (case,) = (case for case in mutations.corpus() if case.kind == "funnel_composition")
+    forged = case.copied()
+    forge(forged)
+    mutations.bind_again(forged)
+    for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
+        (tmp_path / name).write_bytes(saved.encode(document))
+    with pytest.raises(kernel.Rejected):
+        kernel.check(tmp_path / mutations.PROOF)
+    status, why = generator().decided(tmp_path / mutations.PROOF, checker=program.parent / "second")
+    assert (status, why) == (1, ""), "refused by the checker, not before"
 
 
 def rebound(document: Json, digests: dict[str, str]) -> Json:
