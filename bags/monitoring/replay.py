@@ -16,7 +16,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
-from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -260,6 +260,23 @@ def _replayed(
     return stamped, watch.forecasts
 
 
+def samples_of(
+    design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
+) -> list[Sample]:
+    """The samples that a monitor of the design makes of a bag's messages, in order.
+
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
+    """
+    sampler, place_of, found = design.sampler(), place(bag), []
+    with Bag(place_of, definitions=definitions) as source:
+        _check(sampler, source, place_of)
+        for message in source.messages(sampler.topics):
+            stamp_ns = sampler.stamp(message.data, message.log_time_ns)
+            decoded = decode(message.data, *source.types_on(message.topic))
+            found += sampler.message(message.topic, stamp_ns, decoded)
+    return found + sampler.flush()
+
+
 def announced_runs(
     design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
 ) -> list[Run]:
@@ -278,12 +295,7 @@ def _fed(
     design = watch.design
     digest = design.digest
     with Bag(bag, definitions=definitions) as source:
-        for topic in watch.pairing.topics:
-            kind = source.types_on(topic)
-            try:
-                watch.pairing.check(topic, *kind)
-            except BagError as error:
-                raise BagError(f"{bag}: {error}") from error
+        _check(watch.pairing, source, bag)
         run_topics = _run_topics(source) if announced else []
         for message in source.messages([*run_topics, *watch.pairing.topics]):
             if message.topic in run_topics:
@@ -294,6 +306,16 @@ def _fed(
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
             decoded = decode(message.data, *source.types_on(message.topic))
             yield watch.message(message.topic, stamp_ns, decoded)
+
+
+def _check(sampler: Sampler, source: Bag, bag: Path) -> None:
+    """BagError unless the bag has the signals and their clock."""
+    for topic in sampler.topics:
+        kind = source.types_on(topic)
+        try:
+            sampler.check(topic, *kind)
+        except BagError as error:
+            raise BagError(f"{bag}: {error}") from error
 
 
 def _run_topics(source: Bag) -> list[str]:
