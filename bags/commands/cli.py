@@ -520,7 +520,7 @@ def monitor(
         chosen = to_judge(proved.design, folders, validation=settings.split.validation)
         folders = list(chosen.judged)
         for line in chosen.said:
-            err.print(f"{line} (without --config all are judged)", soft_wrap=True, markup=False)
+            err.print(f"{line}; without --config all are judged", soft_wrap=True, markup=False)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:

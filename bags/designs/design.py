@@ -150,7 +150,7 @@ class WiredDesign(Generic[M, P, F]):
 
     @property
     def made_with(self) -> dict[str, str]:
-        """How it was made with recordings (trained, calibrated or both), by their digests."""
+        """What recordings were used for (training, calibration or both), by their digests."""
         trained: set[str] = set()
         calibrated: set[str] = set()
         for stage in self.stages:
@@ -159,9 +159,9 @@ class WiredDesign(Generic[M, P, F]):
             for tube in funnel.tubes if isinstance(funnel, TubeFunnel) else ():
                 trained |= {digest for _, digest in tube.designed_on}
                 calibrated |= {digest for _, digest in tube.measured_on}
-        parts = {"trained": trained, "calibrated": calibrated}
+        parts = {"training": trained, "calibration": calibrated}
         return {
-            digest: " and ".join(way for way, part in parts.items() if digest in part) + " with it"
+            digest: " and ".join(use for use, part in parts.items() if digest in part)
             for digest in trained | calibrated
         }
 

@@ -168,7 +168,7 @@ def _unjudged(reading: Reading) -> bool:
 
 @dataclass(frozen=True)
 class ToJudge:
-    """Bags to hold against a design, and those that it was made with, each with how.
+    """Bags to hold against a design, and those that it was made with, each with its use.
 
     One that it was made with is judged only if all of them are such.
     """
@@ -178,12 +178,12 @@ class ToJudge:
 
     @property
     def said(self) -> list[str]:
-        """A line for each way in which bags were used, with their names; empty if none was."""
-        ways: dict[str, list[str]] = {}
-        for path, way in self.used.items():
-            ways.setdefault(way, []).append(trial_name(path))
+        """A line for each use, with the names of its bags; empty if there is none."""
+        uses: dict[str, list[str]] = {}
+        for path, use in self.used.items():
+            uses.setdefault(use, []).append(trial_name(path))
         what = "judged all the same" if set(self.judged) & set(self.used) else "not judged"
-        return [f"{what}: {', '.join(names)}: the design was {way}" for way, names in ways.items()]
+        return [f"{what}: {', '.join(names)} (used for {use})" for use, names in uses.items()]
 
 
 def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[str] = ()) -> ToJudge:
@@ -195,10 +195,10 @@ def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[st
     made_with = design.made_with
     used: dict[Path, str] = {}
     for bag in bags:
-        if way := made_with.get(bag_digest(bag)):
-            used[bag] = way
+        if use := made_with.get(bag_digest(bag)):
+            used[bag] = use
         elif trial_name(bag) in validation:
-            used[bag] = "chosen by it (split.validation)"
+            used[bag] = "validation"
     return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
 
 

@@ -85,10 +85,10 @@ def test_every_bag_that_did_not_make_the_design_is_judged_and_the_others_are_nam
     assert "violated" in judged
     for text in (rest, said.partition("not judged")[2]):
         assert re.match(
-            r": again: the design was (trained|calibrated|trained and calibrated) with it", text
+            r": again \(used for (training|calibration|training and calibration)\)", text
         )
     by_choice = nlsid("report", design, again)
-    assert "judged all the same: again: the design was trained" in by_choice
+    assert "judged all the same: again (used for" in by_choice
 
 
 def test_a_forged_proof_is_rejected_on_the_page(design: Path) -> None:
