@@ -104,13 +104,12 @@ def check_fleet(
 ) -> list[Checked]:
     """A row a bag, in the order of `bags`; one that cannot be reached is `not read`."""
     with Manifest(manifest) as kept:
-        answers = ask(CheckBag(config), bags, workers, kept, progress=progress)
-    return [
-        Checked(answer.name, robot_of(answer.name), UNREAD, trouble=answer.reason)
-        if answer.reason
-        else Checked(**_document(answer.content))
-        for answer in answers
-    ]
+        return [
+            Checked(answer.name, robot_of(answer.name), UNREAD, trouble=answer.reason)
+            if answer.reason
+            else Checked(**_document(answer.content))
+            for answer in ask(CheckBag(config), bags, workers, kept, progress=progress)
+        ]
 
 
 def _document(content: bytes) -> dict[str, Any]:

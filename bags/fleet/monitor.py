@@ -239,13 +239,12 @@ def monitor_fleet(
     """
     task = JudgeBag(proved, centre, definitions)
     with Manifest(manifest) as kept:
-        answers = ask(task, bags, workers, kept, progress=progress)
-    rows = [
-        Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
-        if answer.reason
-        else Judged(**_document(answer.content))
-        for answer in answers
-    ]
+        rows = [
+            Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
+            if answer.reason
+            else Judged(**_document(answer.content))
+            for answer in ask(task, bags, workers, kept, progress=progress)
+        ]
     design: Any = proved.design
     made_of: set[str] = set()
     if isinstance(design.funnel, TubeFunnel):
