@@ -137,8 +137,9 @@ def messages_at(
 ) -> Batch:
     """The messages whose records are at `offsets`; BagError unless all are messages of `channel`.
 
-    edges: ascending, where records begin or end, the last end among them; no message goes past the
-    next (None: where those of the channel begin). Gathered through overlapping views, so that no message costs a step of Python.
+    Gathered through overlapping views, so that no message costs a step of Python. edges: ascending,
+    where records begin or end, the last end among them; no message goes past the next (None: where
+    those of the channel begin).
     """
     last = len(content) - MESSAGE.itemsize
     if last < 0 or (offsets < 0).any() or (offsets > last).any():

@@ -321,7 +321,7 @@ def place(given: Path | str, *, patience: float | None = None) -> Path:
     was made of a URL, `s3:/bucket/...`, is taken for it. Raises BagError for a URL that carries a
     password, a token or a query: names of bags are written into files.
     """
-    text = str(given)
+    text = str(given).lstrip()
     if not isinstance(given, RemotePath):
         found = _URL.match(text)
         if text.startswith("file:/"):
@@ -336,9 +336,9 @@ def place(given: Path | str, *, patience: float | None = None) -> Path:
         protocol, rest = found.group(1).lower(), text[found.end() :]
         if cut := re.search("[?#]" if protocol in ("http", "https") else "[?][^/]*=", rest):
             raise BagError(
-                f"{protocol}://{rest[: cut.start()].rpartition('@')[2]}: a query may hold a secret, "
-                "and names are written into files; give a URL without it, and credentials in the "
-                "environment"
+                f"{protocol}://{rest[: cut.start()].rpartition('@')[2]}: a query may hold a "
+                "secret, and names are written into files; give a URL without it, and credentials "
+                "in the environment"
             )
         if "@" in rest.partition("/")[0]:
             raise BagError(
