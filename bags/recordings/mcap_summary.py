@@ -170,6 +170,7 @@ class Prepared:
         self._place = {block.offset: i for i, block in enumerate(self._blocks)}
         self._channels: frozenset[int] = frozenset()
         self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
+        self._runs: dict[int, tuple[IntArray, IntArray]] = {}  # and what is fetched of it
 
     def records(
         self, block: ListedBlock, channels: Collection[int]
@@ -185,11 +186,12 @@ class Prepared:
             window = list(self._window(block))
             self._path.fetch(_span(ahead) for ahead in window)
             self._ready = {ahead.offset: self._entries_of(ahead) for ahead in window}
+            plain = [ahead for ahead in window if not ahead.compression]
+            self._runs = {ahead.offset: self._runs_of(ahead) for ahead in plain}
             self._path.fetch(
-                (ahead.offset + start, ahead.offset + end)
-                for ahead in window
-                if not ahead.compression
-                for start, end in zip(*self._runs(ahead), strict=True)
+                (at + start, at + end)
+                for at, (starts, ends) in self._runs.items()
+                for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
             )
         offsets = self._ready[block.offset]
         if block.compression:
@@ -198,7 +200,7 @@ class Prepared:
             at = block.offset - block.record
             content = uncompressed(replace(block, crc=crc), header[at : at + block.size])
             return content, offsets, _sorted(*offsets.values(), [len(content)])
-        starts, ends = self._runs(block)
+        starts, ends = self._runs[block.offset]
         after = np.cumsum(ends - starts)
         content = b"".join(
             self._path.read_range(block.offset + start, block.offset + end)
@@ -219,7 +221,7 @@ class Prepared:
                 held += block.size
                 yield block
 
-    def _runs(self, block: ListedBlock) -> tuple[IntArray, IntArray]:
+    def _runs_of(self, block: ListedBlock) -> tuple[IntArray, IntArray]:
         """First bytes and ends, in the block, of the wanted messages' records: of runs without a
         gap of GAP_BYTES. A record ends where the next record of a message begins.
         """

@@ -107,12 +107,28 @@ class RemotePath(PosixPath):
             self._entry = self._asked(self._described)
         return self._entry
 
-    def _described(self, fs: Any, name: str, limit: dict[str, float]) -> Entry:
+    def _described(self, left: float) -> Entry:
         self.requests += 1
-        if (s3 := self._s3) is not None and (key := name.partition("/")[2]):
+        if (s3 := self._s3) is not None and (key := self._key):
             with suppress(FileNotFoundError):  # it may be a folder
                 return _entry(s3.head(key))
+        fs, name, limit = _storage(self, left)
         return _entry(fs.info(name, **limit))
+
+    def _listed(self, left: float) -> list[dict[str, Any]]:
+        fs, name, limit = _storage(self, left)
+        found: list[dict[str, Any]] = fs.ls(name, detail=True, **limit)
+        return found
+
+    def _matching(self, left: float) -> dict[str, dict[str, Any]]:
+        fs, name, limit = _storage(self, left)
+        found: dict[str, dict[str, Any]] = fs.glob(name, detail=True, **limit)
+        return found
+
+    @property
+    def _key(self) -> str:
+        """Of an object of S3, in its bucket."""
+        return "/".join(self.parts[2:])
 
     @property
     def _s3(self) -> "_ByObstore | None":
@@ -153,7 +169,7 @@ class RemotePath(PosixPath):
 
     def iterdir(self) -> Iterator["RemotePath"]:  # type: ignore[override]
         """What is in the folder."""
-        for found in self._asked(lambda fs, name, limit: fs.ls(name, detail=True, **limit)):
+        for found in self._asked(self._listed):
             name = str(found["name"]).rstrip("/").rpartition("/")[2]
             if name and name != self.name:
                 child = self / name
@@ -203,11 +219,12 @@ class RemotePath(PosixPath):
         starts, ends = ([span[k] for span in spans] for k in (0, 1))
         size = self.entry.size
 
-        def ask(fs: Any, name: str, limit: dict[str, float]) -> list[bytes]:
+        def ask(left: float) -> list[bytes]:
             self.requests += len(starts)
             if (s3 := self._s3) is not None:
-                parts = s3.ranges(name.partition("/")[2], starts, ends)
+                parts = s3.ranges(self._key, starts, ends)
             else:
+                fs, name, limit = _storage(self, left)
                 parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
             return [
                 _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
@@ -257,15 +274,16 @@ class RemotePath(PosixPath):
             order.pop(0)
         self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
-    def _asked(self, ask: Callable[[Any, str, dict[str, float]], T]) -> T:
-        """The answer of storage, asked again with growing waits while the patience lasts."""
+    def _asked(self, ask: Callable[[float], T]) -> T:
+        """The answer of storage, asked again with growing waits while the patience lasts.
+
+        ask: it is told how many seconds of it are left.
+        """
         wait = FIRST_WAIT
         while True:
             started = time.monotonic()
             try:
-                fs, name = _storage(str(self))
-                left = max(1.0, self.patience - self._lost)
-                return ask(fs, name, {"timeout": left} if fs.async_impl else {})
+                return ask(max(1.0, self.patience - self._lost))
             except REFUSALS:
                 raise
             except Exception as error:  # every protocol raises its own
@@ -366,7 +384,7 @@ def matching(path: Path) -> list[Path]:
     if not isinstance(path, RemotePath):
         start = Path(path.anchor)
         return sorted(start.glob(str(path.relative_to(start))))
-    found = path._asked(lambda fs, name, limit: fs.glob(name, detail=True, **limit))
+    found = path._asked(path._matching)
     protocol = path.parts[0]
     places: list[Path] = []
     for name, described in sorted(found.items()):
@@ -384,18 +402,18 @@ def _rebuilt(text: str, patience: float, entry: Entry | None) -> RemotePath:
     return path
 
 
-def _storage(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and its name for the file."""
+def _storage(path: RemotePath, left: float) -> tuple[Any, str, dict[str, float]]:
+    """The file system of a URL, its name for the file, and the limit of a request of `left` s."""
     try:
         from fsspec.core import url_to_fs
 
-        found: tuple[Any, str] = url_to_fs(url, use_listings_cache=False)
+        fs, name = url_to_fs(str(path), use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise BagError(
-            f"{url} cannot be read: {error}; bags in object storage need `pip install "
+            f"{path} cannot be read: {error}; bags in object storage need `pip install "
             "'nlsid[fleet]'`"
         ) from error
-    return found
+    return fs, name, {"timeout": left} if fs.async_impl else {}
 
 
 @dataclass(frozen=True)

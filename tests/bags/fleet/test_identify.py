@@ -209,7 +209,7 @@ def test_a_bag_that_changes_while_it_is_read_is_named_and_not_kept(
     local = drive(tmp_path / "web" / "drive.mcap", samples=120, image_bytes=1000)
     other = drive(tmp_path / "other.mcap", seed=1, samples=120, image_bytes=1000)
     assert local.stat().st_size == other.stat().st_size
-    swapped = []
+    swapped: list[int] = []
 
     def swap(_: str, number: int) -> None:
         if number == 2 and not swapped:
@@ -263,7 +263,7 @@ def test_what_is_answered_is_on_the_disk_and_not_in_memory(tmp_path: Path) -> No
     class Long:
         asked = "long"
 
-        def __call__(self, _: Path, name: str) -> bytes:
+        def __call__(self, bag: Path, name: str) -> bytes:  # noqa: ARG002
             return name.encode() * 50_000
 
     (tmp_path / "bag").write_text("")
