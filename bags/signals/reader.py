@@ -221,6 +221,7 @@ class _Topic:
             self._stamps = columns.stamp_ns
         else:
             self._stamps = columns.log_ns if clock == LOG_TIME else columns.publish_ns
+        self._back = columns.back if clock == LOG_TIME and not sort else ()
         if sort and (np.diff(self._stamps) < 0).any():
             order = np.argsort(self._stamps, kind="stable")
             self._stamps = self._stamps[order]
@@ -239,13 +240,15 @@ class _Topic:
             raise BagError(
                 f"{self._where}: every header stamp is 0; its publisher does not fill it in"
             )
-        steps = np.diff(stamps)
-        if len(back := np.flatnonzero(steps < 0)):
-            i = int(back[0])
+        back = self._back or [
+            (int(i) + 1, int(stamps[i]), int(stamps[i + 1]))
+            for i in np.flatnonzero(np.diff(stamps) < 0)
+        ]
+        if back:
+            at, before, after = back[0]
             raise BagError(
-                f"{self._where}: time goes back by {-int(steps[i]) / 1e9:g} s at message {i + 1}: "
-                f"{self._clock} {stamp_text(int(stamps[i]))}, then "
-                f"{stamp_text(int(stamps[i + 1]))} "
+                f"{self._where}: time goes back by {(before - after) / 1e9:g} s at message {at}: "
+                f"{self._clock} {stamp_text(before)}, then {stamp_text(after)} "
                 f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
             )
 
