@@ -435,7 +435,7 @@ def report(
     target = page or folder / documents.DESIGN_REPORT
     recordings, replays, drawn = [], [], ""
     if bags:
-        proved = documents.load_proved(folder / documents.FUNNEL)
+        proved = documents.load_proved(documents.funnel_of(folder))
         folders = expand_bags(bags)
         topics = Watch(proved.design, centre=show.centre_of(settings)).pairing.topics
         with progress_bar("reading") as progress:

@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.__main__ import BENCHMARKS
 
 LONGEST = 48  # characters of one value
+SPACE, HYPHEN = "\N{NO-BREAK SPACE}", "\N{NON-BREAKING HYPHEN}"
 THOUSANDS = 1e4  # numbers from here on have no digits behind the point
 FEWEST = 3  # figures that make keys with a common beginning a table
 FIGURE = re.compile(r"\{\{(\w+) ([\w.]+) ([\w.]+)\}\}")
@@ -39,9 +40,10 @@ def page(results: Path, benchmarks: Path) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name, found in files:
+        load = found.get("load", "-")
         lines.append(
-            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10]} | "
-            f"{found['seconds']:g} s | {' to '.join(map(str, found.get('load', '-')))} | "
+            f"| [{name}](#{name.replace('_', '-')}) | {found['date'][:10].replace('-', HYPHEN)} | "
+            f"{found['seconds']:g}{SPACE}s | {f'{SPACE}to{SPACE}'.join(map(str, load))} | "
             f"{found['commit'][:8]} | {_peers(found['result'])} |"
         )
     if without := sorted(BENCHMARKS.keys() - dict(files).keys()):
