@@ -39,7 +39,7 @@ from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.processes import isolate, python, settings
 
 FAULT = "scaled by 0.6"
-PATIENCE = 30.0  # s for a process to come up or a message to arrive, on a loaded machine
+PATIENCE = 120.0  # s for a process to come up or a message to arrive, on a loaded machine
 SETTLE = 0.5  # s for the last messages of a pass
 MARGIN_TOLERANCE = 1e-9
 ALARM_LIMIT_MS = 50.0
@@ -231,7 +231,10 @@ def _wait(what: str, done: Callable[[], bool]) -> None:
     deadline = time.monotonic() + PATIENCE
     while not done():
         if time.monotonic() > deadline:
-            raise NlsidError(f"waited {PATIENCE:g} s for {what}, in vain")
+            raise NlsidError(
+                f"waited {PATIENCE:g} s for {what}, in vain: this machine may be too busy now, or "
+                "DDS finds no other process (a firewall, no loopback interface)"
+            )
         time.sleep(0.02)
 
 

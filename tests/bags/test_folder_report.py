@@ -69,7 +69,7 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
 
 def test_bags_with_nothing_lost_share_a_row_and_the_others_have_their_own(design: Path) -> None:
     bags = [bag_info(bag) for bag in f1tenth()[:3]]
-    topics = tuple(replace(topic, gaps=topic.topic == "/odom") for topic in bags[1].topics)
+    topics = tuple(replace(topic, gaps=int(topic.topic == "/odom")) for topic in bags[1].topics)
     holed = replace(bags[1], topics=topics)
     page = folder_page(design, recordings=[bags[0], holed, bags[2]])
     cell = "<td>([^<]*)</td>"
@@ -78,6 +78,7 @@ def test_bags_with_nothing_lost_share_a_row_and_the_others_have_their_own(design
     assert rows == [
         (names[1], "/odom", "121", "40 Hz", "1"),
         (f"{names[0]} and 2 more", "/cmd_vel", "120", "40 Hz", "0"),
+        (f"{names[0]} and 2 more", "/steering_command", "120", "40 Hz", "0"),
         (f"{names[0]} and 1 more", "/odom", "121", "40 Hz", "0"),
     ]
 
@@ -91,6 +92,7 @@ def test_every_file_has_its_digest_and_the_proofs_that_it_is_a_part_of(design: P
     assert "model of funnel.proof.json; model of model.proof.json" in model
 
 
+@pytest.mark.pictures
 def test_a_composition_is_drawn_from_its_files(tmp_path: Path) -> None:
     """Two stages of a second, with no picture in their folder."""
     page = folder_page(composed(tmp_path))
