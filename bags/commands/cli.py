@@ -322,7 +322,9 @@ def push(
     out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
     response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
     command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
-    period: PeriodOption = 0.0,
+    period: Annotated[
+        float, typer.Option(help="Seconds between samples; default: as they come.")
+    ] = 0.0,
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
     ] = 0.0,
@@ -404,11 +406,11 @@ def report(
     folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
     bags: Annotated[
         list[Path] | None,
-        typer.Argument(help="Bags whose losses are listed, and that are held against its funnel."),
+        typer.Argument(help="Their losses are listed; those that made no part of it are judged."),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="Takes `split.test` (which are held against it) and `monitor.nominal`."),
+        typer.Option(help="Takes `monitor.nominal`, and `split.validation`, which is not judged."),
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
@@ -424,16 +426,18 @@ def report(
     from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
+    from bags.designs.design import made_of
     from bags.monitoring.replay import replay_bag
     from bags.monitoring.watch import Watch
     from bags.pictures.folder_report import print_page, write_folder_report
     from bags.pictures.report import report_available
     from bags.recordings.folders import expand_bags
+    from bags.signals.reader import bag_digest
     from bags.tools.info import bag_info
 
     settings = load_config(config) if config is not None else None
     target = page or folder / documents.DESIGN_REPORT
-    recordings, replays, drawn = [], [], ""
+    recordings, replays, spared, drawn = [], [], [], ""
     if bags:
         proved = documents.load_proved(documents.funnel_of(folder))
         folders = expand_bags(bags)
@@ -442,18 +446,25 @@ def report(
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
                 recordings.append(bag_info(bag, topics=topics))
-        if settings is not None:
-            folders = [f for f in folders if f.name in settings.split.test] or folders
+        used = made_of(proved.design)
+        chosen_by = set() if settings is None else {*settings.split.validation}
+        unseen = [f for f in folders if f.name not in chosen_by and bag_digest(f) not in used]
+        judged = unseen or folders
+        spared = [f.name for f in folders if f not in judged]
         with progress_bar("replaying") as progress:
-            for done, bag in enumerate(folders):
-                progress(bag.name, done / len(folders))
+            for done, bag in enumerate(judged):
+                progress(bag.name, done / len(judged))
                 replays.append(replay_bag(proved, bag, centre=show.centre_of(settings)))
         if report_available() and all(entry.half_width for entry in replays):
             from bags.pictures import plots
 
             drawn = plots.svg(plots.margins(replays))
-    write_folder_report(folder, target, recordings=recordings, replays=replays, drawn=drawn)
+    write_folder_report(
+        folder, target, recordings=recordings, replays=replays, spared=spared, drawn=drawn
+    )
     out.print(f"wrote {target}", soft_wrap=True)
+    if spared:
+        out.print(f"{len(spared)} of {len(folders)} bags made the design and are not judged")
     if pdf:
         print_page(target, target.with_suffix(".pdf"))
         out.print(f"wrote {target.with_suffix('.pdf')}", soft_wrap=True)

@@ -239,6 +239,20 @@ def read_design(
     return made
 
 
+def made_of(design: AnyDesign) -> set[str]:
+    """Digests of the recordings that model or funnel name: those that fitted or scaled them."""
+    found: set[str] = set()
+    for stage in design.stages:
+        waiting: list[Any] = [stage.model.document(), stage.funnel.document()]
+        while waiting:
+            part = waiting.pop()
+            if isinstance(part, dict) and part.keys() == {"name", "digest"}:
+                found.add(str(part["digest"]).partition("[")[0])  # of a window, its recording
+            elif isinstance(part, dict | list):
+                waiting += part.values() if isinstance(part, dict) else part
+    return found
+
+
 def _read_at(signals: tuple[Signal, ...], *, single: bool) -> SignalPath | SignalVector:
     if single:
         return Expression.parse(signals[0].path).path

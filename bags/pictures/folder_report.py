@@ -8,12 +8,14 @@ import base64
 import hashlib
 import math
 import os
+import re
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
 
 from bags.designs import documents
@@ -40,6 +42,7 @@ td code { white-space: nowrap } .digests td code { white-space: normal }
   th, td:first-child, td[colspan] { white-space: normal }
   body { max-width: none; margin: 0; font-size: 11pt } }
 """
+ROBOT = re.compile(r"<h1>([^<]*): identified model</h1>")
 FUNNEL_CAPTION = "The funnel: the tube around the motion"
 PICTURES = {
     documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
@@ -62,15 +65,16 @@ def write_folder_report(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    spared: Sequence[str] = (),
     drawn: str = "",
 ) -> None:
     """Write the page of a design folder.
 
     recordings: bags whose losses are listed, with the topics to list. replays: bags held against
-    its funnel, `drawn` their picture as <svg> or empty. Raises DocumentError if the folder has
-    neither a proof nor a report.
+    its funnel, `drawn` their picture as <svg> or empty; spared: names of bags that are not, since
+    they made it. Raises DocumentError if the folder has neither a proof nor a report.
     """
-    page = folder_page(folder, recordings=recordings, replays=replays, drawn=drawn)
+    page = folder_page(folder, recordings=recordings, replays=replays, spared=spared, drawn=drawn)
     files.write_atomically(out, page.encode())
 
 
@@ -105,6 +109,7 @@ def folder_page(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    spared: Sequence[str] = (),
     drawn: str = "",
 ) -> str:
     """The whole page as text."""
@@ -120,7 +125,7 @@ def folder_page(
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
-        "replays": ("Recordings held against the funnel", _replays(replays, drawn)),
+        "replays": ("Recordings held against the funnel", _replays(replays, spared, drawn)),
         "recordings": ("Recordings and their losses", _recordings(recordings)),
         "files": ("Files", _files(folder, proofs)),
     }
@@ -131,17 +136,26 @@ def folder_page(
         for key, (title, text) in present.items()
     )
     name = escape(folder.resolve().name)
+    robot = _robot(folder / documents.REPORT) or name
     return f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{name}: design</title>
+<html lang="en"><meta charset="utf-8"><title>{robot}: design</title>
 <meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>{STYLE}{PRINT}</style>
-<h1>{name}</h1>
+<h1>{robot}</h1>
+<p class="note">Folder {name}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC, nlsid {version("nlsid")}</p>
 <nav>{links}</nav>
 {body}
-<p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """
+
+
+def _robot(report: Path) -> str:
+    """What the configuration calls the robot, as the model's own page has it; or nothing."""
+    if not report.is_file():
+        return ""
+    found = ROBOT.search(report.read_text(encoding="utf-8", errors="replace"))
+    return found[1] if found else ""
 
 
 def _decided(path: Path) -> kernel.Verdict | str:
@@ -262,7 +276,7 @@ def _between(values: Sequence[float], unit: str = "") -> str:
     return f"{' to '.join(ends)}{unit}"
 
 
-def _replays(replays: Sequence[Replay], drawn: str) -> str:
+def _replays(replays: Sequence[Replay], spared: Sequence[str], drawn: str) -> str:
     if not replays:
         return ""
     rows = "".join(_replay(replay) for replay in replays)
@@ -270,9 +284,14 @@ def _replays(replays: Sequence[Replay], drawn: str) -> str:
         f"<th>{name}</th>"
         for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
     )
+    left_out = (
+        f" Not judged, because the model or the tube was made of them: {escape(', '.join(spared))}."
+        if spared
+        else ""
+    )
     return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
-most of what is assumed that any judged sample used.</p>{drawn}"""
+most of what is assumed that any judged sample used.{left_out}</p>{drawn}"""
 
 
 def _replay(replay: Replay) -> str:

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from bags.chain.config import load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.pictures.folder_report import BROWSERS, folder_page, print_page
@@ -65,6 +67,21 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     assert page.tags.count("svg") > 3
     assert "script" not in page.tags
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
+
+
+def test_every_bag_that_made_no_part_of_the_design_is_judged(design: Path, tmp_path: Path) -> None:
+    """A training trial, a test trial, and a copy of the latter with a broken sensor."""
+    training, tested = f1tenth()[0], f1tenth()[4]
+    path = load_config(CONFIG).signals.response[0].path
+    write_faulty_copy(tested, tmp_path / "broken", path, FAULTS["scaled by 0.6"])
+    out = tmp_path / "page.html"
+    bags = [training, tested, tmp_path / "broken"]
+    said = nlsid("report", design, *bags, "--config", CONFIG, "--out", out)
+    assert "1 of 3 bags made the design and are not judged" in said
+    page = Page(out.read_text()).text
+    assert f"the model or the tube was made of them: {training.name}." in page
+    assert f"{tested.name}inside" in page
+    assert re.search("broken(outside|assumption violated)", page)
 
 
 def test_bags_with_nothing_lost_share_a_row_and_the_others_have_their_own(design: Path) -> None:
