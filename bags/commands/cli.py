@@ -30,7 +30,7 @@ from bags.commands.progress import progress_bar
 from bags.commands.tracking_cli import app as track_app
 from nlsid_core import kernel
 from nlsid_core import second as second_kernel
-from nlsid_core.errors import DataError, NlsidError
+from nlsid_core.errors import CertificateRejected, DataError, NlsidError
 
 if TYPE_CHECKING:
     from bags.fleet.workers import Workers
@@ -376,23 +376,33 @@ def check(
     second: Annotated[
         bool, typer.Option("--second", help="Also ask the checker that Coq proves right.")
     ] = False,
+    recording: Annotated[
+        Path | None,
+        typer.Option(help="Of a falsification: the bag, whose digest and samples are compared."),
+    ] = None,
 ) -> None:
-    """Decide proofs without a solver: PROVED (status 0) or REJECTED (status 1).
+    """Decide proofs without a solver: PROVED or FALSIFIED (status 0), or REJECTED (status 1).
 
-    Status 2 if a proof cannot be read, so that nothing was decided about it, or if the second
-    kernel was asked and has no opinion of it.
+    FALSIFIED: of what a tube assumes, by `nlsid monitor --falsify`. Status 2 if a proof cannot be
+    read, so that nothing was decided about it, or if the second kernel was asked and has no opinion
+    of it.
     """
     status = 0
     for path in proofs:
         name = str(path) if str(path).isprintable() else ascii(str(path))
         try:
             said = str(kernel.check(path))
-            typer.echo(said if len(proofs) == 1 else said.replace("PROVED", f"PROVED {name}:", 1))
+            word, _, rest = said.partition(" ")
+            typer.echo(said if len(proofs) == 1 else f"{word} {name}: {rest}")
+            if recording is not None:
+                from bags.monitoring.falsify import recorded
+
+                typer.echo(f"  compared: {recorded(path, recording)}")
             if second:
                 opinion = second_kernel.opinion(path)
                 typer.echo(f"  {opinion}")
                 status = max(status, {"accepted": 0, "refused": 1}.get(opinion.verdict, 2))
-        except kernel.Rejected as refusal:
+        except (kernel.Rejected, CertificateRejected) as refusal:
             status = max(status, 1)
             typer.echo(f"REJECTED {name}: {refusal}")
         except OSError as error:
@@ -490,6 +500,12 @@ def monitor(
     forecast: Annotated[
         float, typer.Option(min=0.0, help="Seconds ahead: also what the outputs could have been.")
     ] = 0.0,
+    falsify: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for certificates that bags break what a tube assumes, for `nlsid check`."
+        ),
+    ] = None,
     response: ResponseOption = None,
     command: CommandOption = None,
     period: PeriodOption = 0.0,
@@ -506,6 +522,7 @@ def monitor(
     from bags.designs import documents
     from bags.designs.design import Wiring
     from bags.fleet.monitor import judged_of
+    from bags.monitoring.falsify import falsified, refuse_unfalsifiable
     from bags.monitoring.replay import replay_bag
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
@@ -518,6 +535,8 @@ def monitor(
     settings = load_config(config) if config is not None else None
     wiring = Wiring.parse_if_any(response or [], command or [], period)
     proved = documents.load_proved(funnel, wiring=wiring)
+    if falsify is not None:
+        refuse_unfalsifiable(proved.design.model)
     folders = every = expand_bags(bags)
     if settings is not None:
         folders = [f for f in every if trial_name(f) in settings.split.test] or every
@@ -554,8 +573,8 @@ def monitor(
         if (alarm := entry.first_alarm) is not None:
             said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
             out.print(said, soft_wrap=True)
-        if entry.filled:
-            out.print(f"{entry.name}: {entry.said_filled}", soft_wrap=True)
+        for said in filter(None, (entry.said_filled, entry.said_wide)):
+            out.print(f"{entry.name}: {said}", soft_wrap=True)
         for reading in entry.unjudged[:UNJUDGED_SAID]:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)
@@ -564,6 +583,10 @@ def monitor(
             out.print(f"{entry.name}: {said}", soft_wrap=True)
         if not entry.judged:
             out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
+    if falsify is not None:
+        bad = [f for f, r in zip(folders, replays, strict=True) if r.first_bad is not None]
+        for said in (line for f in bad for line in falsified(funnel, f, falsify, types)):
+            (err if as_json else out).print(said, soft_wrap=True, markup=False, highlight=False)
     if drawn and not as_json:
         out.print(f"wrote {picture}", soft_wrap=True)
     if any(entry.first_bad is not None or entry.first_alarm is not None for entry in replays):

@@ -185,7 +185,8 @@ class _Demo:
             done = subprocess.run(command, check=False, capture_output=True, text=True)
         self._say((done.stdout + done.stderr).strip())
         if done.returncode:
-            self._say(f"only this part again: {shlex.join(['python', *command[1:]])}")
+            self._say("to repeat this step alone:")
+            self._say(shlex.join(["python", *command[1:]]))
         return done.returncode == 0
 
     def where_to_look(self) -> None:

@@ -4,7 +4,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
@@ -14,7 +16,7 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
-from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -23,6 +25,9 @@ from nlsid_core.running.reading import Reading, Status, cause
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
+
+
+MOST_WIDE: Final = 0.05  # of the samples: a tube wider than the signal in more is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +78,27 @@ class Replay:
         """The same in words, of how many; empty if there is none."""
         count = sum(not reading.starts for reading in self.readings)
         return said_filled(self.filled, count)
+
+    @property
+    def said_wide(self) -> str:
+        """In how many samples the tube is wider than all that was measured here; empty if few."""
+        judged = [r for r in self.judged if r.measured]
+        widths = np.array(
+            [list(r.half_widths) or [self.half_width] * len(r.measured) for r in judged]
+        )
+        if not widths.any():
+            return ""
+        ranges = np.ptp(np.array([r.measured for r in judged]), axis=0)
+        share = (widths > ranges).mean(axis=0)
+        worst = int(np.argmax(share))
+        if share[worst] <= MOST_WIDE:
+            return ""
+        which = f" of output {worst}" if len(share) > 1 else ""
+        return (
+            f"in {100 * share[worst]:.0f} % of the samples judged the half-width{which} is more "
+            f"than the whole range measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
+            + ": the tube says nothing there"
+        )
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:
@@ -234,6 +260,23 @@ def _replayed(
     return stamped, watch.forecasts
 
 
+def samples_of(
+    design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
+) -> list[Sample]:
+    """The samples that a monitor of the design makes of a bag's messages, in order.
+
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
+    """
+    sampler, place_of, found = design.sampler(), place(bag), []
+    with Bag(place_of, definitions=definitions) as source:
+        _check(sampler, source, place_of)
+        for message in source.messages(sampler.topics):
+            stamp_ns = sampler.stamp(message.data, message.log_time_ns)
+            decoded = decode(message.data, *source.types_on(message.topic))
+            found += sampler.message(message.topic, stamp_ns, decoded)
+    return found + sampler.flush()
+
+
 def announced_runs(
     design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
 ) -> list[Run]:
@@ -252,12 +295,7 @@ def _fed(
     design = watch.design
     digest = design.digest
     with Bag(bag, definitions=definitions) as source:
-        for topic in watch.pairing.topics:
-            kind = source.types_on(topic)
-            try:
-                watch.pairing.check(topic, *kind)
-            except BagError as error:
-                raise BagError(f"{bag}: {error}") from error
+        _check(watch.pairing, source, bag)
         run_topics = _run_topics(source) if announced else []
         for message in source.messages([*run_topics, *watch.pairing.topics]):
             if message.topic in run_topics:
@@ -268,6 +306,16 @@ def _fed(
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
             decoded = decode(message.data, *source.types_on(message.topic))
             yield watch.message(message.topic, stamp_ns, decoded)
+
+
+def _check(sampler: Sampler, source: Bag, bag: Path) -> None:
+    """BagError unless the bag has the signals and their clock."""
+    for topic in sampler.topics:
+        kind = source.types_on(topic)
+        try:
+            sampler.check(topic, *kind)
+        except BagError as error:
+            raise BagError(f"{bag}: {error}") from error
 
 
 def _run_topics(source: Bag) -> list[str]:
