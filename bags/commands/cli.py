@@ -556,6 +556,8 @@ def monitor(
             out.print(said, soft_wrap=True)
         if entry.filled:
             out.print(f"{entry.name}: {entry.said_filled}", soft_wrap=True)
+        if entry.said_wide:
+            out.print(f"{entry.name}: {entry.said_wide}", soft_wrap=True)
         for reading in entry.unjudged[:UNJUDGED_SAID]:
             said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
             out.print(said, soft_wrap=True)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
 from bags.monitoring.announcement import Run
@@ -22,6 +24,7 @@ from nlsid_core.running.reading import Reading, Status, cause
 
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
+MOST_WIDE = 0.05  # part of the samples in which a tube may say nothing without a word
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
 
@@ -73,6 +76,24 @@ class Replay:
         """The same in words, of how many; empty if there is none."""
         count = sum(not reading.starts for reading in self.readings)
         return said_filled(self.filled, count)
+
+    @property
+    def said_wide(self) -> str:
+        """In what part of the judged samples a tube that follows the commands says nothing.
+
+        There it is wider than the largest output in the recording. Empty up to MOST_WIDE.
+        """
+        following = [r for r in self.judged if len(r.half_widths)]
+        if not following:
+            return ""
+        largest = np.max(np.abs([r.measured for r in following]), axis=0)
+        wide = np.any(np.array([r.half_widths for r in following]) > largest, axis=1)
+        if wide.mean() <= MOST_WIDE:
+            return ""
+        return (
+            f"in {100 * wide.mean():.0f} % of the judged samples the tube's half-width is more "
+            "than the largest output of this recording: it says nothing there"
+        )
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:

@@ -18,6 +18,7 @@ from bags.monitoring.catching import (
     Width,
     what_it_catches,
 )
+from bags.monitoring.replay import Replay
 from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
@@ -26,6 +27,7 @@ from nlsid_core.design import OutputTubeDesign
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD, synthetic_dataset
 from tests.core.kernel.tube_claims import dataset
 from tests.core.kernel.tube_claims import design as follower
@@ -307,3 +309,23 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     show.say_catching(console, found, None)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
+
+
+@pytest.mark.parametrize(("wide", "said"), [(1, ""), (2, "in 10 % of the judged samples")])
+def test_a_recording_says_where_its_tube_is_wider_than_all_that_was_measured(
+    wide: int, said: str
+) -> None:
+    """20 samples of at most 0.5, and one that is not judged; 5 % may pass without a word."""
+    readings = [
+        Reading(
+            0.1 * k, Status.INSIDE, measured=(-0.5 if k == 10 else 0.3,),
+            half_widths=(0.6 if k < wide else 0.5,),
+        )
+        for k in range(20)
+    ]  # fmt: skip
+    unknown = Reading(2.0, Status.UNKNOWN, measured=(9.0,), half_widths=(10.0,))
+    replay = Replay("bag", (*readings, unknown), (), "speed", "m/s", 0.2)
+    assert replay.said_wide.startswith(said)
+    assert bool(replay.said_wide) == bool(said)
+    constant = Replay("bag", tuple(r._replace(half_widths=()) for r in readings), (), "", "", 9.0)
+    assert not constant.said_wide
