@@ -284,6 +284,11 @@ def _replays(replays: Sequence[Replay], spared: Sequence[str], drawn: str) -> st
         f"<th>{name}</th>"
         for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
     )
+    wide = "".join(
+        f'<p class="not">{escape(f"{replay.name}: {replay.said_wide}")}</p>'
+        for replay in replays
+        if replay.said_wide
+    )
     left_out = (
         f" Not judged, because the model or the tube was made of them: {escape(', '.join(spared))}."
         if spared
@@ -291,7 +296,7 @@ def _replays(replays: Sequence[Replay], spared: Sequence[str], drawn: str) -> st
     )
     return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
-most of what is assumed that any judged sample used.{left_out}</p>{drawn}"""
+most of what is assumed that any judged sample used.{left_out}</p>{wide}{drawn}"""
 
 
 def _replay(replay: Replay) -> str:
