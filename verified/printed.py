@@ -18,6 +18,7 @@ SPACE = re.compile(r'("(?:[^"\\]|\\.)*")|\s+')
 # What comes before the terms of a constructor, for the extracted checker.
 TAGS = {"None": "0", "Some": "1", "Linear": "0", "Affine": "1", "Monotone": "2", "Leaf": "0"}
 TAGS |= {"Cells": "3", "Split": "1", "false": "0", "true": "1"}
+TAGS |= {"Response": "0", "Peak": "1", "Energy": "2", "Fading": "3"}
 
 
 class Differs(Exception):  # noqa: N818 - says where a theorem and its files differ
@@ -111,7 +112,7 @@ def as_written(value: Any, like: Any, where: str) -> Any:
     """
     if type(value) is dict and type(like) is dict:
         for key, entry in value.items():
-            if key not in like and entry is not None and set(_flat(entry)) != {1}:
+            if key not in like and entry is not None and not set(_flat(entry)) <= {1}:
                 raise Differs(f"{where}.{key} is in the theorem and not in the file")
         return {
             key: as_written(value[key], entry, f"{where}.{key}") if key in value else entry
@@ -124,6 +125,8 @@ def as_written(value: Any, like: Any, where: str) -> Any:
         ]
     if isinstance(value, int | Fraction) and type(like) in (int, float, str):
         return _number(Fraction(value), like)
+    if type(value) is str and value == like:
+        return like
     raise Differs(f"{where} is another one in the theorem")
 
 
@@ -192,6 +195,17 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
     }  # fmt: skip
 
 
+def composed(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
+    """The files of funnels that follow each other, and their proofs."""
+    documents: dict[str, Any] = {"proof": {"proof": {"multipliers": number(terms["multipliers"])}}}
+    parts = ("field", "policy", "funnel", "goal")
+    for i, (stage, proof) in enumerate(zip(terms["stages"], terms["proofs"], strict=True), start=1):
+        own = dict(zip(parts, stage.terms, strict=True)) | {"proof": proof}
+        printed = funnel(own, {"proof": files[f"stage{i}.proof"]})
+        documents |= {f"stage{i}.{role}": document for role, document in printed.items()}
+    return documents
+
+
 def _maybe(term: Made) -> tuple[Any, ...]:
     return term.terms
 
@@ -253,6 +267,47 @@ def _squares(term: Made) -> dict[str, Any]:
         raise Differs("weights that differ between factors")
     rows = [[row for _, row in factor] for factor in factors]
     return {"unit": unit, "scale": scale, "weights": weights[0], "factors": rows}
+
+
+def sampled(terms: dict[str, Any], _files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
+    """The files of a sampled funnel, and its proof."""
+    exponents, coefficients, x_range, u_range = terms["model"].terms
+    form, *numbers = terms["funnel"].terms
+    bound, rate, gain, tube, inlet, half_widths, S, A = map(number, numbers)
+    names = ("basis", "ball_basis")
+    *bases, links = terms["proof"].terms
+    variables = range(1, len(x_range) + 1)
+    return {
+        "model": {
+            "exponents": exponents, "coefficients": number(coefficients),
+            "x_range": number(x_range), "u_range": number(u_range),
+        },
+        "policy": dict(zip("uxK", map(number, terms["policy"].terms), strict=True)),
+        "funnel": {
+            "assumption": {"form": form.name.lower(), "bound": bound, "rate": rate, "gain": gain},
+            "tube": tube, "inlet": inlet, "half_widths": half_widths, "S": S, "A": A,
+        },
+        "proof": {"proof": {
+            **{name: [[row.count(i) for i in variables] for row in rows]
+               for name, rows in zip(names, bases, strict=True)},
+            "steps": [_link(link) for link in links],
+        }},
+    }  # fmt: skip
+
+
+def _link(link: Made) -> dict[str, Any]:
+    *numbers, tube, inlet = link.terms
+    T, kappa, curvature = map(number, numbers)
+    chains = {"tube": _chain(tube), "inlet": _chain(inlet)}
+    return {"T": T, "kappa": kappa, "curvature": curvature, **chains}
+
+
+def _chain(chain: Made) -> dict[str, Any]:
+    reach, columns, squares, ball_columns, ball = chain.terms
+    return {
+        "reach": number(reach), "columns": columns, "squares": _squares(squares),
+        "ball": {"columns": ball_columns, "squares": _squares(ball)},
+    }  # fmt: skip
 
 
 def near(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:

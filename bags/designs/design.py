@@ -148,6 +148,23 @@ class WiredDesign(Generic[M, P, F]):
         named: Any = self.funnel if self.funnel is not None else self.policy
         return self.composition or files.digest(named.document())
 
+    @property
+    def made_with(self) -> dict[str, str]:
+        """What recordings were used for (training, calibration or both), by their digests."""
+        trained: set[str] = set()
+        calibrated: set[str] = set()
+        for stage in self.stages:
+            model, funnel = stage.model, stage.funnel
+            trained |= {digest for _, digest in getattr(model, "bags", ())}
+            for tube in funnel.tubes if isinstance(funnel, TubeFunnel) else ():
+                trained |= {digest for _, digest in tube.designed_on}
+                calibrated |= {digest for _, digest in tube.measured_on}
+        parts = {"training": trained, "calibration": calibrated}
+        return {
+            digest: " and ".join(use for use, part in parts.items() if digest in part)
+            for digest in trained | calibrated
+        }
+
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
         if self.later:
@@ -237,20 +254,6 @@ def read_design(
     design: Any = WiredDesign(model, policy, funnel, wiring, held)
     made: AnyDesign = design
     return made
-
-
-def made_of(design: AnyDesign) -> set[str]:
-    """Digests of the recordings that model or funnel name: those that fitted or scaled them."""
-    found: set[str] = set()
-    for stage in design.stages:
-        waiting: list[Any] = [stage.model.document(), stage.funnel.document()]
-        while waiting:
-            part = waiting.pop()
-            if isinstance(part, dict) and part.keys() == {"name", "digest"}:
-                found.add(str(part["digest"]).partition("[")[0])  # of a window, its recording
-            elif isinstance(part, dict | list):
-                waiting += part.values() if isinstance(part, dict) else part
-    return found
 
 
 def _read_at(signals: tuple[Signal, ...], *, single: bool) -> SignalPath | SignalVector:

@@ -65,16 +65,17 @@ def write_folder_report(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
-    spared: Sequence[str] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> None:
     """Write the page of a design folder.
 
     recordings: bags whose losses are listed, with the topics to list. replays: bags held against
-    its funnel, `drawn` their picture as <svg> or empty; spared: names of bags that are not, since
-    they made it. Raises DocumentError if the folder has neither a proof nor a report.
+    its funnel, `drawn` their picture as <svg> or empty; used: lines about bags that the design was
+    made with. Raises DocumentError if the folder has
+    neither a proof nor a report.
     """
-    page = folder_page(folder, recordings=recordings, replays=replays, spared=spared, drawn=drawn)
+    page = folder_page(folder, recordings=recordings, replays=replays, used=used, drawn=drawn)
     files.write_atomically(out, page.encode())
 
 
@@ -109,7 +110,7 @@ def folder_page(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
-    spared: Sequence[str] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> str:
     """The whole page as text."""
@@ -125,7 +126,7 @@ def folder_page(
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
-        "replays": ("Recordings held against the funnel", _replays(replays, spared, drawn)),
+        "replays": ("Recordings held against the funnel", _replays(replays, used, drawn)),
         "recordings": ("Recordings and their losses", _recordings(recordings)),
         "files": ("Files", _files(folder, proofs)),
     }
@@ -276,7 +277,7 @@ def _between(values: Sequence[float], unit: str = "") -> str:
     return f"{' to '.join(ends)}{unit}"
 
 
-def _replays(replays: Sequence[Replay], spared: Sequence[str], drawn: str) -> str:
+def _replays(replays: Sequence[Replay], used: Sequence[str], drawn: str) -> str:
     if not replays:
         return ""
     rows = "".join(_replay(replay) for replay in replays)
@@ -289,14 +290,10 @@ def _replays(replays: Sequence[Replay], spared: Sequence[str], drawn: str) -> st
         for replay in replays
         if replay.said_wide
     )
-    left_out = (
-        f" Not judged, because the model or the tube was made of them: {escape(', '.join(spared))}."
-        if spared
-        else ""
-    )
-    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
+    lines = "".join(f"<p>{escape(line[0].upper() + line[1:])}.</p>" for line in used)
+    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{lines}
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
-most of what is assumed that any judged sample used.{left_out}</p>{wide}{drawn}"""
+most of what is assumed that any judged sample used.</p>{wide}{drawn}"""
 
 
 def _replay(replay: Replay) -> str:

@@ -15,6 +15,11 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
+from nlsid_core.identification.feedback import (
+    FeedbackClass,
+    identify_feedback,
+    identify_unproved,
+)
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import (
     ImplicitClass,
@@ -248,6 +253,27 @@ def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwo
     return trail
 
 
+def feedback(train: Dataset, model_class: FeedbackClass, task: Task) -> Trail[CellNetwork]:
+    """Filters with feedback through a static map, unrolled; the loop itself for comparison."""
+    trail: Trail[CellNetwork] = Trail(
+        task, prove_stability, f"held-back error, rms [{_unit(train)}]"
+    )
+    fitted, judged = hold_out(train)
+
+    def search(method: CertifiedSem) -> tuple[CellNetwork, Proof]:
+        model, proof, steps = identify_feedback(
+            train, fitted, judged, model_class, transient=task.transient,
+            slowest=min(MAX_RADIUS, task.searched_rate), steps=method.iterations,
+            progress=task.progress,
+        )  # fmt: skip
+        trail.history = History(trail.history.value, steps)
+        return model, proof
+
+    trail.add(Sem, lambda _: identify_unproved(train, model_class, transient=task.transient))
+    trail.add_proved(CertifiedSem, search)
+    return trail
+
+
 def monotone(train: Dataset, model_class: MonotoneClass, task: Task) -> Trail[MonotoneEquation]:
     """Monotone equations through moments, of repeated experiments if there are any."""
     offsets = offsets_of(train.trajectories)
@@ -424,6 +450,7 @@ OFFERS: dict[type, Offer] = {
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     CellClass: Offer(cells, (CertifiedSem,), ()),
+    FeedbackClass: Offer(feedback, (CertifiedSem, Sem), (Sem,)),
     MonotoneClass: Offer(
         monotone,
         (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),

@@ -102,8 +102,12 @@ class Validation:
             f"one-step residual is {self.one_step}",
             f"simulation residual is {self.simulation}",
         ]
-        rms = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in self.output_rms]
-        lines.insert(1, f"rms error of the simulation: {', '.join(rms)}")
+        rms = []
+        for (name, value, unit), part in zip(self.output_rms, self.output_percent, strict=True):
+            varies = f" of the {100.0 * value / part:.3g}" if 0.0 < part < np.inf else ""
+            rms.append(f"{name} {value:.3g}{varies} {unit}".rstrip())
+        said = " by which it varies in these trials" if len(rms) == 1 else ""
+        lines.insert(1, f"rms error of the simulation: {', '.join(rms)}{said}")
         if self.clipped_percent:
             lines.insert(
                 2,

@@ -69,21 +69,6 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
 
 
-def test_every_bag_that_made_no_part_of_the_design_is_judged(design: Path, tmp_path: Path) -> None:
-    """A training trial, a test trial, and a copy of the latter with a broken sensor."""
-    training, tested = f1tenth()[0], f1tenth()[4]
-    path = load_config(CONFIG).signals.response[0].path
-    write_faulty_copy(tested, tmp_path / "broken", path, FAULTS["scaled by 0.6"])
-    out = tmp_path / "page.html"
-    bags = [training, tested, tmp_path / "broken"]
-    said = nlsid("report", design, *bags, "--config", CONFIG, "--out", out)
-    assert "1 of 3 bags made the design and are not judged" in said
-    page = Page(out.read_text()).text
-    assert f"the model or the tube was made of them: {training.name}." in page
-    assert f"{tested.name}inside" in page
-    assert re.search("broken(outside|assumption violated)", page)
-
-
 def test_bags_with_nothing_lost_share_a_row_and_the_others_have_their_own(design: Path) -> None:
     bags = [bag_info(bag) for bag in f1tenth()[:3]]
     topics = tuple(replace(topic, gaps=int(topic.topic == "/odom")) for topic in bags[1].topics)
@@ -117,6 +102,32 @@ def test_a_composition_is_drawn_from_its_files(tmp_path: Path) -> None:
     assert page.count("<svg") == 1
     assert "<figcaption>The funnel: the tube around the motion</figcaption>" in page
     assert "stage1.vector_field of composition.proof.json" in page
+
+
+def test_every_bag_that_did_not_make_the_design_is_judged_and_the_others_are_named(
+    design: Path, tmp_path: Path
+) -> None:
+    """A faulty bag that no split names, and a training trial that goes by another name."""
+    bags, settings = f1tenth(), load_config(CONFIG)
+    sign = next(bag for bag in bags if bag.name in settings.split.test)
+    trained = next(bag for bag in bags if bag.name not in settings.split.test)
+    again, faulty = tmp_path / "again", tmp_path / "faulty"
+    shutil.copytree(trained, again)
+    write_faulty_copy(sign, faulty, settings.signals.response[0].path, FAULTS["scaled by 0.6"])
+    said = nlsid("report", design, sign, again, faulty, "--config", CONFIG)
+    judged, _, rest = (
+        Page((design / documents.DESIGN_REPORT).read_text())
+        .text.partition("Recordings held against the funnel")[2]
+        .rpartition("Not judged")
+    )
+    assert all(name in judged for name in (sign.name, "faulty"))
+    assert "violated" in judged
+    for text in (rest, said.partition("not judged")[2]):
+        assert re.match(
+            r": again \(used for (training|calibration|training and calibration)\)", text
+        )
+    by_choice = nlsid("report", design, again)
+    assert "judged all the same: again (used for" in by_choice
 
 
 def test_a_forged_proof_is_rejected_on_the_page(design: Path) -> None:
