@@ -412,10 +412,10 @@ def multipliers_gone(files: Files) -> None:
 
 
 def spline_steeper(files: Files) -> None:
-    """By half, where it is steepest."""
+    """Four times, where it is steepest."""
     c = files["model.json"]["f"]["coefficients"]
     steepest = max(range(len(c) - 1), key=lambda i: c[i + 1] - c[i])
-    rise = 0.5 * (c[steepest + 1] - c[steepest])
+    rise = 3.0 * (c[steepest + 1] - c[steepest])
     c[steepest + 1 :] = [entry + rise for entry in c[steepest + 1 :]]
 
 
