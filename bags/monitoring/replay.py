@@ -1,7 +1,7 @@
 """Offline monitoring: a bag's messages through the same sampling and monitor as the live node."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,8 +14,10 @@ from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Forecasted, Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
+from bags.signals.reader import bag_digest
 from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
@@ -190,6 +192,42 @@ def _unjudged(reading: Reading) -> bool:
     return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
 
 
+@dataclass(frozen=True)
+class ToJudge:
+    """Bags to hold against a design, and those that it was made with, each with its use.
+
+    One that it was made with is judged only if all of them are such.
+    """
+
+    judged: tuple[Path, ...]
+    used: Mapping[Path, str]
+
+    @property
+    def said(self) -> list[str]:
+        """A line for each use, with the names of its bags; empty if there is none."""
+        uses: dict[str, list[str]] = {}
+        for path, use in self.used.items():
+            uses.setdefault(use, []).append(trial_name(path))
+        what = "judged all the same" if set(self.judged) & set(self.used) else "not judged"
+        return [f"{what}: {', '.join(names)} (used for {use})" for use, names in uses.items()]
+
+
+def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[str] = ()) -> ToJudge:
+    """The bags that the design was not made with, by their content, else all of them.
+
+    A verdict on a recording that made a design says little. validation: names of bags that orders
+    and bases were chosen by.
+    """
+    made_with = design.made_with
+    used: dict[Path, str] = {}
+    for bag in bags:
+        if use := made_with.get(bag_digest(bag)):
+            used[bag] = use
+        elif trial_name(bag) in validation:
+            used[bag] = "validation"
+    return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
+
+
 def replay_bag(
     proved: Proved[AnyDesign],
     bag: Path | str,
@@ -291,13 +329,14 @@ def announced_runs(
 def _fed(
     watch: Watch, bag: Path, definitions: Definitions | None, *, announced: bool
 ) -> Iterator[list[Stamped]]:
-    """What `watch` says to every message, in log order."""
-    design = watch.design
-    digest = design.digest
+    """What `watch` says to every message, by log time; as recorded where it goes back itself."""
+    digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
         run_topics = _run_topics(source) if announced else []
-        for message in source.messages([*run_topics, *watch.pairing.topics]):
+        topics = watch.pairing.topics
+        set_back = watch.pairing.clock == "log" and bool(source.log_order(topics).back)
+        for message in source.messages([*run_topics, *topics], as_recorded=set_back):
             if message.topic in run_topics:
                 run = _run(message, source)
                 if run.funnel == digest:

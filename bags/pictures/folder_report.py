@@ -59,15 +59,17 @@ def write_folder_report(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> None:
     """Write the page of a design folder.
 
     recordings: bags whose losses are listed, with the topics to list. replays: bags held against
-    its funnel, `drawn` their picture as <svg> or empty. Raises DocumentError if the folder has
+    its funnel, `drawn` their picture as <svg> or empty; used: lines about bags that the design was
+    made with. Raises DocumentError if the folder has
     neither a proof nor a report.
     """
-    page = folder_page(folder, recordings=recordings, replays=replays, drawn=drawn)
+    page = folder_page(folder, recordings=recordings, replays=replays, used=used, drawn=drawn)
     files.write_atomically(out, page.encode())
 
 
@@ -102,6 +104,7 @@ def folder_page(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> str:
     """The whole page as text."""
@@ -118,7 +121,7 @@ def folder_page(
         "model": ("The model", model),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
         "recordings": ("Recordings and their losses", _recordings(recordings)),
-        "replays": ("Recordings held against the funnel", _replays(replays, drawn)),
+        "replays": ("Recordings held against the funnel", _replays(replays, used, drawn)),
         "files": ("Files", _files(folder)),
     }
     present = {key: found for key, found in chapters.items() if found[1]}
@@ -218,7 +221,7 @@ def _recorded(info: BagInfo, topic: TopicInfo) -> str:
     return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
 
 
-def _replays(replays: Sequence[Replay], drawn: str) -> str:
+def _replays(replays: Sequence[Replay], used: Sequence[str], drawn: str) -> str:
     if not replays:
         return ""
     rows = "".join(_replay(replay) for replay in replays)
@@ -226,7 +229,8 @@ def _replays(replays: Sequence[Replay], drawn: str) -> str:
         f"<th>{name}</th>"
         for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
     )
-    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
+    lines = "".join(f"<p>{escape(line[0].upper() + line[1:])}.</p>" for line in used)
+    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{lines}
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
 most of what is assumed that any judged sample used.</p>{drawn}"""
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from bags.chain.config import load_config
+from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.pictures.folder_report import BROWSERS, folder_page, print_page
@@ -61,6 +63,32 @@ def test_it_has_every_chapter_and_needs_nothing_else(design: Path) -> None:
     assert page.tags.count("svg") > 3
     assert "script" not in page.tags
     assert all(link.startswith(("#", "data:image/png;base64,")) for link in page.links)
+
+
+def test_every_bag_that_did_not_make_the_design_is_judged_and_the_others_are_named(
+    design: Path, tmp_path: Path
+) -> None:
+    """A faulty bag that no split names, and a training trial that goes by another name."""
+    bags, settings = f1tenth(), load_config(CONFIG)
+    sign = next(bag for bag in bags if bag.name in settings.split.test)
+    trained = next(bag for bag in bags if bag.name not in settings.split.test)
+    again, faulty = tmp_path / "again", tmp_path / "faulty"
+    shutil.copytree(trained, again)
+    write_faulty_copy(sign, faulty, settings.signals.response[0].path, FAULTS["scaled by 0.6"])
+    said = nlsid("report", design, sign, again, faulty, "--config", CONFIG)
+    judged, _, rest = (
+        Page((design / documents.DESIGN_REPORT).read_text())
+        .text.partition("Recordings held against the funnel")[2]
+        .rpartition("Not judged")
+    )
+    assert all(name in judged for name in (sign.name, "faulty"))
+    assert "violated" in judged
+    for text in (rest, said.partition("not judged")[2]):
+        assert re.match(
+            r": again \(used for (training|calibration|training and calibration)\)", text
+        )
+    by_choice = nlsid("report", design, again)
+    assert "judged all the same: again (used for" in by_choice
 
 
 def test_a_forged_proof_is_rejected_on_the_page(design: Path) -> None:
