@@ -452,9 +452,9 @@ def program(build: Path) -> Path:
 def test_both_kernels_refuse_a_forged_tube(
     forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
 ) -> None:
-    of = {feedback_stronger: "engaged", spline_steeper: "lasting_cascade"}
-    of[filter_stronger] = "lasting_cascade"
-    folder = CORPUS / "tube" / of.get(forge, "lasting_two_outputs")
+    of_cascades = forge in (spline_steeper, filter_stronger)
+    planned = "engaged" if forge is feedback_stronger else "lasting_two_outputs"
+    folder = CORPUS / "tube" / ("lasting_cascade" if of_cascades else planned)
     files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
     forge(files)
     proof = put(files, tmp_path)
