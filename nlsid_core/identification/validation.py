@@ -50,7 +50,8 @@ class Residual:
     independent: bool
 
     def __str__(self) -> str:
-        white = "white" if self.white else "NOT white (99 %): dynamics or coloured noise are left"
+        left = "dynamics are left, or noise that is coloured or of both kinds"
+        white = "white" if self.white else f"NOT white (99 %): {left}"
         if self.independent:
             return f"{white}, independent of the input"
         return f"{white}, NOT independent of the input (99 %): it explains more than the model uses"
