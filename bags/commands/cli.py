@@ -322,7 +322,9 @@ def push(
     out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
     response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
     command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
-    period: PeriodOption = 0.0,
+    period: Annotated[
+        float, typer.Option(help="Seconds between samples; default: as they come.")
+    ] = 0.0,
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
     ] = 0.0,
@@ -414,7 +416,7 @@ def report(
     folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
     bags: Annotated[
         list[Path] | None,
-        typer.Argument(help="Bags whose losses are listed, and that are held against its funnel."),
+        typer.Argument(help="Their losses are listed; those that made no part of it are judged."),
     ] = None,
     config: Annotated[
         Path | None,
@@ -447,7 +449,7 @@ def report(
     recordings, replays, drawn = [], [], ""
     used: list[str] = []
     if bags:
-        proved = documents.load_proved(folder / documents.FUNNEL)
+        proved = documents.load_proved(documents.funnel_of(folder))
         folders = expand_bags(bags)
         topics = Watch(proved.design, centre=show.centre_of(settings)).pairing.topics
         with progress_bar("reading") as progress:

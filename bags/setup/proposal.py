@@ -663,7 +663,9 @@ def _terms(tried: StateAffineClass) -> int:
 def _poor(best: float, where: str) -> str:
     return (
         f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
-        "will be wide; another pair of signals, or more of them, may say more"
+        "will be wide; another pair of signals, or more of them, may say more. Not tried here: "
+        "`model: feedback` for what swings on a spring that stiffens, `cells` for dry friction and "
+        "for levels that flow over, `block_cascade` for what saturates"
     )
 
 
