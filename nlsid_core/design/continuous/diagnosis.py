@@ -143,7 +143,7 @@ def _terms(
     parts["disturbance"] = pushed[:, :own].sum(axis=1)
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning
-    rest = steps.values(section, rho, case) - linear - sum(parts.values())
+    rest = steps.values(section, rho, [case])[0] - linear - sum(parts.values())
     cause = "saturation" if len(steps.limits) else "hold" if steps.widths is not None else "motion"
     parts[cause] = parts.get(cause, 0.0) + np.asarray(rest)
     return linear, parts

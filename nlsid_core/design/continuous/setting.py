@@ -98,7 +98,7 @@ class Setting:
             cubic = self.expansion.around(self.policy, self.P, last, (rho, rho))
             self.steps.local[last] = cubic
         self.steps.bound_pushes(end, rho)
-        return MARGIN * float(np.abs(self.steps.values(end, rho, 0)).mean())
+        return MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
 
 
 def prepare(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.diagnosis import NoFunnel, diagnosed
@@ -18,6 +19,7 @@ from nlsid_core.sos.sphere import SphereSolution
 ACCEPT = 0.5  # of the margin asked for: closer is not worth another program
 MAX_TRIES = 12
 NEAR = 1.01  # of a feasible ρ: closer to the largest is not worth another program
+CLOSE = 1e-6  # of ρ: how near a bound's root is found
 LOWEST = 1e-9  # of ρ at the right end: below, there is no funnel worth the name
 
 
@@ -119,7 +121,7 @@ def _largest(
 
 
 def _root(slack: Callable[[float], float], low: float, high: float) -> float:
-    """The largest r in [low, high] with slack(r) ≥ 0, by bisection on log r after a coarse look."""
+    """The largest r in [low, high] with slack(r) ≥ 0, nearly, after a coarse look from above."""
     if slack(high) >= 0:
         return high
     step = 0.9
@@ -129,9 +131,4 @@ def _root(slack: Callable[[float], float], low: float, high: float) -> float:
         step *= step
     if inside <= low:
         return low
-    for _ in range(40):
-        middle = (inside + high) / 2
-        if high - inside <= 1e-9 * high:
-            break
-        inside, high = (middle, high) if slack(middle) >= 0 else (inside, middle)
-    return inside
+    return float(brentq(slack, inside, high, xtol=CLOSE * high))
