@@ -14,9 +14,9 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.setting import Setting
 from nlsid_core.dynamics import Rates, VectorField
 
-STEPS = 300  # of Runge-Kutta of order four, at least
+STEPS = 200  # of Runge-Kutta of order four, at least
 MOST_SAMPLES = 2000  # of a held input: a shorter hold is simulated without one
-ASCENTS = 3  # of the distance at the end: the first is at most a few percent short of the last
+ASCENTS = 3  # of the distance at the end: two are usual
 SCALES = np.concatenate([[0.0], np.geomspace(2.0**-8, 1.0, 9)])
 LOST = 1e6  # of the goal's size: what is as far from the motion does not come back
 
@@ -44,12 +44,12 @@ class Tried:
 
     def __str__(self) -> str:
         held = f", with inputs held for {self.period:g} s," if self.period else ""
+        far = f"{self.farthest[0]:.3g} times as far from the goal's centre as the goal reaches"
         if self.impossible:
             how = ", while w and the measurement's error switch between the ends of their bounds"
             return (
                 f"No funnel of this policy can be proved: a simulated solution{held} starts on the "
-                f"motion at {self.start:g} s and ends {self.farthest[0]:.3g} times as far from the "
-                f"goal's centre as the goal reaches{how if self.pushed else ''}"
+                f"motion at {self.start:g} s and ends {far}{how if self.pushed else ''}"
             )
         missed = np.flatnonzero(self.farthest > 1)
         said = "Of the solutions that were simulated none misses the goal"
@@ -57,23 +57,17 @@ class Tried:
             sizes = ", ".join(f"{width:.3g}" for width in SCALES[missed[0]] * self.widths)
             said = (
                 f"A simulated solution{held} starts at {self.start:g} s within ({sizes}) of the "
-                "motion and misses the goal, so that no funnel with this policy and P is that wide"
+                "motion and misses the goal: no funnel of this shape begins as wide as that"
             )
-        if self.pushed:
-            said += (
-                "; those that start on the motion end at most "
-                f"{self.farthest[0]:.2g} times as far from the goal's centre as the goal reaches"
-            )
-        return said
+        return f"{said}; those that start on the motion end at most {far}" if self.pushed else said
 
 
 def try_to_miss(setting: Setting) -> Tried:
     """Simulate the policy of a search that failed, against everything that its claim allows."""
-    steps, policy, goal, hold = setting.steps, setting.policy, setting.goal, setting.hold
-    field = steps.field
-    true = field if setting.expansion is None else setting.expansion.rates
+    policy, goal, hold, n = setting.policy, setting.goal, setting.hold, setting.steps.field.n
+    true = setting.steps.field if setting.expansion is None else setting.expansion.rates
     low, high = true.uncertain.T
-    error = np.zeros(field.n) if hold is None else hold.error
+    error = np.zeros(n) if hold is None else hold.error
     start, end = float(policy.t[0]), float(policy.t[-1])
     period = 0.0 if hold is None or hold.longest else hold.period
     if period < (end - start) / MOST_SAMPLES:
@@ -81,16 +75,20 @@ def try_to_miss(setting: Setting) -> Tried:
     each = max(1, int(np.ceil(STEPS * period / (end - start))))  # steps a sample
     step = period / each if period else (end - start) / STEPS
     t = np.append(np.arange(start, end - step / 2, step), end)
+    halves = np.interp(np.arange(2 * len(t) - 1) / 2, np.arange(len(t)), t).tolist()
+    x0, u0, K = ([part(s) for s in halves] for part in (policy.x, policy.u, policy.K))
     across, by_w, by_error = _linear(setting, true, t)
     inlet = np.linalg.inv(setting.P[0])
-    axes = np.linalg.cholesky(goal.P).T  # rows: d'x at the end is what they make large
+    axes = np.linalg.cholesky(goal.P).T  # rows d: d'x at the end is made as large as can be
     D = np.tile(np.concatenate([axes, -axes]), (len(SCALES), 1))
-    scale = np.repeat(SCALES, 2 * field.n)
+    scale = np.repeat(SCALES, 2 * n)
     farthest = np.zeros(len(SCALES))
 
-    def rate(s: float, X: FloatArray, W: FloatArray) -> FloatArray:
-        U = held if period else policy(s, X + e)
-        return true(s, X, U, W)
+    def demanded(half: int, X: FloatArray) -> FloatArray:
+        return policy.clipped(u0[half] - (X - x0[half]) @ K[half].T)
+
+    def rate(half: int, X: FloatArray, W: FloatArray) -> FloatArray:
+        return true(halves[half], X, held if period else demanded(half, X + e), W)
 
     for _ in range(ASCENTS):
         adjoint = np.empty((len(t), *D.shape))
@@ -99,20 +97,20 @@ def try_to_miss(setting: Setting) -> Tried:
             adjoint[k] = adjoint[k + 1] @ across[k]
         first = adjoint[0] @ inlet
         size = np.sqrt(np.einsum("ni,ni->n", first, adjoint[0]))
-        X = policy.x(start) + (scale / size)[:, None] * first
+        X = x0[0] + (scale / size)[:, None] * first
         lost = np.zeros(len(X), dtype=bool)
-        for k, (s, h) in enumerate(zip(t[:-1].tolist(), np.diff(t).tolist(), strict=True)):
+        for k, h in enumerate(np.diff(t).tolist()):
             W = np.where(adjoint[k] @ by_w[k] > 0, high, low)
             e = error * np.where(adjoint[k] @ by_error[k] > 0, 1.0, -1.0)
             if k % each == 0:
-                held = policy(s, X + e)
-            a = rate(s, X, W)
-            b = rate(s + h / 2, X + h / 2 * a, W)
-            c = rate(s + h / 2, X + h / 2 * b, W)
-            X = X + h / 6 * (a + 2 * b + 2 * c + rate(s + h, X + h * c, W))
-            gap = X - policy.x(s + h)
+                held = demanded(2 * k, X + e)
+            a = rate(2 * k, X, W)
+            b = rate(2 * k + 1, X + h / 2 * a, W)
+            c = rate(2 * k + 1, X + h / 2 * b, W)
+            X = X + h / 6 * (a + 2 * b + 2 * c + rate(2 * k + 2, X + h * c, W))
+            gap = X - x0[2 * k + 2]
             lost |= ~(np.einsum("ni,ij,nj->n", gap, goal.P, gap) < LOST**2)
-            X[lost] = policy.x(s + h)
+            X[lost] = x0[2 * k + 2]
         gap = X - goal.centre
         distance = np.sqrt(np.einsum("ni,ij,nj->n", gap, goal.P, gap))
         distance[lost] = np.inf
@@ -129,25 +127,20 @@ def _linear(
 
     Pushes: (n, n_w) of w from one end of its box to the other, and (n, n) of the measured state.
     """
-    steps, policy = setting.steps, setting.policy
-    identity, box = np.eye(steps.field.n), true.uncertain
+    field, policy = setting.steps.field, setting.policy
+    identity, box = np.eye(field.n), true.uncertain
     middle = box.mean(axis=1)
-    lowest, highest = middle + np.diag(box[:, 0] - middle), middle + np.diag(box[:, 1] - middle)
+    corners = middle + np.vstack([np.diag(end - middle) for end in box.T])
     across, by_w, by_error = [], [], []
     for s, h in zip(((t[:-1] + t[1:]) / 2).tolist(), np.diff(t).tolist(), strict=True):
         x, u, K = policy.x(s), policy.u(s), policy.K(s)
-        A, B = steps.field.jacobians(s, x, u)
+        A, B = field.jacobians(s, x, u)
         loop = h / 2 * (A - B @ K)
         across.append(np.linalg.solve(identity - loop, identity + loop))
-        by_w.append((_at(true, s, x, u, highest) - _at(true, s, x, u, lowest)).T)
         by_error.append(-B @ K)
+        by_w.append(np.zeros((field.n, 0)))
+        if len(box):
+            count = len(corners)
+            ends = true(s, np.tile(x, (count, 1)), np.tile(u, (count, 1)), corners)
+            by_w[-1] = (ends[len(box) :] - ends[: len(box)]).T
     return across, by_w, by_error
-
-
-def _at(
-    true: VectorField | Rates, s: float, x: FloatArray, u: FloatArray, w: FloatArray
-) -> FloatArray:
-    """(N, n) rates at one point for w (N, n_w)."""
-    if not len(w):
-        return np.zeros((0, len(x)))
-    return true(s, np.tile(x, (len(w), 1)), np.tile(u, (len(w), 1)), w)

@@ -12,6 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.counterexample import try_to_miss
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
@@ -96,7 +97,10 @@ def design_funnel(
             raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
-    setting, funnel, proved, margin = _found(setting, progress)
+    try:
+        setting, funnel, proved, margin = _found(setting, progress)
+    except Infeasible as refusal:
+        raise Infeasible(f"{refusal}{_simulated(setting)}") from refusal
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -179,6 +183,15 @@ def validity_caps(
                 reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(P[knot]), rows).max()
                 caps[knot] = min(caps[knot], CAP_ROOM * room**2 / reach)
     return caps
+
+
+def _simulated(setting: Setting) -> str:
+    """What simulated solutions say of a claim that was not proved, where they can be computed."""
+    try:
+        with np.errstate(all="ignore"):
+            return f". {try_to_miss(setting)}"
+    except (ArithmeticError, ValueError, RuntimeError):  # the equations may end away from a motion
+        return ""
 
 
 def _found(setting: Setting, progress: Progress) -> _Found:
