@@ -2,8 +2,8 @@
 
 python -m benchmarks.f1tenth [--json]
 
-Published beside ours: the figures first measured on these trials (four lags, all but the test
-trials): least squares 11.7 %, simulation-error minimum about 8.5 %.
+Beside these is what was measured first on these trials (four lags, all but the test trials):
+least squares 11.7 %, simulation-error minimum about 8.5 %.
 """
 
 import os
@@ -129,8 +129,8 @@ def main() -> None:
     arguments = parser.parse_args()
     keys = measure()
     print(f"F1TENTH speed, 4 lags, 17 training, 16 calibration and 8 test trials, {describe()}\n")
-    print(f"{'':42s}{'ours':>9s}{'published':>12s}")
-    for label, key, published in (
+    print(f"{'':42s}{'ours':>9s}{'before':>12s}")
+    for label, key, before in (
         ("least squares, test error [%]", "ls", "11.7"),
         ("robust simulation error, first [%]", "first", "-"),
         ("robust simulation error, final [%]", "final", "<= 9.5"),
@@ -140,7 +140,7 @@ def main() -> None:
         ("bags to model, proof and report [s]", "identify_seconds", "-"),
         ("both proofs checked exactly [s]", "check_seconds", "-"),
     ):
-        print(f"{label:42s}{keys[key]:9.3f}{published:>12s}")
+        print(f"{label:42s}{keys[key]:9.3f}{before:>12s}")
     print(f"{'proved':42s}{keys['proved']!s:>9s}")
     refused = f"{keys['rie_pairs_refused']}/{keys['rie_pairs']}"
     print(f"{'pairs of repeats that differ beyond noise':42s}{refused:>9s}")

@@ -38,7 +38,8 @@ def _prepare(app: Any) -> None:
     _documented.update(api.write(Path(app.srcdir) / "api"))
     results = measured.page(ROOT / "benchmarks" / "results", ROOT / "benchmarks")
     (Path(app.srcdir) / "benchmarks.md").write_text(results)
-    for page in sorted(Path(app.srcdir).glob("theory*.md")):
+    pages = [page for page in Path(app.srcdir).glob("*.md") if linking.derives(page.stem)]
+    for page in sorted(pages):
         for name in linking.linked(page.read_text(), _documented)[1]:
             _derived.setdefault(name, []).append(page.stem)
 
@@ -46,7 +47,7 @@ def _prepare(app: Any) -> None:
 def _read(app: Any, name: str, source: list[str]) -> None:
     if name.startswith("decisions/0"):
         source[0] = f"---\norphan: true\n---\n{source[0]}"
-    if name.startswith("theory"):
+    if linking.derives(name):
         source[0] = linking.linked(source[0], _documented)[0]
     source[0] = measured.filled(source[0], ROOT / "benchmarks" / "results")
     if running.FRONT.match(source[0]):

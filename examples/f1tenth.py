@@ -12,7 +12,7 @@ SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
 
 
 def run() -> tuple[dict[str, float], dict[str, float]]:
-    """(computed, published): the test error in % and how many test trials stay inside."""
+    """(computed, known): the test error in % and how many test trials stay inside."""
     dataset = read_dataset(f1tenth(), responses=[SPEED], excitations=[COMMAND], max_gap=0.1)
     train, test = dataset.without(TEST), dataset.select(TEST)
 
@@ -31,6 +31,6 @@ def run() -> tuple[dict[str, float], dict[str, float]]:
 
 
 if __name__ == "__main__":
-    computed, published = run()
+    computed, known = run()
     for key, value in computed.items():
-        print(f"{key:10s}{value:8.2f}   published {published[key]:g}")
+        print(f"{key:10s}{value:8.2f}   known {known[key]:g}")

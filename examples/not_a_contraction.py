@@ -39,5 +39,5 @@ def proof() -> ImplicitProof:
 
 
 if __name__ == "__main__":
-    print("|da(5/4)|^2 = {:.4f}, published {:.3f}".format(*example()))
+    print("|da(5/4)|^2 = {:.4f}, by hand {:.3f}".format(*example()))
     print(f"proved stable by Lemma {proof().set}, delta = {proof().delta:g}")

@@ -18,12 +18,13 @@ from nlsid_core import conic
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.design import FunnelDesign, decided, proved_for
+from nlsid_core.design.continuous.graded import monomials_of, positions
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.shape import MAX_ITERATIONS, STOP, refuse_shape, solve_ends
 from nlsid_core.design.continuous.sweep import Ends
-from nlsid_core.design.continuous.vstep import gram_columns
+from nlsid_core.design.continuous.vstep import DEGREE
 from nlsid_core.design.problems import ContinuousTracking
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -128,12 +129,13 @@ def alternate_rho(
         ends = solve_ends(steps, policy, funnel, executor=executor)
         forms = KnotForms(steps, policy, funnel, ends, margin=0.0)
         rho = funnel.rho.copy()
+        basis = np.vstack([monomials_of(funnel.n, q) for q in range(3)])
         for k in range(len(rho) - 2, -1, -1):
             largest = []
             for constant, slope in levels(forms, k, rho[k + 1]):
                 constant[0] -= margin
                 try:
-                    largest.append(largest_level(constant, slope, forms.basis))
+                    largest.append(largest_level(constant, slope, basis))
                 except SolverError:
                     largest.append(0.0)
             rho[k] = max(funnel.rho[k], min(largest) * (1 - 1e-6))
@@ -151,11 +153,11 @@ def levels(forms: KnotForms, k: int, after: float) -> list[tuple[FloatArray, Flo
     constant is -Ẇ/ρ° + μ(1 - |z|²), so c/ρ° = it + ρ̇/ρ° + μ(ρ/ρ° - 1).
     """
     result = []
-    half = len(forms.h) * forms.vertices
+    half = len(forms.h) * forms.cases
     for end in (0, 1):
         present = forms.rho[k + end]
-        for v in range(forms.vertices):
-            sample = forms.samples[end * half + k * forms.vertices + v]
+        for v in range(forms.cases):
+            sample = forms.samples[end * half + k * forms.cases + v]
             mu = sample.mu
             constant, slope = sample.constant.copy(), np.zeros_like(sample.constant)
             constant[0] += after / forms.h[k] / present
@@ -200,3 +202,14 @@ def refuse_first(setting: Setting, rho: FloatArray) -> None:
             f"the first rho does not end in the goal: rho(t_f) = {rho[-1]:.6g}, and the goal holds "
             f"what ends with at most {setting.rho_final:.6g}. Scale it down, or take a larger goal"
         )
+
+
+def gram_columns(basis: IntArray) -> tuple[sp.csc_matrix, int]:
+    """Monomial coefficients of v'Qv from svec(Q), and how long that is."""
+    n = basis.shape[1]
+    i, j = conic.triangle(len(basis))
+    rows = np.concatenate([monomials_of(n, q) for q in range(DEGREE + 1)])
+    home = positions(basis[i] + basis[j], rows)
+    weight = np.where(i == j, 1.0, conic.SQRT2)
+    shape = (len(rows), len(i))
+    return sp.csc_matrix((weight, (home, np.arange(len(i)))), shape=shape), len(i)

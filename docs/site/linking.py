@@ -1,6 +1,6 @@
-"""Links between the pages of theory and the functions that they derive, in both directions.
+"""Links between pages of theory or of certificates and the functions that they derive.
 
-In a page of theory, code such as `design.tube.design_output_tube` that names something of
+In such a page, code such as `design.tube.design_output_tube` that names something of
 nlsid_core becomes a link to its entry in the API, and that entry links back to the page.
 """
 
@@ -12,9 +12,14 @@ CODE = re.compile(r"(?<!`)`([A-Za-z_]\w*(?:\.\w+)*)(?:\([^`]*\))?`(?!`)")
 ROOMS = ("", "identification.", "models.", "design.", "dynamics.", "identification.moment_rie.")
 
 
+def derives(page: str) -> bool:
+    """Whether functions are derived in the page of that name."""
+    return page.startswith(("theory", "certificate", "sums_of_squares"))
+
+
 @cache
 def home(name: str) -> str | None:
-    """What a page of theory calls `name`: nlsid_core.module or nlsid_core.module.Name, or None.
+    """What such a page calls `name`: nlsid_core.module or nlsid_core.module.Name, or None.
 
     A field of a dataclass leads to its class.
     """

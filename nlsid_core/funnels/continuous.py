@@ -149,7 +149,7 @@ class ContinuousFunnel:
         return float(unit_ball / np.sqrt(np.linalg.det(self.shape(t))))
 
     def volume_integral(self) -> float:
-        """∫ volume dt over the knots by the trapezoidal rule, as the thesis's figures are made."""
+        """∫ volume dt over the knots by the trapezoidal rule."""
         volumes = np.array([self.volume(s) for s in self.t])
         return float((volumes[1:] + volumes[:-1]) @ np.diff(self.t) / 2)
 

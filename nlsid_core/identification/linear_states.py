@@ -3,7 +3,7 @@
     minimise Σ |E x⁺ - F x - G w - c|²   over [E - I, F'; F, E] ⪰ 0, E = E'
 in signals of unit spread. The set holds every stable A = E⁻¹F (2.19), so nothing stable is lost; an
 unstable truth gives the stable model nearest in this measure.
-Source: thesis (2.19), [70].
+Source: thesis (2.19), after its reference [70].
 """
 
 from dataclasses import dataclass

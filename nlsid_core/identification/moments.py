@@ -34,7 +34,7 @@ RANK_TOLERANCE = 1e-12  # relative eigenvalue of unit moments at which inputs re
 
 @dataclass(frozen=True)
 class MonotoneClass:
-    """e(y) affine in past outputs and in inputs, e increasing. Source: thesis Section 3.5.
+    """e(y) affine in past outputs and in inputs, e increasing. Source: thesis (3.14).
 
     lags: n of the output, 1 to 100 samples; delays: of the inputs, each 0 to 100 samples (None:
     0 … n). degree: of e, 1 or 3.

@@ -97,7 +97,7 @@ class SphereProgram:
         high = monomials(self.n, [self.half])
         low = monomials(self.n, [self.half - 1])
         basis = np.vstack([low, high[high[:, list(chosen)].any(axis=1)]])
-        points = _unisolvent_points(basis, self.half)
+        points = unisolvent_points(basis, self.half)
         weight = _weights(basis, np.isin(np.arange(self.n), chosen))
         moments = _sphere_moments(basis) * np.outer(weight, weight)
         values, vectors = np.linalg.eigh(moments)
@@ -345,7 +345,7 @@ def multinomials(rows: IntArray) -> FloatArray:
     return np.asarray(factorials[rows.sum(axis=1)] / factorials[rows].prod(axis=1))
 
 
-def _unisolvent_points(basis: IntArray, half: int) -> FloatArray:
+def unisolvent_points(basis: IntArray, half: int) -> FloatArray:
     """Points on the sphere that determine every function in the span of products of the basis."""
     n = basis.shape[1]
     products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)

@@ -16,7 +16,7 @@ from benchmarks.thesis.relaxation import sample_funnel
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design_funnel, integrate_nominal
-from nlsid_core.design.continuous.pieces import prove_pieces
+from nlsid_core.design.continuous.pieces import proof_basis, prove_pieces
 from nlsid_core.design.continuous.setting import Setting, prepare
 from nlsid_core.design.continuous.vstep import improve
 from nlsid_core.designs import Design
@@ -197,23 +197,76 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     forms = KnotForms(setting.steps, setting.policy, funnel, ends, margin=0.0)
     largest = {}
     for trust in (0.05, 0.2):
-        D = improve(forms.samples, forms.pairs, 8, forms.basis, weights=np.ones(8),
-                    margins=forms.margins, trust=trust)  # fmt: skip
+        D = improve(forms.samples, forms.pairs, 8, proof_basis(setting.steps.program),
+                    weights=np.ones(8), margins=forms.margins, trust=trust)  # fmt: skip
         largest[trust] = np.abs(np.linalg.eigvalsh(D)).max()
         assert largest[trust] <= trust + 1e-4
     assert largest[0.05] == pytest.approx(0.05, rel=0.01)
     assert largest[0.2] > 0.1
 
 
-def test_p_of_a_pushed_field_is_refused_before_anything_slow() -> None:
+def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
+    """Three pushes, each bounded with κ."""
     field = VectorField.from_function(
-        lambda x, w: np.array([x[1] + w[0], -x[0] - x[1] + w[1] + w[2]]), 2, 0,
-        uncertain=[[-1e-3, 1e-3]] * 3,
+        lambda x, w: np.array([x[1] + w[0], -x[0] - x[1] + w[1] + x[0] ** 3 / 9 + w[2]]), 2, 0,
+        uncertain=[[-0.01, 0.01]] * 3,
     )  # fmt: skip
-    t = np.linspace(0, 1, 5)
+    t = np.linspace(0, 2, 9)
     nominal = integrate_nominal(field, lambda _: np.zeros(0), t=t, start=[0.0, 0.0])
-    with pytest.raises(DataError, match="fewer than three pushes"):
-        design_funnel(field, nominal, goal=GOAL, shape="P")
+    rho, design = (design_funnel(field, nominal, goal=GOAL, shape=s) for s in ("rho", "P"))
+    assert design.model.is_pushed
+    assert volume_of(design) > 1.25 * volume_of(rho)
+    stays_inside(design, pushed=0.01)
+
+
+def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
+    rho, design = (
+        design_funnel(*hanging(5), goal=GOAL, limits=[[-0.4, 0.4]], shape=s) for s in ("rho", "P")
+    )
+    assert volume_of(design) > 1.1 * volume_of(rho)
+    assert stays_inside(design) > 100
+
+
+def test_p_stays_where_a_taylor_polynomial_is_valid() -> None:
+    def boat(x: Any, u: Any) -> Any:  # across its course, heading
+        return np.array([np.sin(x[1]), u[0]])
+
+    t = np.linspace(0, 2, 9)
+    nominal = integrate_nominal(boat, lambda _: np.zeros(1), t=t, start=np.zeros(2))
+    rho, design = (design_funnel(boat, nominal, goal=GOAL, shape=s) for s in ("rho", "P"))
+    assert volume_of(design) > 1.2 * volume_of(rho)
+    for k, t0 in enumerate(design.funnel.t[:-1].tolist()):
+        box = {entry: (low, high) for entry, low, high in design.model.validity(k)}
+        for at in (t0, float(design.funnel.t[k + 1])):
+            widths = np.sqrt(np.diag(np.linalg.inv(design.funnel.shape(at))))
+            for entry in set(box) & {0, 1}:
+                assert box[entry][0] <= -widths[entry]
+                assert widths[entry] <= box[entry][1]
+
+
+def stays_inside(design: FunnelDesign, pushed: float = 0.0) -> int:
+    """Follow 200 starts on the boundary, pushed anew at every step; how many inputs clipped."""
+    rng, steps, clipped = np.random.default_rng(4), 400, 0
+    funnel, policy, field = design.funnel, design.policy, design.model
+    times, h = np.linspace(funnel.t[0], funnel.t[-1], steps + 1, retstep=True)
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    x = 0.9999 * np.linalg.solve(np.linalg.cholesky(funnel.shape(times[0])).T, circle).T
+    for t in times[:-1].tolist():
+        w = pushed * rng.choice([-1.0, 1.0], size=len(field.uncertain))
+
+        def rate(x: FloatArray, t: float = t, w: FloatArray = w) -> FloatArray:
+            return field(t, x, policy(t, x), w)
+
+        if len(policy.limits):
+            clipped += int((np.abs(policy(t, x)) >= policy.limits[:, 2]).sum())
+        a = rate(x)
+        b = rate(x + h / 2 * a)
+        c = rate(x + h / 2 * b)
+        x = x + h / 6 * (a + 2 * b + 2 * c + rate(x + h * c))
+        P = funnel.shape(t + h)
+        assert np.einsum("bi,ij,bj->b", x, P, x).max() <= 1.0
+    return clipped
 
 
 def test_a_design_knows_how_it_was_found() -> None:

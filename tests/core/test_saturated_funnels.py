@@ -286,13 +286,11 @@ def test_a_policy_clips_what_it_asks_for_and_refuses_limits_that_are_none() -> N
         ContinuousPolicy(*parts, limits=np.array([[i, -1.0, 1.0] for i in range(4)]))
 
 
-def test_a_nominal_beyond_the_limits_and_the_general_shape_are_refused() -> None:
+def test_a_nominal_beyond_the_limits_is_refused() -> None:
     field, _ = pendulum.problem()
     nominal = still(field, 5, 0.2)
     with pytest.raises(DataError, match="no room is left"):
         design_funnel(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]])
-    with pytest.raises(DataError, match="with limits take shape rho"):
-        design_funnel(field, nominal, goal=GOAL, shape="P", limits=[[0, -6.0, 6.0]])
 
 
 def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """The map of the house and its glossary are true, and every page leads to them."""
 
+import importlib
+import inspect
 import json
 import re
 from pathlib import Path
 
 from benchmarks.__main__ import BENCHMARKS
-from docs.site import linking, measured
+from docs.site import api, linking, measured
 from tests.house.sources import ROOT
 
 DOCS = ROOT / "docs"
@@ -58,6 +60,30 @@ def test_what_the_pages_of_theory_name_is_there() -> None:
     pages = sorted(DOCS.glob("theory*.md"))
     assert len(pages) > 2
     assert not {page.name: found for page in pages if (found := linking.unknown(page.read_text()))}
+
+
+def test_what_states_the_source_of_its_formula_is_linked_from_the_page_that_derives_it(
+    tmp_path: Path,
+) -> None:
+    """A class or function that says so, or for a module any name in it."""
+    documented = api.write(tmp_path)
+    pages = [page for page in DOCS.glob("*.md") if linking.derives(page.stem)]
+    linked = {name for page in pages for name in linking.linked(page.read_text(), documented)[1]}
+    without = []
+    for room in api.ROOMS:
+        for module in api.modules(importlib.import_module(f"nlsid_core.{room}")):
+            here = module.__name__
+            things = {here: module} | {
+                f"{here}.{n}": getattr(module, n) for n in api.members(module)
+            }
+            without += [
+                name
+                for name, thing in things.items()
+                if "Source: " in (inspect.getdoc(thing) or "")
+                and not any(f"{link}.".startswith(f"{name}.") for link in linked)
+            ]
+    assert len(linked) > 100
+    assert not without
 
 
 def test_figures_of_pages_are_what_the_benchmarks_wrote(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.setting import Goal, Setting, prepare
-from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape
+from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape, validity_caps
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
 from nlsid_core.dynamics import Nominal, VectorField
@@ -33,7 +33,6 @@ from nlsid_core.progress import Progress, silent
 RETRIES = 6
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
-CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 KIND = "continuous_funnel"
 
 
@@ -146,43 +145,6 @@ def decided(
         raise Infeasible(f"the kernel refuses what was found: {refusal}") from refusal
     seconds["proof"] = time.perf_counter() - started
     return design
-
-
-def validity_caps(
-    field: VectorField, policy: ContinuousPolicy, P: FloatArray, widths: FloatArray | None = None
-) -> FloatArray:
-    """(K,) the largest ρ at each knot with which x and u stay where the dynamics are valid.
-
-    widths: (K-1, m) that the applied input is off.
-    Raises DataError if the nominal itself does not.
-    """
-    caps = np.full(len(P), np.inf)
-    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
-    for k in range(len(P) - 1):
-        for entry, low, high in field.validity(field.span(float(policy.t[k]))):
-            centre, rows = policy.entry(entry, k)
-            least, most = clipped.get(entry, (-np.inf, np.inf))
-            if most < low or high < least:
-                raise DataError(
-                    f"the limits [{least:g}, {most:g}] of input {entry - field.n} lie outside "
-                    f"where its dynamics are valid, [{low:g}, {high:g}]"
-                )
-            # A limit within the bounds keeps its side by itself.
-            room = min(
-                np.inf if most <= high else high - float(np.max(centre)),
-                np.inf if low <= least else float(np.min(centre)) - low,
-            )
-            if widths is not None and entry >= field.n:
-                room -= float(widths[k, entry - field.n])
-            if room <= 0:
-                raise DataError(
-                    f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
-                    f"{centre[0]:.4g} at {policy.t[k]:g} s, not well within [{low:g}, {high:g}]"
-                )
-            for knot in (k, k + 1):
-                reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(P[knot]), rows).max()
-                caps[knot] = min(caps[knot], CAP_ROOM * room**2 / reach)
-    return caps
 
 
 def _simulated(setting: Setting) -> str:

@@ -8,15 +8,17 @@ Source: thesis (6.8).
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design.continuous.knots import KnotForms
 from nlsid_core.design.continuous.lstep import LSteps, section_at, sections
-from nlsid_core.design.continuous.pieces import Proved, prove_pieces, unsolved
+from nlsid_core.design.continuous.pieces import Proved, proof_basis, prove_pieces, unsolved
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.design.continuous.vstep import MAX_DEGREE, improve
+from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -24,26 +26,69 @@ from nlsid_core.progress import Progress, silent
 
 STOP = 0.025  # thesis: growth of the volume below which the alternation has converged
 MAX_ITERATIONS = 30
+CAP_ROOM = 1 - 1e-6  # the checker decides in rationals what is rounded here
 TRUST = 0.5  # of P in the V-step: the volume is linearised at the present one
 SHAPE_MARGIN = 16.0  # times the sweep's margin: with P(t) free there is volume to pay it with
+INSIDE = 0.95  # of what validity allows, at the start: a V-step begins strictly inside
+SWEEPS, NEAR = 6, 0.05  # of P/ρ, until ρ is nearly 1
 ROOM = 10.0  # times the margin, at the start, so that the first V-step has somewhere to go
 
 
 def refuse_shape(steps: LSteps) -> None:
-    """Raise DataError where V-steps do not apply: pushes, limits, or a degree above 3."""
-    if len(steps.limits):
-        raise DataError(
-            "V-steps (shape P, alternation) search one polynomial at a time: with limits take "
-            "shape rho by the sweep"
-        )
-    if steps.kappa is not None:
-        raise DataError("V-steps take w at its corners: they are for fewer than three pushes")
+    """Raise DataError for dynamics of a degree that V-steps do not apply to."""
     if steps.field.degree > MAX_DEGREE:
         raise DataError(
             f"V-steps (shape P, alternation) are for dynamics of degree up to {MAX_DEGREE}, not "
             f"{steps.field.degree}: take shape rho by the sweep, or a Taylor polynomial of degree "
             f"{MAX_DEGREE} with its remainder as an uncertain w"
         )
+
+
+def validity_rows(
+    field: VectorField, policy: ContinuousPolicy, widths: FloatArray | None = None
+) -> list[FloatArray]:
+    """Per knot (R, n): |r'x̄| ≤ 1 keeps x and u where the dynamics are valid, for every row r.
+
+    widths: (K-1, m) that the applied input is off.
+    Raises DataError if the nominal itself does not keep to it.
+    """
+    found: list[list[FloatArray]] = [[] for _ in policy.t]
+    clipped = {int(i) + field.n: (low, high) for i, low, high in policy.limits.tolist()}
+    for k in range(len(policy.t) - 1):
+        for entry, low, high in field.validity(field.span(float(policy.t[k]))):
+            centre, rows = policy.entry(entry, k)
+            least, most = clipped.get(entry, (-np.inf, np.inf))
+            if most < low or high < least:
+                raise DataError(
+                    f"the limits [{least:g}, {most:g}] of input {entry - field.n} lie outside "
+                    f"where its dynamics are valid, [{low:g}, {high:g}]"
+                )
+            # A limit within the bounds keeps its side by itself.
+            room = min(
+                np.inf if most <= high else high - float(np.max(centre)),
+                np.inf if low <= least else float(np.min(centre)) - low,
+            )
+            if widths is not None and entry >= field.n:
+                room -= float(widths[k, entry - field.n])
+            if room <= 0:
+                raise DataError(
+                    f"the nominal leaves where its dynamics are valid: entry {entry} of (x, u) is "
+                    f"{centre[0]:.4g} at {policy.t[k]:g} s, not well within [{low:g}, {high:g}]"
+                )
+            for knot in (k, k + 1) if np.isfinite(room) else ():
+                found[knot] += list(rows / (CAP_ROOM**0.5 * room))
+    return [np.array(rows).reshape(-1, field.n) for rows in found]
+
+
+def validity_caps(
+    field: VectorField, policy: ContinuousPolicy, P: FloatArray, widths: FloatArray | None = None
+) -> FloatArray:
+    """(K,) the largest ρ at each knot with which x and u stay where the dynamics are valid."""
+    caps = np.empty(len(P))
+    for knot, rows in enumerate(validity_rows(field, policy, widths)):
+        reach = np.einsum("ri,ij,rj->r", rows, np.linalg.inv(P[knot]), rows)
+        caps[knot] = 1 / reach.max() if reach.any() else np.inf
+    return caps
 
 
 def enlarge_shape(
@@ -59,33 +104,66 @@ def enlarge_shape(
 ) -> tuple[ContinuousFunnel, Proved, list[tuple[str, float]]]:
     """Enlarge P(t), keeping the end, and prove the last funnel of the alternation that can be.
 
+    The funnel stays where the dynamics are valid: there I + D ⪰ rr' for all `validity_rows`.
+
     objective: "volume", linearised within a trust region, or "reference", the thesis's largest
     scaled copies of the ellipsoids it starts from. Raises Infeasible if none could be proved.
     """
     margin *= SHAPE_MARGIN
-    rho, _ = sweep_rho(steps, sections(steps, policy, funnel.P), margin=ROOM * margin,
-                       rho_final=float(funnel.rho[-1]))  # fmt: skip
-    P = funnel.P / rho[:, None, None]
-    present = replace(funnel, P=(P + P.transpose(0, 2, 1)) / 2, rho=np.ones(len(rho)))
-    found = [present]
+    volume_before, kappa = funnel.volume_integral(), steps.kappa
+    steps.kappa = None if kappa is None else kappa.copy()
+    present = _normalised(steps, policy, funnel, ROOM * margin)
+    first = present.P
+    found = [_Kept(present, steps.kappa)]
+    ends = solve_ends(steps, policy, present, executor=executor)
     for iteration in range(iterations):
-        candidate = _enlarged(steps, policy, present, margin, objective, found[0].P, executor)
-        if candidate is None:
+        enlarged = _enlarged(steps, policy, present, ends, margin, objective, first, executor)
+        if enlarged is None:
             break
+        candidate, ends = enlarged
         growth = candidate.volume_integral() / present.volume_integral()
         present = candidate
-        found.append(present)
+        found.append(_Kept(present, steps.kappa))
         volume = present.volume_integral()
         progress(f"P(t): volume integral {volume:.4g}", min(0.95, (iteration + 1) / 10))
         if growth < 1 + STOP:
             break
-    history = [(f"P {i}", f.volume_integral()) for i, f in enumerate(found)]
+    history = [(f"P {i}", kept.funnel.volume_integral()) for i, kept in enumerate(found)]
+    proved: Proved | None = None
     while found:
-        last = found.pop()
+        last, steps.kappa = found.pop()
+        if last.volume_integral() <= volume_before:
+            break
         proved = prove_pieces(steps, policy, last)
         if not proved.unproved:
             return last, proved, history
+    steps.kappa = kappa
+    if proved is None:
+        raise Infeasible("no V-step made the funnel larger")
     raise Infeasible(f"no proof from {unsolved(policy, proved.unproved)}: try more knots there")
+
+
+def _normalised(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, margin: float
+) -> ContinuousFunnel:
+    """The funnel with P/ρ for P and ρ = 1, ρ as the sweep finds it for a margin.
+
+    P/ρ at the knots, linear between them, is no longer what was swept: so it is swept again.
+    """
+    P, final = funnel.P, float(funnel.rho[-1])
+    for _ in range(SWEEPS):
+        rho, _ = sweep_rho(steps, sections(steps, policy, P), margin=margin, rho_final=final,
+                           caps=INSIDE * validity_caps(steps.field, policy, P))  # fmt: skip
+        P, final = P / rho[:, None, None], 1.0
+        if np.abs(rho - 1).max() < NEAR:
+            break
+    P = (P + P.transpose(0, 2, 1)) / 2
+    return replace(funnel, P=P, rho=np.ones(len(P)))
+
+
+class _Kept(NamedTuple):
+    funnel: ContinuousFunnel
+    kappa: FloatArray | None
 
 
 def solve_ends(
@@ -111,14 +189,18 @@ def _enlarged(
     steps: LSteps,
     policy: ContinuousPolicy,
     funnel: ContinuousFunnel,
+    ends: list[Ends],
     margin: float,
     objective: str,
     reference: FloatArray,
     executor: Executor | None,
-) -> ContinuousFunnel | None:
-    """One V-step for all knots but the last; None if none was found or it does not hold."""
-    ends = solve_ends(steps, policy, funnel, executor=executor)
+) -> tuple[ContinuousFunnel, list[Ends]] | None:
+    """One V-step for all knots but the last, with its L-steps; None if none was found that holds.
+
+    ends: the L-steps of the funnel it starts from.
+    """
     forms = KnotForms(steps, policy, funnel, ends, margin=margin)
+    rows, kappa = validity_rows(steps.field, policy), steps.kappa
     h = np.diff(funnel.t)
     share = (np.r_[h, 0] + np.r_[0, h])[:-1] / 2
     volumes = np.array([funnel.volume(float(t)) for t in funnel.t[:-1]])
@@ -127,8 +209,9 @@ def _enlarged(
     if objective == "reference":
         copies = np.array([T.T @ P @ T for T, P in zip(forms.frames, reference[:-1], strict=False)])
     try:
-        D = improve(forms.samples, forms.pairs, len(weights), forms.basis, weights=weights,
-                    margins=forms.margins, trust=TRUST, reference=copies)  # fmt: skip
+        D = improve(forms.samples, forms.pairs, len(weights), proof_basis(steps.program),
+                    weights=weights, margins=forms.margins, trust=TRUST, reference=copies,
+                    bounds=[r @ T for r, T in zip(rows, forms.frames, strict=True)])  # fmt: skip
     except SolverError:
         return None
     for part in (1.0, 0.5, 0.2):
@@ -138,18 +221,12 @@ def _enlarged(
             new = inverse.T @ (np.eye(len(inverse)) + part * change) @ inverse
             moved[k] = (new + new.T) / 2
         candidate = replace(funnel, P=moved)
-        if _holds(steps, policy, candidate, margin / 4):
-            return candidate
+        if kappa is not None:
+            steps.kappa = kappa.copy()
+            for k in range(len(kappa)):
+                steps.bound_pushes(section_at(steps, policy, moved, k, 1.0), 1.0)
+        ends = solve_ends(steps, policy, candidate, executor=executor)
+        if min(s.m for pair in ends for s in (*pair.start, *pair.end)) >= margin / 4:  # ρ = 1
+            return candidate, ends
+    steps.kappa = kappa
     return None
-
-
-def _holds(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, margin: float
-) -> bool:
-    """True if every L-step at the knots of a funnel with ρ = 1 leaves the margin."""
-    for k in range(len(funnel.t) - 1):
-        for end in (0, 1):
-            section = section_at(steps, policy, funnel.P, k, float(end))
-            if min(s.m for s in steps.solve(section, float(funnel.rho[k + end]))) < margin:
-                return False
-    return True

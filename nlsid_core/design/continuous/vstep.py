@@ -2,18 +2,21 @@
 
 At each end of each interval, in the coordinates z in which the present funnel is |z| ≤ 1, a new
 P_κ = T⁻ᵀ(I + D)T⁻¹ changes c(z) = -Ẇ + μ(1 - W) linearly in D; c - margin = v'Qv with Q ⪰ 0.
+`vstep_program` solves what that makes.
 Source: thesis (6.8); the linearised-volume objective needs the trust region.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-import scipy.sparse as sp
 
-from nlsid_core import conic
 from nlsid_core.arrays import FloatArray, IntArray
-from nlsid_core.conic import Cone, ConeProgram
-from nlsid_core.design.continuous.graded import monomials_of, positions, product_table
+from nlsid_core.design.continuous.graded import monomials_of, product_table
+from nlsid_core.design.continuous.vstep_program import ShapeProgram
+from nlsid_core.polynomial.values import monomial_values
+from nlsid_core.sos.sphere import unisolvent_points
 
 MAX_DEGREE = 3  # of the dynamics
 DEGREE = MAX_DEGREE + 1  # of c in z
@@ -21,10 +24,10 @@ DEGREE = MAX_DEGREE + 1  # of c in z
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """One end of one interval: knot κ, the interval's other knot, 1/h, error y = T⁻¹(f - ẋ₀) and μ.
+    """One end of one interval: knot κ, the other knot, 1/h and the error y = T⁻¹(f - ẋ₀).
 
-    y: (n, M₃) in monomials of degree 0..3, mu: (M₂,) of degree 0..2. to_other: (n, n), z of the
-    other knot from z here. sign: +1 at the start of the interval, -1 at its end.
+    y: (n, M₃) in monomials of degree 0..3. to_other: (n, n), z of the other knot from z here.
+    sign: +1 at the start of the interval, -1 at its end.
     """
 
     knot: int
@@ -32,67 +35,87 @@ class Sample:
     rate: float
     sign: int
     y: FloatArray
-    mu: FloatArray
     to_other: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class Affine:
-    """c = constant + own·D_own + others·D_other over monomials, D by its upper triangle."""
+    """c = constant + own·D_own + others·D_other over monomials, D by its upper triangle.
+
+    mu: (M₂,) of the multiplier in monomials of degree 0..2.
+    """
 
     constant: FloatArray
     own: FloatArray
     others: FloatArray
     mu: FloatArray
 
+    def with_multiplier(self, mu: FloatArray, n: int) -> "Affine":
+        """c + μ(1 - W) in n variables."""
+        tables = _tables(n)
+        own, constant = self.own.copy(), self.constant.copy()
+        own[tables.quadratic, range(own.shape[1])] -= tables.twice * mu[:, None]
+        constant += (own - self.own) @ tables.diagonal
+        constant[: len(mu)] += mu
+        return Affine(constant, own, self.others, self.mu + mu)
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """Where products land: linear (n, M₃) and quadratic (M₂, d) times the others' monomials."""
+
+    p: IntArray
+    q: IntArray
+    square: IntArray  # (d,) the monomial z_p z_q
+    twice: FloatArray  # (d,) 1 on the diagonal of D, 2 off it
+    diagonal: FloatArray
+    linear: IntArray
+    quadratic: IntArray
+
+
+@lru_cache(maxsize=8)
+def _tables(n: int) -> _Tables:
+    starts = np.cumsum([0, *(len(monomials_of(n, q)) for q in range(DEGREE + 1))])
+    p, q = np.triu_indices(n)
+    pairs = product_table(n, 1, 1)[p, q]
+    linear = [starts[r + 1] + product_table(n, 1, r) for r in range(MAX_DEGREE + 1)]
+    quadratic = [starts[r + 2] + product_table(n, 2, r)[pairs] for r in range(DEGREE - 1)]
+    on = p == q
+    return _Tables(p, q, starts[2] + pairs, np.where(on, 1.0, 2.0), on.astype(float),
+                   np.hstack(linear), np.hstack(quadratic).T)  # fmt: skip
+
 
 def affine_form(sample: Sample) -> Affine:
-    """How c depends on the two matrices D at this sample."""
+    """How -Ẇ depends on the two matrices D at this sample."""
     n = len(sample.y)
-    pairs = list(zip(*np.triu_indices(n), strict=True))
-    sizes = [len(monomials_of(n, q)) for q in range(DEGREE + 1)]
-    starts = np.cumsum([0, *sizes])
-    own = np.zeros((starts[-1], len(pairs)))
+    tables = _tables(n)
+    p, q, twice = tables.p, tables.q, tables.twice
+    columns = np.arange(len(p))
+    own = np.zeros((int(tables.quadratic.max()) + 1, len(p)))
     others = np.zeros_like(own)
-    second = product_table(n, 1, 1)
-
-    def put(column: FloatArray, tables: list[IntArray], poly: FloatArray, factor: float) -> None:
-        """column += factor·monomial·poly; tables: where the monomial takes each degree of poly."""
-        at = 0
-        for q, table in enumerate(tables):
-            column[table] += factor * poly[at : at + sizes[q]]
-            at += sizes[q]
-
-    variables = [[starts[q + 1] + product_table(n, 1, q)[p] for q in range(4)] for p in range(n)]
-    for column, (p, q) in enumerate(pairs):
-        twice = 1.0 if p == q else 2.0
-        # -2 z'Dy: z_p y_q + z_q y_p for p < q, z_p y_p on the diagonal.
-        put(own[:, column], variables[p], sample.y[q], -2.0)
-        if p != q:
-            put(own[:, column], variables[q], sample.y[p], -2.0)
-        square = int(second[p, q])
-        own[starts[2] + square, column] += sample.sign * sample.rate * twice
-        quadratic = [starts[r + 2] + product_table(n, 2, r)[square] for r in range(3)]
-        put(own[:, column], quadratic, sample.mu, -twice)
-        a = sample.to_other
-        product = (np.outer(a[p], a[q]) + np.outer(a[q], a[p])) * (twice / 2)
-        values = np.bincount(second.ravel(), product.ravel(), sizes[2])
-        others[starts[2] : starts[3], column] = -sample.sign * sample.rate * values
-    diagonal = np.array([float(p == q) for p, q in pairs])
-    constant = own @ diagonal + others @ diagonal
-    constant[: starts[3]] += sample.mu
-    return Affine(constant, own, others, sample.mu)
+    # -2 z'Dy: z_p y_q + z_q y_p off the diagonal, z_p y_p on it.
+    own[tables.linear[p].T, columns] -= 2 * sample.y[q].T
+    own[tables.linear[q].T, columns] -= (twice - 1) * 2 * sample.y[p].T
+    own[tables.square, columns] += sample.sign * sample.rate * twice
+    a = sample.to_other
+    product = a[p][:, p] * a[q][:, q] + a[p][:, q] * a[q][:, p]  # (D, monomials)
+    product *= twice[:, None] / 2 * twice
+    others[tables.square] = -sample.sign * sample.rate * product.T
+    none = np.zeros(len(tables.quadratic))
+    return Affine((own + others) @ tables.diagonal, own, others, none)
 
 
-def gram_columns(basis: IntArray) -> tuple[sp.csc_matrix, int]:
-    """Monomial coefficients of v'Qv from svec(Q), and how long that is."""
-    n = basis.shape[1]
-    i, j = conic.triangle(len(basis))
-    rows = np.concatenate([monomials_of(n, q) for q in range(DEGREE + 1)])
-    home = positions(basis[i] + basis[j], rows)
-    weight = np.where(i == j, 1.0, conic.SQRT2)
-    shape = (len(rows), len(i))
-    return sp.csc_matrix((weight, (home, np.arange(len(i)))), shape=shape), len(i)
+def squares_along(along: FloatArray, scale: FloatArray) -> FloatArray:
+    """(M₄, d): what D adds at first order to Σ_j scale_j (z'(I + D)g_j)², along: (n, J) the g_j."""
+    n = len(along)
+    tables = _tables(n)
+    result = np.zeros((int(tables.quadratic.max()) + 1, len(tables.p)))
+    outer: FloatArray = 2 * (along * scale) @ along.T  # z'g z'Dg, twice
+    for a, b in ((tables.p, tables.q), (tables.q, tables.p)):
+        for column, (i, j) in enumerate(zip(a.tolist(), b.tolist(), strict=True)):
+            np.add.at(result[:, column], tables.linear[i, 1 : n + 1],
+                      outer[j] * tables.twice[column] / 2)  # fmt: skip
+    return result
 
 
 def improve(
@@ -104,73 +127,71 @@ def improve(
     weights: FloatArray,
     margins: list[float],
     trust: float,
+    bounds: Sequence[FloatArray] = (),
     reference: FloatArray | None = None,
 ) -> FloatArray:
     """D (free, n, n) for the free knots 0..free-1; D = 0 for knots beyond.
 
-    samples and knots: c at each sample, and (own, other) knot. margins: what c keeps
-    above zero at each sample, in 1/s. weights: (free,) of each knot's volume.
+    samples and knots: c at each sample, and (own, other) knot, neighbours. basis: (k, n) exponents
+    of v. margins: what c keeps above zero at each sample, in 1/s. weights: (free,) of each knot's
+    volume. bounds: per free knot (R, n) rows r: |r'z| ≤ 1 in the set, I + D ⪰ rr'.
     reference: (free, n, n) matrices of the reference ellipsoids in the knots' coordinates: then the
     objective is Σ weights·r with I + D ⪯ r·reference; else the linearised volume. trust: of |D|.
+    Raises SolverError if it ends at no point that keeps the margins.
     """
-    n, k = basis.shape[1], len(basis)
-    d = n * (n + 1) // 2
-    gram, triangle = gram_columns(basis)
-    rows = gram.shape[0]
-    extra = free if reference is not None else 0
-    left, right = [], []
-    for sample, (own, other), margin in zip(samples, knots, margins, strict=True):
-        block = sp.lil_matrix((rows, free * d + extra))
-        if own < free:
-            block[:, own * d : (own + 1) * d] = sample.own
-        if other < free:
-            block[:, other * d : (other + 1) * d] = sample.others
-        left.append(-block.tocsc())
-        target = sample.constant.copy()
-        target[0] -= margin
-        right.append(target)
-    count = len(samples)
-    A = [sp.hstack([sp.vstack(left), sp.kron(sp.eye(count), gram)], format="csc")]
-    b = [np.concatenate(right)]
-    cones = [Cone("zero", count * rows)]
-    size = free * d + extra + count * triangle
-    # Gram matrices: s = svec(Q) ⪰ 0.
-    A.append(
-        sp.hstack([sp.csc_matrix((count * triangle, free * d + extra)), -sp.eye(count * triangle)])
-    )
-    b.append(np.zeros(count * triangle))
-    cones += [Cone("psd", k)] * count
-    a, c = conic.triangle(n)
-    upper = {pair: m for m, pair in enumerate(zip(*np.triu_indices(n), strict=True))}
-    to_svec = sp.lil_matrix((d, d))
-    for row, (p, q) in enumerate(zip(a.tolist(), c.tolist(), strict=True)):
-        to_svec[row, upper[min(p, q), max(p, q)]] = 1.0 if p == q else conic.SQRT2
-    identity = conic.svec(np.eye(n))
-    for f in range(free):
-        place = sp.lil_matrix((d, size))
-        place[:, f * d : (f + 1) * d] = to_svec
-        for sign in (1.0, -1.0):
-            A.append(sp.csc_matrix(sign * place))
-            b.append(trust * identity)
-            cones.append(Cone("psd", n))
-        if reference is not None:
-            scaled = place.copy()
-            scaled[:, free * d + f] = -conic.svec(reference[f])[:, None]
-            A.append(sp.csc_matrix(scaled))
-            b.append(-identity)
-            cones.append(Cone("psd", n))
-    q_vector = np.zeros(size)
-    if reference is None:
-        diagonal = np.array([float(p == q) for p, q in zip(*np.triu_indices(n), strict=True)])
-        for f in range(free):
-            q_vector[f * d : (f + 1) * d] = weights[f] * diagonal
-    else:
-        q_vector[free * d : free * d + free] = weights
-    program = ConeProgram(sp.csc_matrix((size, size)), q_vector, sp.vstack(A, format="csc"),
-                          np.concatenate(b), tuple(cones))  # fmt: skip
-    x = conic.solve(program, tolerance=1e-6).x
-    result = np.zeros((free, n, n))
+    n, d = basis.shape[1], samples[0].own.shape[1]
     p, q = np.triu_indices(n)
-    for f in range(free):
-        result[f, p, q] = result[f, q, p] = x[f * d : (f + 1) * d]
-    return result
+    units = np.zeros((d, n, n))
+    units[range(d), p, q] = units[range(d), q, p] = 1.0
+    # F (free, L, 1 + unknowns, n, n): trust·I ± D, and r·reference - I - D.
+    rows = [np.concatenate([trust * np.eye(n)[None], sign * units]) for sign in (1.0, -1.0)]
+    F = np.repeat(np.array(rows)[None], free, axis=0)
+    most = max((len(r) for r in bounds), default=0)
+    inside = np.tile(np.concatenate([np.eye(n)[None], units]), (free, most, 1, 1, 1))
+    for place, directions in zip(inside, bounds, strict=False):
+        place[: len(directions), 0] -= directions[:, :, None] * directions[:, None]
+    F = np.concatenate([F, inside], axis=1)
+    cost = np.tile(np.trace(units, axis1=1, axis2=2), (free, 1))
+    x = np.zeros((free, d))
+    if reference is not None:
+        copies = np.concatenate([-np.eye(n)[None], -units])
+        copies = np.repeat(np.concatenate([copies, np.zeros((1, n, n))])[None], free, axis=0)
+        copies[:, -1] = reference
+        F = np.pad(F, ((0, 0), (0, 0), (0, 1), (0, 0), (0, 0)))
+        F = np.concatenate([F, copies[:, None]], axis=1)
+        cost = np.pad(np.zeros_like(cost), ((0, 0), (0, 1)), constant_values=1.0)
+        x = np.pad(x, ((0, 0), (0, 1)))
+        x[:, -1] = 2.0 / np.linalg.eigvalsh(reference)[:, 0]
+    V, table = _at_points(basis.tobytes(), n)
+    places = np.array(knots)
+    targets = np.array([s.constant for s in samples])
+    targets[:, 0] -= margins
+    g = targets @ table.T
+    size = np.abs(g).max(axis=1)
+    B = np.zeros((len(samples), 2, x.shape[1], len(table)))
+    first = places.min(axis=1)
+    for row, sample in enumerate(samples):
+        for knot, part in zip(places[row], (sample.own, sample.others), strict=True):
+            if knot < free:
+                B[row, knot - first[row], :d] = (table @ part).T / size[row]
+    program = ShapeProgram(V, g / size[:, None], B, first, F, weights[:, None] * cost)
+    found = program.solve(x)
+    D = np.zeros((free, n, n))
+    D[:, p, q] = D[:, q, p] = found[:, :d]
+    return D
+
+
+@lru_cache(maxsize=8)
+def _at_points(basis: bytes, n: int) -> tuple[FloatArray, FloatArray]:
+    """(N, k) orthonormal combinations of the basis at N points, and (N, M) all monomials of degree
+    0..4 there. Each is made homogeneous by one more variable, so that the points are on a sphere.
+    """
+
+    def filled(powers: IntArray, degree: int) -> IntArray:
+        return np.column_stack([degree - powers.sum(axis=1), powers])
+
+    squared = filled(np.frombuffer(basis, dtype=np.int64).reshape(-1, n), DEGREE // 2)
+    points = unisolvent_points(squared, DEGREE // 2)
+    V = np.linalg.qr(monomial_values(squared, points))[0] * np.sqrt(len(points))
+    powers = np.concatenate([monomials_of(n, q) for q in range(DEGREE + 1)])
+    return V, monomial_values(filled(powers, DEGREE), points)
