@@ -99,7 +99,7 @@ def design_funnel(
     try:
         setting, funnel, proved, margin = _found(setting, progress)
     except Infeasible as refusal:
-        raise Infeasible(f"{refusal}{_simulated(setting)}") from refusal
+        raise Infeasible(f"{refusal}. {_in_use(setting)}{_simulated(setting)}") from refusal
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -145,6 +145,17 @@ def decided(
         raise Infeasible(f"the kernel refuses what was found: {refusal}") from refusal
     seconds["proof"] = time.perf_counter() - started
     return design
+
+
+def _in_use(setting: Setting) -> str:
+    """The weights of a policy, which the advice of a refusal compares with."""
+    named = zip("QR", setting.weights, strict=True)
+    rows = [
+        f"{name} is ({', '.join(f'{entry:.3g}' for entry in np.diag(M).tolist())})"
+        for name, M in named
+        if len(M)
+    ]
+    return f"The diagonal of {' and of '.join(rows)}"
 
 
 def _simulated(setting: Setting) -> str:
