@@ -57,6 +57,8 @@ def sweep_rho(
         at_end = steps.solve(end, rho[k + 1], duals)
         phi = min(s.m for s in at_end)
         cap = rho[k + 1] * (1 + h * (phi - margin))
+        if cap <= LOWEST * rho[k + 1]:  # ρ̇ cannot be large enough for this end
+            raise NoFunnel(diagnosed(steps, [end], [rho[k + 1]], rho[k + 1] / h))
         if caps is not None:
             cap = min(cap, float(caps[k]))
         for section in between:
