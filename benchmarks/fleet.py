@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -151,25 +151,36 @@ def fill(client: Any, count: int, folder: str, compression: CompressionType) -> 
     return size
 
 
-def read(
-    bags: Mapping[str, Path], workers: int, manifest: Path | None = None
-) -> tuple[list[Answer], float]:
-    """The answers, and bags a second between the first of them and the last."""
+@dataclass(frozen=True)
+class Read:
+    """Answers without what they say: sent has its bytes, digest is of all of it in order.
+
+    bags_per_s: between the first answer and the last.
+    """
+
+    answers: list[Answer]
+    bags_per_s: float
+    digest: str
+    sent: int
+
+
+def read(bags: Mapping[str, Path], workers: int, manifest: Path | None = None) -> Read:
+    """What a command that keeps a row for each bag reads of them."""
     came: list[float] = []
+    answers: list[Answer] = []
+    said, sent = hashlib.sha256(), 0
     with Manifest(manifest) as kept:
-        answers = ask(
+        for answer in ask(
             ReadTrials(load_config(CONFIG)), bags, Workers(workers), kept,
             progress=lambda *_: came.append(time.monotonic()),
-        )  # fmt: skip
-    refused = [answer for answer in answers if answer.reason]
-    if refused:
-        raise RuntimeError(f"{refused[0].name}: {refused[0].reason}")
-    return answers, (len(came) - 1) / (came[-1] - came[0]) if len(came) > 1 else float("nan")
-
-
-def digest(answers: Sequence[Answer]) -> str:
-    """Of everything that was sent home, in order."""
-    return hashlib.sha256(b"".join(answer.content for answer in answers)).hexdigest()
+        ):  # fmt: skip
+            if answer.reason:
+                raise RuntimeError(f"{answer.name}: {answer.reason}")
+            said.update(answer.content)
+            sent += len(answer.content)
+            answers.append(replace(answer, content=b""))
+    rate = (len(came) - 1) / (came[-1] - came[0]) if len(came) > 1 else float("nan")
+    return Read(answers, rate, said.hexdigest(), sent)
 
 
 @dataclass(frozen=True)
@@ -201,16 +212,16 @@ def _ours(pipe: Any, pattern: str) -> None:
     bags = named_bags([Path(pattern)])
     read(dict(islice(bags.items(), 1)), 0)  # so that imports do not count
     started = time.process_time()
-    answers, _ = read(bags, 0)
+    found = read(bags, 0)
     cpu = time.process_time() - started
     pipe.send(
         Alone(
             resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             1e3 * cpu / len(bags),
-            digest(answers),
-            sum(answer.requests for answer in answers),
-            sum(answer.fetched for answer in answers),
-            sum(len(answer.content) for answer in answers),
+            found.digest,
+            sum(answer.requests for answer in found.answers),
+            sum(answer.fetched for answer in found.answers),
+            found.sent,
         )
     )
 
@@ -309,8 +320,8 @@ def killed(pattern: str, wanted: str, rounds: int, folder: Path) -> int:
             good += done.stdout.strip().endswith(wanted)
         else:
             run.wait()
-            answers, _ = read(named_bags([Path(pattern)]), 0, manifest)
-            good += digest(answers) == wanted and all(answer.kept for answer in answers)
+            found = read(named_bags([Path(pattern)]), 0, manifest)
+            good += found.digest == wanted and all(answer.kept for answer in found.answers)
     return good
 
 
@@ -353,18 +364,16 @@ def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
         many = dict(islice(bags.items(), MANY))
         tenth = f"s3://{BUCKET}/plain/robot_0/drive_*.mcap"
         fewer, here = alone(_ours, tenth), alone(_ours, pattern)
-        _, one = read(many, 1)
-        answers, two = read(bags, 2)
-        same = digest(answers) == here.digest
-        compressed, _ = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0)
+        one, two = read(many, 1).bags_per_s, read(bags, 2)
+        compressed = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0).answers
         hand, hand_cpu = by_hand(many, 2), alone(_theirs, tenth).cpu_ms
         part_of_all = f"s3://{BUCKET}/plain/robot_[0-3]/drive_000*.mcap"
-        wanted = digest(read(named_bags([Path(part_of_all)]), 0)[0])
+        wanted = read(named_bags([Path(part_of_all)]), 0).digest
         good = killed(part_of_all, wanted, kills, folder)
         return {
             "bags": count,
             "megabytes": round(size / 1e6, 1),
-            "bags_per_s": {"1": round(one, 2), "2": round(two, 2)},
+            "bags_per_s": {"1": round(one, 2), "2": round(two.bags_per_s, 2)},
             "bytes_fetched_share": round(here.fetched / size, 4),
             "bytes_fetched_share_zstd": round(sum(a.fetched for a in compressed) / zipped, 4),
             "requests_per_bag": round(here.requests / count, 2),
@@ -374,12 +383,12 @@ def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
                 str(count): round(here.peak_mb, 1),
             },
             "cpu_ms_per_bag": round(here.cpu_ms, 2),
-            "bit_equal": same,
+            "bit_equal": two.digest == here.digest,
             "resumed_after_kills": f"{good} of {kills}",
             "cpu_share_in_reading": round(cpu_share(some), 3),
             "by_hand_bags_per_s": round(hand, 2),
             "by_hand_cpu_ms_per_bag": round(hand_cpu, 2),
-            "ratio_to_by_hand": round(two / hand, 2),
+            "ratio_to_by_hand": round(two.bags_per_s / hand, 2),
             "cpu_ratio_to_by_hand": round(hand_cpu / here.cpu_ms, 2),
         }
 
@@ -395,7 +404,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.once:
         pattern, manifest = options.once
-        print(digest(read(named_bags([Path(pattern)]), 2, Path(manifest))[0]))
+        print(read(named_bags([Path(pattern)]), 2, Path(manifest)).digest)
         return
     found = measured(options.bags, options.kills, options.endpoint)
     if options.json:

@@ -1,6 +1,7 @@
 """The kernel: its size, its imports, its processor seconds for examples/, and attacks on it.
 
-    python -m benchmarks.kernel [--json] [--mutations N] [--processes N] [--no-designs]
+    python -m benchmarks.kernel [--json] [--mutations N] [--kinds KIND ...] [--processes N]
+                                [--no-designs]
 
 A time is the least of three `kernel.check` of a saved proof, in processor seconds of one process.
 Lines are those that are not blank. A mutant is a structured change of a proof of version 2 or of a
@@ -16,6 +17,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -49,6 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--mutations", type=int, default=MUTATIONS)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="to mutate")
     parser.add_argument("--processes", type=int, default=1, help="for the mutations")
     parser.add_argument("--no-designs", action="store_true", help="lines and mutations only")
     arguments = parser.parse_args()
@@ -56,7 +59,7 @@ def main() -> None:
     if not arguments.no_designs:
         with tempfile.TemporaryDirectory() as folder:
             result |= times(Path(folder))
-    result |= mutated(arguments.mutations, arguments.processes)
+    result |= mutated(arguments.mutations, arguments.processes, arguments.kinds)
     print(describe())
     for key, value in result.items():
         print(f"{key:24}{value!s:>24}   {REACHED.get(key, '')}")
@@ -94,9 +97,9 @@ def times(folder: Path) -> dict[str, Any]:
     return result | {"files_mb": sizes, "margins": margins}
 
 
-def mutated(count: int, processes: int = 1) -> dict[str, Any]:
+def mutated(count: int, processes: int = 1, kinds: Sequence[str] = KINDS) -> dict[str, Any]:
     """How many mutants were decided, judged by an oracle, and proved wrongly."""
-    blocks = [(k, min(BLOCK, count - k * BLOCK)) for k in range(-(-count // BLOCK))]
+    blocks = [(k, min(BLOCK, count - k * BLOCK), kinds) for k in range(-(-count // BLOCK))]
     totals, judged, seconds = Counter[str](), Counter[str](), 0.0
     with ProcessPoolExecutor(processes) as pool:
         for done, found in enumerate(pool.map(_mutated_block, *zip(*blocks, strict=True)), 1):
@@ -108,11 +111,11 @@ def mutated(count: int, processes: int = 1) -> dict[str, Any]:
     return {"mutations": count, "mutations_s": seconds, **totals, "judged": dict(judged)}
 
 
-def _mutated_block(block: int, count: int) -> dict[str, Any]:
+def _mutated_block(block: int, count: int, kinds: Sequence[str]) -> dict[str, Any]:
     from tests.core.kernel import mutations
 
     started = time.process_time()
-    outcomes = mutations.run(count, np.random.default_rng([SEED, block]))
+    outcomes = mutations.run(count, np.random.default_rng([SEED, block]), kinds)
     return outcomes | {"seconds": time.process_time() - started}
 
 

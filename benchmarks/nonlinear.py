@@ -41,6 +41,7 @@ from nlsid_core.identification import (
     BlockCascadeClass,
     CellClass,
     CertifiedSem,
+    FeedbackClass,
     Fit,
     ImplicitClass,
     LeastSquares,
@@ -232,6 +233,8 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
         limits: tuple[Limit, ...] = ("top", "friction", "none")
         for cells, limit in product((1, 2), limits):
             yield CellClass(cells, intervals=4, limit=limit), CertifiedSem(STEPS)
+        for lags in ORDERS:
+            yield FeedbackClass(lags), CertifiedSem(STEPS)
     if one:
         yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
 

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 VERIFIED = ROOT / "verified"
 MUTATIONS = 10_000
 SEED = 4
-KINDS = ("continuous_funnel", "tube", "stability")
+KINDS = ("continuous_funnel", "tube", "stability", "sampled_funnel", "funnel_composition")
 
 
 def main() -> None:

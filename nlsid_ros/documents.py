@@ -19,6 +19,7 @@ from nlsid_ros.running import declare_number, declare_text
 
 LOOK = 0.2  # s between looks at who publishes, and at a check that is on
 CHECKING = "checking the proof"
+LONG = 5.0  # s of checking, after which it is said
 _DIGEST = re.compile(r"(sha256:)?[0-9a-f]{64}", re.ASCII)
 
 
@@ -142,6 +143,11 @@ class DesignSubscription:
                 self._refuse(str(answer["refused"]))
             else:
                 self._accept(text, str(answer["proved"]))
+        if self._check is not None and (seconds := self._check.seconds) > LONG:
+            self.state = (
+                f"{CHECKING} for {seconds:.0f} s now, at a low priority: it is slow where others "
+                "want the processors"
+            )
         if self._check is None and self._waiting is not None:
             text, self._waiting = self._waiting, None
             try:

@@ -230,7 +230,7 @@ class TrackingController(ManagedNode):
         """Begin a run; why not, empty if it began."""
         if self._design is None:
             return f"there is no design yet: {self._funnel.state}"
-        if self._funnel.refusal or self._funnel.state == CHECKING:
+        if self._funnel.refusal or self._funnel.state.startswith(CHECKING):
             return self._funnel.state
         if self._controller is not None or self._stopping:
             return "a run is on"

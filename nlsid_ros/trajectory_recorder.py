@@ -147,6 +147,7 @@ class TrajectoryRecorder(ManagedNode):
         self._snapshots = 0
         self._experiment: dict[str, str] = {}
         self._recording: Recording | None = None
+        self._warned = ""
         self._simulated = bool(self.get_parameter("use_sim_time").value)
         self._clock_of_log = LogClock()
         if self._at_once:
@@ -255,7 +256,6 @@ class TrajectoryRecorder(ManagedNode):
             self._recording.add(arrival, stamp_ns, info["publication_sequence_number"])
 
     def _lose(self, topic: str, count: int) -> None:
-        self.get_logger().warning(f"{topic}: {count} messages lost", throttle_duration_sec=REPORT)
         if self._recording is not None:
             self._recording.lose(topic, count)
 
@@ -335,6 +335,9 @@ class TrajectoryRecorder(ManagedNode):
             level, text = DiagnosticStatus.ERROR, recording.ended
         if self._simulated and not self.get_clock().now().nanoseconds:
             level, text = DiagnosticStatus.ERROR, f"nobody publishes /clock; {text}"
+        if level == DiagnosticStatus.WARN and text != self._warned:
+            self.get_logger().warning(text)
+        self._warned = text
         now = self.get_clock().now().to_msg()
         self._diagnostics.publish(status(now, name_of(self), level, text, values))
 

@@ -132,15 +132,6 @@ Proof.
   pose proof (binomials_length d) as L. rewrite E in L. discriminate.
 Qed.
 
-Definition ndiv (a b : num) : num :=
-  ((fst a * Zpos (snd b))%Z, (snd a * Z.to_pos (fst b))%positive).
-Lemma val_div a b : (0 < fst b)%Z -> val (ndiv a b) = val a / val b.
-Proof.
-  destruct a as [p q], b as [p' q']. unfold ndiv, val; cbn [fst snd]. intros H.
-  rewrite mult_IZR, Pos2Z.inj_mul, Z2Pos.id, mult_IZR by auto. apply IZR_lt in H.
-  field. repeat split; apply Rgt_not_eq; auto; now apply IZR_lt.
-Qed.
-
 Definition terms := list (list nat * matrix).
 Definition slice (rows : list (list num)) (k : nat) (c : Z) (ts : terms) : terms :=
   map (fun t => (tl (fst t),

@@ -95,17 +95,10 @@ Definition funnel_ok (d : problem) (w : witness) : bool :=
   andb (andb (check d w) (shapes_ok d))
     (andb (Nat.ltb 0 (length (segments d))) (goal_ok d (goal_multiplier w))).
 
-Theorem funnel_proved d w : funnel_ok d w = true -> forall x, solution d x ->
-  forall ta, begin d <= ta <= finish d -> inside d x ta ->
-  (forall t, ta <= t <= finish d -> inside d x t) /\ in_goal d x.
+Theorem goal_reached d w lambda : check d w = true -> goal_ok d lambda = true ->
+  (0 < length (segments d))%nat -> forall x, solution d x -> inside d x (finish d) -> in_goal d x.
 Proof.
-  intros H x Hx ta Hta Hin. unfold funnel_ok in H.
-  apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [Hc _].
-  apply andb_prop in H2 as [Hne Hg]. apply Nat.ltb_lt in Hne.
-  assert (S : forall t, ta <= t <= finish d -> inside d x t).
-  { intros t Ht. apply (stays d w Hc x Hx ta t); auto; lra. }
-  split; auto.
-  unfold in_goal, goal_ok in *. destruct (goal d) as [[centre B]|]; auto.
+  intros Hc Hg Hne x Hx S. unfold in_goal, goal_ok in *. destruct (goal d) as [[centre B]|]; auto.
   destruct (rev (segments d)) as [|g gs] eqn:Er; [discriminate|].
   assert (Es : segments d = rev gs ++ [g]).
   { rewrite <- (rev_involutive (segments d)), Er. reflexivity. }
@@ -124,7 +117,7 @@ Proof.
   assert (Lx : length x = n).
   { destruct Hx as [_ Dx]. destruct (Dx g ((begins g + ends g) / 2) Hin_g ltac:(lra)) as [w0 [_ F]].
     apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence. }
-  pose proof (S (finish d) ltac:(lra) g Hin_g ltac:(rewrite Fin; lra)) as I.
+  pose proof (S g Hin_g ltac:(rewrite Fin; lra)) as I.
   rewrite Fin in *. unfold inside_segment in I. rewrite (place_end g T) in I.
   unfold P, rho in I. rewrite line_1, (zip_line n0 1 line_1 _ _ S0 S1) in I.
   set (z := deviation g 1 (at_time x (ends g))) in *.
@@ -154,13 +147,24 @@ Proof.
   assert (Lze : length z = length (map val e)) by (rewrite map_length; congruence).
   rewrite form_plus by auto. rewrite !(form_symmetric _ _ (zip Rplus z (map val e))).
   rewrite !form_plus by auto. rewrite (form_symmetric _ (map val e) z).
-  assert (Lam : 0 <= val (goal_multiplier w)).
+  assert (Lam : 0 <= val lambda).
   { unfold val. apply Rmult_le_pos; auto. left. now apply Rinv_0_lt_compat, IZR_lt. }
   set (W := form (vals (shape (stop g))) z z) in *. fold (vals (shape (stop g))) in I.
-  fold W in I. set (rh := val (level (stop g))) in *. set (la := val (goal_multiplier w)) in *.
+  fold W in I. set (rh := val (level (stop g))) in *. set (la := val lambda) in *.
   set (bzz := form (vals B) z z) in *. set (bze := form (vals B) z (map val e)) in *.
   set (bee := form (vals B) (map val e) (map val e)) in *.
   apply (Rmult_le_reg_l rh); auto.
   pose proof (Rmult_le_compat_l la _ _ Lam I). lra.
+Qed.
+Theorem funnel_proved d w : funnel_ok d w = true -> forall x, solution d x ->
+  forall ta, begin d <= ta <= finish d -> inside d x ta ->
+  (forall t, ta <= t <= finish d -> inside d x t) /\ in_goal d x.
+Proof.
+  intros H x Hx ta Hta Hin. unfold funnel_ok in H.
+  apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [Hc _].
+  apply andb_prop in H2 as [Hne Hg]. apply Nat.ltb_lt in Hne.
+  assert (S : forall t, ta <= t <= finish d -> inside d x t).
+  { intros t Ht. apply (stays d w Hc x Hx ta t); auto; lra. }
+  split; auto. apply (goal_reached d w _ Hc Hg Hne x Hx). apply S. lra.
 Qed.
 End Goal.

@@ -92,6 +92,38 @@ Proof.
   specialize (G [] (Forall_nil _)). induction G as [|[p|] st]; cbn; auto.
   now apply merge_all.
 Qed.
+
+Variable value : mono -> A -> R.
+Hypothesis value_both : forall m a b, value m (both a b) = value m a + value m b.
+Fixpoint sum_of (p : list (mono * A)) : R :=
+  match p with [] => 0 | (m, a) :: p' => value m a + sum_of p' end.
+Lemma merge_sum p : forall q, sum_of (merge p q) = sum_of p + sum_of q.
+Proof.
+  induction p as [|[m a] p IH]; intros q. { destruct q; cbn; ring. }
+  induction q as [|[k b] q IHq]. { cbn; ring. }
+  cbn [merge]. destruct (mcompare m k) eqn:E.
+  - apply mcompare_eq in E as ->. cbn. rewrite IH, value_both. ring.
+  - cbn [sum_of]. rewrite IH. cbn. ring.
+  - change (value k b + sum_of (merge ((m, a) :: p) q)
+      = sum_of ((m, a) :: p) + sum_of ((k, b) :: q)).
+    rewrite IHq. cbn. ring.
+Qed.
+Lemma sorted_sum l : sum_of (sorted l) = sum_of l.
+Proof.
+  unfold sorted. pose (sv := fix sv st := match st with
+    | [] => 0 | Some p :: st' => sum_of p + sv st' | None :: st' => sv st' end).
+  assert (Hpush : forall st p, sv (push p st) = sum_of p + sv st).
+  { induction st as [|[q|] st IH]; intros p; cbn; try ring.
+    rewrite IH, merge_sum. ring. }
+  assert (Hfold : forall l st,
+    sv (fold_left (fun stack term => push [term] stack) l st) = sum_of l + sv st).
+  { clear l. induction l as [|[m a] l IH]; intros st; cbn [fold_left]. { cbn; ring. }
+    rewrite IH, Hpush. cbn. ring. }
+  assert (Hflat : forall st, sum_of (flatten st) = sv st).
+  { induction st as [|[q|] st IH]; [reflexivity| |exact IH].
+    change (sum_of (merge (flatten st) q) = sum_of q + sv st). rewrite merge_sum, IH. ring. }
+  rewrite Hflat, Hfold. cbn. ring.
+Qed.
 End Merge.
 
 Section Polynomials.
@@ -246,32 +278,14 @@ Proof.
   - change (x j * mval (mmul (i :: a) b) = mval (i :: a) * mval (j :: b)).
     rewrite IHb. cbn. ring.
 Qed.
-Lemma padd_val p : forall q, pval (padd p q) = pval p + pval q.
-Proof.
-  unfold padd. induction p as [|[m a] p IH]; intros q. { destruct q; cbn; ring. }
-  induction q as [|[k b] q IHq]. { cbn; ring. }
-  cbn [merge]. destruct (mcompare m k) eqn:E.
-  - apply mcompare_eq in E as ->. cbn. rewrite IH, badd_val. ring.
-  - cbn [pval]. rewrite IH. cbn. ring.
-  - change (bval b * mval k + pval (merge badd ((m, a) :: p) q)
-      = pval ((m, a) :: p) + pval ((k, b) :: q)).
-    rewrite IHq. cbn. ring.
-Qed.
+Lemma pval_sum p : pval p = sum_of (fun m a => bval a * mval m) p.
+Proof. induction p as [|[m a] p IH]; cbn; [|rewrite IH]; reflexivity. Qed.
+Lemma both_val m a b : bval (badd a b) * mval m = bval a * mval m + bval b * mval m.
+Proof. rewrite badd_val. ring. Qed.
+Lemma padd_val p q : pval (padd p q) = pval p + pval q.
+Proof. rewrite !pval_sum. apply merge_sum, both_val. Qed.
 Lemma sorted_val l : pval (sorted badd l) = pval l.
-Proof.
-  unfold sorted. pose (sv := fix sv st := match st with
-    | [] => 0 | Some p :: st' => pval p + sv st' | None :: st' => sv st' end).
-  assert (Hpush : forall st p, sv (push badd p st) = pval p + sv st).
-  { induction st as [|[q|] st IH]; intros p; cbn; try ring.
-    rewrite IH. change (merge badd q p) with (padd q p). rewrite padd_val. ring. }
-  assert (Hfold : forall l st,
-    sv (fold_left (fun stack term => push badd [term] stack) l st) = pval l + sv st).
-  { induction l0 as [|[m a] l0 IH]; intros st; cbn. ring. rewrite IH, Hpush. cbn. ring. }
-  assert (Hflat : forall st, pval (flatten badd st) = sv st).
-  { induction st as [|[q|] st IH]; [reflexivity| |exact IH].
-    change (pval (padd (flatten badd st) q) = pval q + sv st). rewrite padd_val, IH. ring. }
-  rewrite Hflat, Hfold. cbn. ring.
-Qed.
+Proof. rewrite !pval_sum. apply sorted_sum, both_val. Qed.
 Lemma pterm_val m a q : pval (pterm m a q) = bval a * mval m * pval q.
 Proof.
   induction q as [|[k b] q IH]. { cbn; ring. }

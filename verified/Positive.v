@@ -121,11 +121,11 @@ Fixpoint dominated (columns : list Z) (p : list I) (l : choices) (terms : poly) 
 Definition is_one (v : mono) : bool := match v with [] => true | _ => false end.
 Definition nonzero (t : mono * bern) : bool := negb (forallb (ieqb izero) (snd t)).
 
-(* [l] is [products basis], computed once. *)
-Definition is_positive (basis : list mono) (l : choices) (columns : list Z) (sq : squares) (c : F)
-  : bool :=
+(* What is left of [c] on the diagonal, nowhere negative. [l] is [products basis], computed once. *)
+Definition remainder (basis : list mono) (l : choices) (columns : list Z) (sq : squares) (c : F)
+  : option (list bern) :=
   match expanded basis columns sq with
-  | None => false
+  | None => None
   | Some squared =>
       let rest := fsub c squared in
       let D := order rest in
@@ -136,15 +136,20 @@ Definition is_positive (basis : list mono) (l : choices) (columns : list Z) (sq 
       if andb (Nat.eqb (length columns) (length basis)) (forallb ipos p)
       then
         match dominated columns p l terms (repeat [] (length basis)) with
-        | None => false
-        | Some room =>
-            andb (forallb (forallb inonneg) room)
-              (existsb (fun e => andb (is_one (fst e))
-                 (andb (Nat.ltb 0 (length (snd e))) (forallb ipos (snd e))))
-                 (combine basis room))
+        | Some room => if forallb (forallb inonneg) room then Some room else None
+        | None => None
         end
-      else false
+      else None
   end.
+Definition some_left (basis : list mono) (room : list bern) : bool :=
+  existsb (fun e => andb (is_one (fst e))
+    (andb (Nat.ltb 0 (length (snd e))) (forallb ipos (snd e)))) (combine basis room).
+Definition is_positive (basis : list mono) (l : choices) (columns : list Z) (sq : squares) (c : F)
+  : bool :=
+  match remainder basis l columns sq c with Some room => some_left basis room | None => false end.
+Definition is_nonneg (basis : list mono) (l : choices) (columns : list Z) (sq : squares) (c : F)
+  : bool :=
+  match remainder basis l columns sq c with Some _ => true | None => false end.
 
 (* Why. *)
 Section At.
@@ -490,10 +495,11 @@ Proof.
   rewrite IH, <- E1; auto. ring.
 Qed.
 
-Theorem is_positive_sound basis columns sq c v : 0 <= s <= 1 ->
-  is_positive basis (products basis) columns sq c = true -> means c v -> 0 < v.
+Theorem remainder_sound basis columns sq c v room : 0 <= s <= 1 ->
+  remainder basis (products basis) columns sq c = Some room -> means c v ->
+  0 <= v /\ (some_left basis room = true -> 0 < v).
 Proof.
-  intros Hs H Hc. unfold is_positive in H.
+  intros Hs H Hc. unfold remainder in H.
   destruct (expanded basis columns sq) as [q|] eqn:Eq; [|discriminate].
   destruct (expanded_val _ _ _ _ Hs Eq) as [w [Hq Hw]].
   pose proof (means_sub _ _ _ _ _ _ Hc Hq) as [Dr Vr].
@@ -501,8 +507,8 @@ Proof.
   set (p := map _ columns) in *.
   destruct (andb _ _) eqn:E; [|discriminate]. apply andb_prop in E as [E1 E2].
   apply Nat.eqb_eq in E1.
-  destruct (dominated _ _ _ _ _) as [room|] eqn:Ed; [|discriminate].
-  apply andb_prop in H as [H1 H2].
+  destruct (dominated _ _ _ _ _) as [room'|] eqn:Ed; [|discriminate].
+  destruct (forallb _ room') eqn:H1; [|discriminate]. injection H as ->.
   assert (Hp : length p = length basis) by (unfold p; now rewrite map_length).
   assert (Hpos : Forall (fun a => 0 < r a) p).
   { apply Forall_forall. intros a Ha. rewrite forallb_forall in E2. apply r_pos; auto. }
@@ -513,23 +519,24 @@ Proof.
   { generalize (zz basis p). generalize (length basis). clear. intros n. induction n as [|n IH]; intros [|z0 l]; cbn; auto.
     rewrite IH. ring. }
   rewrite Z0 in V.
-  enough (P : 0 < dot (map bval room) (zz basis p)).
-  { assert (0 < (v - w) * r (den rest)) by lra.
-    assert (0 < v - w) by (apply Rmult_lt_reg_r with (r (den rest)); lra). lra. }
+  enough (P : 0 <= dot (map bval room) (zz basis p) /\
+    (some_left basis room = true -> 0 < dot (map bval room) (zz basis p))).
+  { destruct P as [P1 P2]. split.
+    - assert (0 <= v - w) by (apply Rmult_le_reg_r with (r (den rest)); lra). lra.
+    - intros L. specialize (P2 L). assert (0 < v - w) by (apply Rmult_lt_reg_r with (r (den rest)); lra). lra. }
   (* every entry is nonnegative, and that of the monomial 1 positive *)
   assert (G : forall basis room zs, length room = length basis ->
     Forall2 (fun v z => 0 <= z /\ (v = [] -> 0 < z)) basis zs ->
     forallb (forallb inonneg) room = true ->
     0 <= dot (map bval room) zs /\
-    (existsb (fun e => is_one (fst e) && (Nat.ltb 0 (length (snd e)) && forallb ipos (snd e)))%bool
-       (combine basis room) = true -> 0 < dot (map bval room) zs)).
+    (some_left basis room = true -> 0 < dot (map bval room) zs)).
   { clear - Hs. induction basis as [|v basis IH]; intros [|a room] zs HL HZ HN;
       try discriminate; inversion HZ as [|? z ? zs' [Hz Hz1] HZ']; subst.
     { cbn. split; [lra|discriminate]. }
     cbn in HN. apply andb_prop in HN as [N1 N2]. cbn in HL. injection HL as HL.
     destruct (IH room zs' HL HZ' N2) as [A B]. pose proof (bval_nonneg a Hs N1) as C.
     pose proof (Rmult_le_pos _ _ C Hz) as D.
-    split; [cbn; lra|]. cbn [combine existsb fst snd map dot]. intros O.
+    split; [cbn; lra|]. unfold some_left in *. cbn [combine existsb fst snd map dot]. intros O.
     apply Bool.orb_prop in O as [O|O]; [|specialize (B O); lra].
     apply andb_prop in O as [O1 O2]. apply andb_prop in O2 as [O2 O3].
     apply Nat.ltb_lt in O2. destruct v; [|discriminate].
@@ -546,6 +553,18 @@ Proof.
   split; [nra|]. intros Hv. unfold z. rewrite Hv. cbn.
   assert (0 < 1 / r (nth i p izero)) by (apply Rdiv_lt_0_compat; lra).
   now apply Rmult_lt_0_compat.
+Qed.
+Theorem is_positive_sound basis columns sq c v : 0 <= s <= 1 ->
+  is_positive basis (products basis) columns sq c = true -> means c v -> 0 < v.
+Proof.
+  intros Hs H Hc. unfold is_positive in H. destruct (remainder _ _ _ _ _) as [room|] eqn:E; [|discriminate].
+  now apply (remainder_sound _ _ _ _ _ _ Hs E Hc).
+Qed.
+Theorem is_nonneg_sound basis columns sq c v : 0 <= s <= 1 ->
+  is_nonneg basis (products basis) columns sq c = true -> means c v -> 0 <= v.
+Proof.
+  intros Hs H Hc. unfold is_nonneg in H. destruct (remainder _ _ _ _ _) as [room|] eqn:E; [|discriminate].
+  now apply (remainder_sound _ _ _ _ _ _ Hs E Hc).
 Qed.
 End At.
 End Positive.

@@ -64,6 +64,40 @@ class Funnel:
         self.kappa = self.proof.get("kappa", [[]] * self.intervals)
 
 
+class Composition:
+    """The numbers of funnels that follow each other, and the multipliers between them."""
+
+    def __init__(self, document: Any, content: str, folder: Path) -> None:
+        self.files: Files = {"proof": (content, document)}
+        self.multipliers = strict.composition(document)
+        roles = [f"stage{i}" for i in range(1, len(self.multipliers) + 2)]
+        _bound(document["claim"]["about"], folder, " ".join(roles), self.files)
+        self.stages = []
+        for role in roles:
+            text, stage = self.files.pop(role)
+            if strict.proof_of(stage, role) != "continuous_funnel":
+                raise Refused(f"{role} should claim a continuous_funnel")
+            self.stages.append(Funnel(stage, text, folder))
+            self.files |= {f"{role}.{part}": file for part, file in self.stages[-1].files.items()}
+
+
+class Sampled:
+    """The numbers of a sampled funnel of an explicit model, and its witnesses."""
+
+    def __init__(self, document: Any, content: str, folder: Path) -> None:
+        self.files: Files = {"proof": (content, document)}
+        about, roles = document["claim"].get("about"), "model policy funnel"
+        (self.model, self.policy, self.funnel), digests = _bound(about, folder, roles, self.files)
+        if self.model.get("kind") == "trapezoidal":
+            raise NotCovered("sampled funnels of models of kind trapezoidal are not covered")
+        strict.sampled(self.files)
+        if any(file["model"] != digests["model"] for file in (self.policy, self.funnel)):
+            raise Refused("a file names another model")
+        if self.funnel["policy"] != digests["policy"]:
+            raise Refused("the funnel names another policy")
+        self.proof = document["proof"]
+
+
 def _load(content: bytes, name: str) -> Any:
     def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len({key for key, _ in pairs}) != len(pairs):
@@ -138,8 +172,6 @@ class Increments:
         planned = type(about) is dict and "policy" in about and not stable
         roles = "model" if stable else "model policy funnel" if planned else "model funnel"
         (self.model, *others), digests = _bound(about, folder, roles, self.files)
-        if self.model.get("kind") == "block_cascade":
-            raise NotCovered("models of kind block_cascade are not covered")
         strict.held(self.files)
         if any(entry["model"] != digests["model"] for entry in others):
             raise Refused("a file names another model")
@@ -193,6 +225,7 @@ class Coq:
     """Terms of Coq; what is defined is named."""
 
     def __init__(self, modules: str) -> None:
+        self.mark = ""  # before every name
         self.lines = [
             "(* Made by generate.py. The theorem is about the numbers below. *)",
             "From Coq Require Import ZArith Reals List Uint63.",
@@ -232,8 +265,8 @@ class Coq:
         return self.made(constructor, *terms)
 
     def named(self, name: str, term: str) -> str:
-        self.lines.append(f"Definition {name} := {term}.")
-        return name
+        self.lines.append(f"Definition {self.mark}{name} := {term}.")
+        return self.mark + name
 
 
 def shifted(n: int, p: int) -> list[list[Fraction]]:
@@ -331,13 +364,18 @@ class Writer:
         if kind == "implicit":
             return self.implicit(model)
         if kind == "cell_network":
+            tables = (zip(f["knots"], f["values"], strict=True) for f in model["maps"])
             maps = to.listed(
-                to.listed(map(self.ends, zip(f["knots"], f["values"], strict=True)))
-                for f in model["maps"]
+                to.chosen("Broken", 0, to.listed(map(self.ends, table))) for table in tables
             )
             size = len(model["maps"]) + len(model["start"])
             known = ([row[:size] for row in model[key]] for key in ("into", "next", "output"))
             return to.chosen("Cells", 3, maps, *map(self.matrix, known))
+        if kind == "block_cascade":
+            f, parts = model["f"], printed.cascade(model, *printed.orders(model))
+            numbers = self.num(f["low"]), self.num(f["spacing"]), self.nums(f["coefficients"])
+            maps = to.listed([to.chosen("Spline", 1, *numbers)] * len(model["b1"]))
+            return to.chosen("Cells", 3, maps, *map(self.matrix, parts))
         raise NotCovered(f"models of kind {kind} are not covered")
 
     def affine(
@@ -456,6 +494,57 @@ class Writer:
         low, high = row
         return self.to.pair(self.num(low), self.num(high))
 
+    def composition(self, problem: Composition) -> None:
+        """What the theorem is about, stage by stage, and what is used to decide it."""
+        to, parts = self.to, ("field", "policy", "funnel", "goal")
+        stages, proofs = [], []
+        for i, stage in enumerate(problem.stages, start=1):
+            to.mark = f"stage{i}_"
+            self.problem(stage)
+            proofs.append(to.named("proof", self.witness(stage)))
+            stages.append(to.made("Stage", *(to.mark + part for part in parts)))
+        to.mark = ""
+        to.named("stages", to.listed(stages))
+        to.named("proofs", to.listed(proofs))
+        to.named("multipliers : list num", self.nums(problem.multipliers))
+
+    def sampled(self, problem: Sampled) -> None:
+        """What the theorem is about: model, policy, funnel."""
+        to, model, policy, funnel = self.to, problem.model, problem.policy, problem.funnel
+        rows = to.listed(self.counts(row, strict.DEGREES) for row in model["exponents"])
+        ranges = (to.listed(map(self.ends, model[name])) for name in ("x_range", "u_range"))
+        to.named("model", to.made("Map", rows, self.matrix(model["coefficients"]), *ranges))
+        K = to.listed(map(self.matrix, policy["K"]))
+        to.named("policy", to.made("Track", self.matrix(policy["u"]), self.matrix(policy["x"]), K))
+        given = funnel["assumption"]
+        level = (self.num(given[name]) for name in ("bound", "rate", "gain"))
+        radii = self.nums(funnel["tube"]), self.nums(funnel["inlet"])
+        shapes = (to.listed(map(self.matrix, funnel[name])) for name in ("S", "A"))
+        sides = *radii, self.matrix(funnel["half_widths"]), *shapes
+        to.named("funnel", to.made("Sampled", given["form"].capitalize(), *level, *sides))
+
+    def links(self, proof: dict[str, Any]) -> str:
+        """The witnesses of every step."""
+        to = self.to
+        bases = (self.monomials(proof[name]) for name in ("basis", "ball_basis"))
+        steps = enumerate(proof["steps"])
+        return to.made(
+            "Links", *bases, to.listed(to.named(f"link_{k}", self.link(step)) for k, step in steps)
+        )
+
+    def link(self, step: dict[str, Any]) -> str:
+        """Those of one."""
+        numbers = self.matrix(step["T"]), self.num(step["kappa"]), self.nums(step["curvature"])
+        return self.to.made("Link", *numbers, self.chain(step["tube"]), self.chain(step["inlet"]))
+
+    def chain(self, chain: dict[str, Any]) -> str:
+        """Those of a chain of radii."""
+        sums = (
+            term for entry in (chain, chain["ball"])
+            for term in (self.shifts(entry["columns"]), self.squares(entry["squares"]))
+        )  # fmt: skip
+        return self.to.made("Chain", self.num(chain["reach"]), *sums)
+
     def curves(self, name: str, intervals: Iterable[Any], entry: Any) -> str:
         """Control points, by interval."""
         to = self.to
@@ -555,6 +644,20 @@ Theorem near_plan : Forall (stays_near_plan a b b0 c feedback) tubes.
 Proof. exact (plans_proved a b b0 c feedback tubes planned). Qed.
 Print Assumptions near_plan.
 """
+COMPOSED = """\
+Theorem accepted : composed_ok stages proofs multipliers = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem follow : composed (map stated_by stages).
+Proof. exact (composed_theorem stages proofs multipliers accepted). Qed.
+Print Assumptions follow.
+"""
+SAMPLED = """\
+Theorem accepted : sampled_ok model policy funnel proof = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem stays : stays_in_tube model policy funnel /\\ arrives_from_inlet model policy funnel.
+Proof. exact (sampled_theorem model policy funnel proof accepted). Qed.
+Print Assumptions stays.
+"""
 STABLE = """\
 Theorem accepted : stability_ok data storage rate proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
@@ -564,22 +667,26 @@ Print Assumptions stable.
 """
 
 
-def read(path: Path) -> Funnel | Increments:
+Problem = Funnel | Increments | Sampled | Composition
+
+
+def read(path: Path) -> Problem:
     """The numbers of a proof file of a kind that is covered."""
     content = path.read_bytes()
     document = _load(content, path.name)
-    strict.members(document, path.name, "format version claim proof")
-    strict.word(document["format"], "format", ["nlsid/proof"])
-    claim = document["claim"]
-    kind = claim.get("kind") if type(claim) is dict else None
+    kind = strict.proof_of(document, path.name)
     if kind in ("tube", "stability"):
         return Increments(document, content.decode(), path.parent)
+    if kind == "sampled_funnel":
+        return Sampled(document, content.decode(), path.parent)
+    if kind == "funnel_composition":
+        return Composition(document, content.decode(), path.parent)
     if kind != "continuous_funnel":
         raise NotCovered(f"claims of kind {kind} are not covered by the second kernel")
     return Funnel(document, content.decode(), path.parent)
 
 
-def coq(problem: Funnel | Increments) -> str:
+def coq(problem: Problem) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
     if isinstance(problem, Funnel):
         to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Data")
@@ -587,6 +694,16 @@ def coq(problem: Funnel | Increments) -> str:
         writer.problem(problem)
         to.named("proof", writer.witness(problem))
         return "\n".join(to.lines) + "\n" + THEOREM
+    if isinstance(problem, Composition):
+        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Composed Data")
+        Writer(to).composition(problem)
+        return "\n".join(to.lines) + "\n" + COMPOSED
+    if isinstance(problem, Sampled):
+        to = Coq("Integers Forms Polynomials Positive Claim Tubes Samples Steps Stepwise Data")
+        writer = Writer(to)
+        writer.sampled(problem)
+        to.named("proof", writer.links(problem.proof))
+        return "\n".join(to.lines) + "\n" + SAMPLED
     to = Coq("Integers Forms Claim Data Tubes Boxes Near Driven")
     writer = Writer(to)
     to.named("data", writer.model(problem.model))
@@ -619,6 +736,8 @@ ASKED = {
     "plan": "data tubes proofs a b b0 feedback",
     "tube": "data tubes proofs",
     "stability": "data storage rate proof",
+    "sampled": "model policy funnel proof",
+    "composed": "stages proofs multipliers",
 }
 
 
@@ -628,10 +747,13 @@ def words(terms: dict[str, Any]) -> str:
     return " ".join([kind, *(printed.words(terms[name]) for name in ASKED[kind].split())]) + "\n"
 
 
-def compared(problem: Funnel | Increments, text: str) -> dict[str, Any]:
+def compared(problem: Problem, text: str) -> dict[str, Any]:
     """The terms of the theorem, which print as the files that it was made of."""
     terms = printed.read(text)
-    write = printed.funnel if isinstance(problem, Funnel) else printed.near
+    write = {
+        Funnel: printed.funnel, Increments: printed.near, Sampled: printed.sampled,
+        Composition: printed.composed,
+    }[type(problem)]  # fmt: skip
     printed.differences(write(terms, problem.files), problem.files)
     return terms
 

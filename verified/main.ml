@@ -47,6 +47,10 @@ let witness () =
   let pushed = count () = 1 in
   { margin; basis; multiplier; sides; pieces; pushed; goal_multiplier = num () }
 
+let mapping () = match count () with
+  | 0 -> Broken (listed (pair num num))
+  | 1 -> let low = num () in let spacing = num () in Spline (low, spacing, nums ())
+  | _ -> failwith "a map"
 let model () = match count () with
   | 0 -> Linear (nums ())
   | 1 ->
@@ -57,7 +61,7 @@ let model () = match count () with
     let e1 = num () in let e2 = num () in let e3 = num () in let a = nums () in
     Monotone (e1, e2, e3, a, matrix ())
   | 3 ->
-    let maps = listed (fun () -> listed (pair num num)) in
+    let maps = listed mapping in
     let into = matrix () in let next = matrix () in Cells (maps, into, next, matrix ())
   | _ -> failwith "a model"
 let tube () =
@@ -68,6 +72,34 @@ let rec tree () = match count () with
   | 0 -> Leaf (listed matrix)
   | 1 -> let i = count () in let lower = tree () in Split (i, lower, tree ())
   | _ -> failwith "a tree"
+
+let stage () =
+  let dynamics = field () in let control = policy () in let tunnel = funnel () in
+  { dynamics; control; tunnel; aim = maybe (pair nums matrix) () }
+let map () =
+  let powers0 = listed (fun () -> listed count) in let coefficients = matrix () in
+  let x_range = listed ends in { powers0; coefficients; x_range; u_range = listed ends }
+let track () =
+  let inputs0 = matrix () in let states1 = matrix () in
+  { inputs0; states1; feedback0 = listed matrix }
+let assumption () = match count () with
+  | 0 -> Response | 1 -> Peak | 2 -> Energy | 3 -> Fading | _ -> failwith "an assumption"
+let sampled () =
+  let assumed_form = assumption () in let bound = num () in
+  let forgets_by = num () in let weighs = num () in
+  let tube_radii = nums () in let inlet_radii = nums () in let half_widths = matrix () in
+  let scales = listed matrix in
+  { assumed_form; bound; forgets_by; weighs; tube_radii; inlet_radii; half_widths; scales;
+    responses = listed matrix }
+let chain () =
+  let reach = num () in let shifts = wholes () in let rest = squares () in
+  let ball_shifts = wholes () in { reach; shifts; rest; ball_shifts; ball = squares () }
+let link () =
+  let frame = matrix () in let kappa0 = num () in let curvature = nums () in
+  let of_tube = chain () in { frame; kappa0; curvature; of_tube; of_inlet = chain () }
+let links () =
+  let basis0 = listed wholes in let ball_basis = listed wholes in
+  { basis0; ball_basis; linked0 = listed link }
 
 let () =
   let accepted = match word () with
@@ -83,5 +115,9 @@ let () =
     | "stability" ->
       let m = model () in let storage = matrix () in let rate = num () in
       decide_stability m storage rate (tree ())
+    | "composed" ->
+      let gs = listed stage in let ws = listed witness in decide_composed gs ws (nums ())
+    | "sampled" ->
+      let m = map () in let p = track () in let s = sampled () in decide_sampled m p s (links ())
     | _ -> failwith "a kind" in
   if accepted then print_endline "accepted" else (print_endline "refused"; exit 1)

@@ -27,6 +27,7 @@ COMMON = 10_000  # bits
 DIGITS, SHIFT, LEVEL, LIMITS, DEGREE = 4000, 400, 16, 3, 7
 BASIS, FACTORS_OF_SQUARES, ROWS = 200, 24, 800
 KNOTS, PIECES, UNCERTAIN, ENTRIES = 10_000, 100_000, 32, 16
+SAMPLES, CURVATURE, STEP_MONOMIALS, STAGES = 10**6, 64, 1000, 100
 SIGNAL = "name unit path"
 EQUATION = "0 = h(v, x, w), x+ = [v; shift(x, w)]"
 
@@ -124,9 +125,9 @@ def trials(value: Any, where: str, least: int = 0) -> list[tuple[str, int, int]]
     return found
 
 
-def signals(value: Any, where: str, least: int = 1) -> list[str]:
+def signals(value: Any, where: str, least: int = 1, most: int = SIGNALS) -> list[str]:
     """Of distinct names."""
-    rows = listed(value, where, least, SIGNALS)
+    rows = listed(value, where, least, most)
     for row in rows:
         members(row, where, SIGNAL)
         for key in SIGNAL.split():
@@ -170,6 +171,7 @@ def model(document: dict[str, Any]) -> Sizes:
     kinds = {
         "difference_equation": _difference, "state_affine": _affine,
         "monotone_equation": _monotone, "cell_network": _cells, "implicit": _implicit,
+        "block_cascade": _cascade,
     }  # fmt: skip
     head(document, "model", kinds)
     need(real(document.get("period"), "period") > 0, "the period should be > 0")
@@ -250,6 +252,24 @@ def _cells(model: dict[str, Any]) -> Sizes:
     matrix(model["next"], "next", n, m + n + inputs + 1)
     matrix(model["output"], "output", p, m + n + inputs + 1)
     return Sizes(n, m, p, inputs, 0)
+
+
+def _cascade(model: dict[str, Any]) -> Sizes:
+    _recorded(model, "a1 b1 f a2 b2", "equation")
+    for key in ("y", "u"):
+        signals([model[key]], key)
+    M, n = len(listed(model["b1"], "b1", 1, PHASES)), 0
+    for a, b in (("a1", "b1"), ("a2", "b2")):
+        rows = listed(model[b], b, M, M)
+        columns = len(listed(rows[0], b, 1, MOST))
+        matrix(rows, b, M, columns)
+        n += max(len(reals(model[a], a, 0, MOST)), columns - 1)
+    need(1 <= n <= STATES, f"{n} states")
+    f = members(model["f"], "f", "low spacing coefficients")
+    real(f["low"], "low")
+    need(real(f["spacing"], "spacing") > 0, "the spacing should be > 0")
+    reals(f["coefficients"], "coefficients", 4, MOST)
+    return Sizes(n, M, 1, 1, 0)
 
 
 def _implicit(model: dict[str, Any]) -> Sizes:
@@ -401,6 +421,21 @@ def plan(document: dict[str, Any], model: dict[str, Any], tubes: list[Any]) -> N
         (u,) = reals(row, "u", 1)
         need(low <= u <= high, "a plan's input is outside the model's range")
     need(all(matrix(tube["L"], "L", n, 1) == L for tube in tubes), "L is not the policy's")
+
+
+def proof_of(document: Any, where: str) -> Any:
+    """The kind of what a proof file claims."""
+    members(document, where, "format version claim proof")
+    word(document["format"], "format", ["nlsid/proof"])
+    claim = document["claim"]
+    return claim.get("kind") if type(claim) is dict else None
+
+
+def composition(document: Any) -> list[Fraction]:
+    """The multipliers between the stages."""
+    members(document["claim"], "claim", "kind about")
+    proof = members(document["proof"], "proof", "multipliers")
+    return reals(proof["multipliers"], "multipliers", 1, STAGES - 1)
 
 
 def held(files: dict[str, tuple[str, Any]]) -> None:
@@ -583,3 +618,78 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
                 whole(side, "mode", -1, 1)
             for entry in listed(piece["tau"], "tau", limits, limits):
                 squares(members(entry, "tau", "columns squares"), "tau", sides)
+
+
+def sampled(files: dict[str, tuple[str, Any]]) -> None:
+    """Raise Refused unless the files of an explicit model's sampled funnel are as its page says."""
+    model, policy, funnel, document = (
+        files[role][1] for role in ("model", "policy", "funnel", "proof")
+    )
+    n, p = _map(model)
+    members(policy, "policy", "format version kind law model period L u x K")
+    members(funnel, "funnel", "format version kind set model policy assumption tube inlet "
+            "half_widths S A")  # fmt: skip
+    for name, file in (("policy", policy), ("funnel", funnel)):
+        head(file, name, ("sampled",))
+    need(real(policy["period"], "period") == real(model["period"], "period"), "another period")
+    N = len(matrix(policy["u"], "u", len(listed(policy["u"], "u", 1, SAMPLES)), p))
+    need(N * n**3 <= SAMPLES, "too many samples")
+    matrix(policy["L"], "L", n, n)
+    matrix(policy["x"], "x", N + 1, n)
+    for K in listed(policy["K"], "K", N, N):
+        matrix(K, "K", p, n)
+    radii = {name: reals(funnel[name], name, N + 1) for name in ("tube", "inlet")}
+    need(radii["tube"][0] <= radii["inlet"][0], "the tube starts outside the inlet")
+    matrix(funnel["half_widths"], "half_widths", N + 1, n)
+    for name, count in (("S", N + 1), ("A", N)):
+        for M in listed(funnel[name], name, count, count):
+            matrix(M, name, n, n)
+    _kept(funnel["assumption"], trials(model["bags"], "bags"))
+    members(document["claim"], "claim", "kind about")
+    proof = members(document["proof"], "proof", "basis ball_basis steps")
+    sizes = [basis(proof[name], name, n) for name in ("basis", "ball_basis")]
+    for step in listed(proof["steps"], "steps", N, N):
+        members(step, "step", "T kappa curvature tube inlet")
+        matrix(step["T"], "T", n, n)
+        need(real(step["kappa"], "kappa") >= 0, "kappa >= 0")
+        gammas = reals(step["curvature"], "curvature", 0, CURVATURE)
+        need(min(gammas, default=0) >= 0, "curvature >= 0")
+        for chain in (step["tube"], step["inlet"]):
+            members(chain, "chain", "reach columns squares ball")
+            need(real(chain["reach"], "reach") >= 0, "reach >= 0")
+            squares(chain, "chain", sizes[0])
+            squares(members(chain["ball"], "ball", "columns squares"), "ball", sizes[1])
+
+
+def _map(model: dict[str, Any]) -> tuple[int, int]:
+    """The numbers of states and inputs of an explicit model."""
+    head(model, "model", ("state_map",))
+    members(model, "model", "format version kind equation period x u exponents coefficients "
+            "x_range u_range noise disturbance bags")  # fmt: skip
+    n, p = (len(signals(model[key], key, 1, ENTRIES)) for key in "xu")
+    need(real(model["period"], "period") > 0, "the period should be > 0")
+    rows = listed(model["exponents"], "exponents", 1, MONOMIALS)
+    table = {"exponents": rows, "coefficients": model["coefficients"]}
+    polynomials(table, "model", n + p, (n,))
+    degree = max(map(sum, rows))
+    need(math.comb(n + degree, degree) <= STEP_MONOMIALS, "too many monomials in a step")
+    matrix(model["x_range"], "x_range", n, 2)
+    matrix(model["u_range"], "u_range", p, 2)
+    return n, p
+
+
+def _kept(given: Any, fitted: list[tuple[str, int, int]]) -> None:
+    """The assumption about the disturbance; `fitted` are the model's trials."""
+    names = "bound rate gain measured safety_factor"
+    members(given, "assumption", f"form {names} measured_on")
+    form = word(given["form"], "form", ("response", "peak", "energy", "fading"))
+    bound, rate, gain, found, factor = (real(given[name], name) for name in names.split())
+    need(min(bound, rate, gain, found, factor) >= 0, "assumption: a negative number")
+    need(rate <= 1 <= gain, "rate <= 1, gain >= 1")
+    need(rate == 1 or form == "fading", "rate is 1 but in form fading")
+    need(gain == 1 or form in ("energy", "fading"), "gain is 1 in forms response and peak")
+    need(factor >= 1 and factor * found <= bound, "the bound is below what was measured")
+    runs = trials(given["measured_on"], "measured_on", 1)
+    need(all(end == END for _, _, end in runs), "measured_on: a window is no commissioning run")
+    seen = {recording for recording, _, _ in fitted}
+    need(not seen & {run for run, _, _ in runs}, "measured on what the model was fitted to")

@@ -21,7 +21,7 @@ from bags.chain.sections import (
 from bags.signals.expressions import parse_factors
 from bags.signals.sampling import Sampler, sampled_path
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.identification import BlockCascadeClass, CellClass, LinearClass
+from nlsid_core.identification import BlockCascadeClass, CellClass, FeedbackClass, LinearClass
 from nlsid_core.running.comparison import Centre
 
 ONE_BY_ONE = (LinearClass, BlockCascadeClass)  # classes of one response and one excitation
@@ -373,9 +373,9 @@ def _model_refusals(config: Config) -> Iterator[str]:
             f"identification.model: {model} has one response and one excitation, not {said}; take "
             "state_affine or implicit, or leave out signals"
         )
-    elif kind is CellClass and counts[0] != 1:
+    elif kind in (CellClass, FeedbackClass) and counts[0] != 1:
         yield (
-            f"identification.model: cells have one response, not {said}; take state_affine or "
+            f"identification.model: {model} has one response, not {said}; take state_affine or "
             "implicit, or leave out signals"
         )
     elif (

@@ -1,6 +1,7 @@
 """`nlsid demo`: the chain on the shipped bags, step by step, then live where rclpy is there."""
 
 import importlib.util
+import shlex
 import shutil
 import subprocess
 import sys
@@ -183,6 +184,9 @@ class _Demo:
         with progress_bar("playing"):
             done = subprocess.run(command, check=False, capture_output=True, text=True)
         self._say((done.stdout + done.stderr).strip())
+        if done.returncode:
+            self._say("to repeat this step alone:")
+            self._say(shlex.join(["python", *command[1:]]))
         return done.returncode == 0
 
     def where_to_look(self) -> None:

@@ -45,7 +45,7 @@ ManifestOption = Annotated[
 ]
 WorkersOption = Annotated[
     int,
-    typer.Option("--workers", min=0, help="Processes that read, or share a sweep; 0: this one."),
+    typer.Option("--workers", min=0, help="Processes that share the work; 0: this one."),
 ]
 SchedulerOption = Annotated[
     str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
@@ -98,7 +98,7 @@ def check(
     serious = {UNREAD: 0, "bad": 1, "look": 2, "good": 3}
     for row in sorted(rows, key=lambda row: serious[row.verdict])[:ROWS]:
         lost = "-" if row.lost is None else str(row.lost)
-        shown.add_row(row.bag, row.verdict, row.start[:19], lost, escape(row.trouble))
+        shown.add_row(_plain(row.bag), row.verdict, row.start[:19], lost, _plain(row.trouble))
     console.print(shown)
     if len(rows) > ROWS:
         console.print(f"and {len(rows) - ROWS} more, none more serious; --out writes all of them")
@@ -137,7 +137,7 @@ def monitor(
     from bags.designs import documents
     from bags.fleet.bags import named_bags
     from bags.fleet.check import write_parquet
-    from bags.fleet.monitor import monitor_fleet
+    from bags.fleet.monitor import COPY, monitor_fleet
     from bags.fleet.workers import Workers
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
@@ -164,7 +164,7 @@ def monitor(
         )  # fmt: skip
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
-    verdicts = {row.verdict for row in found.rows}
+    verdicts = {row.verdict for row in found.rows} - {COPY}
     if verdicts & {Status.OUTSIDE.value, Status.ASSUMPTION_VIOLATED.value} or any(
         row.alarm for row in found.rows
     ):
@@ -174,6 +174,8 @@ def monitor(
 
 
 def _say_verdicts(found: FleetVerdict) -> None:
+    from bags.fleet.monitor import COPY, UNREAD
+
     counts = Counter(row.verdict for row in found.rows)
     console.print(
         f"{len(found.rows)} bags: " + ", ".join(f"{n} {what}" for what, n in counts.most_common())
@@ -185,7 +187,9 @@ def _say_verdicts(found: FleetVerdict) -> None:
             table.add_column(column, overflow="fold")
         groups = found.by(key)
         for name, own in list(groups.items())[:ROWS]:
-            table.add_row(name or "-", str(own.total()), *(str(own[what]) for what in counts))
+            table.add_row(
+                _plain(name) or "-", str(own.total()), *(str(own[what]) for what in counts)
+            )
         console.print(table)
     for what, count in Counter(r.assumption for r in found.rows if r.assumption).most_common():
         console.print(f"broken in {count} bags: {what}", soft_wrap=True, markup=False)
@@ -202,7 +206,7 @@ def _say_verdicts(found: FleetVerdict) -> None:
         table.add_column(column, overflow="fold")
     for row in found.worst:
         table.add_row(
-            row.bag, f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
+            _plain(row.bag), f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
             row.spent_when[:19], row.verdict, row.bad_from[:19] or "-",
             "-" if row.margin is None else f"{row.margin:.3f}",
         )  # fmt: skip
@@ -212,7 +216,9 @@ def _say_verdicts(found: FleetVerdict) -> None:
     drift = found.drift
     said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
     console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
-    say_left_out(console, {row.bag: row.reason for row in found.rows if row.verdict == "not read"})
+    say_left_out(
+        console, {row.bag: row.reason for row in found.rows if row.verdict in (UNREAD, COPY)}
+    )
 
 
 def identify(
@@ -283,11 +289,18 @@ def _say_read(out: Console, found: FleetTrials) -> None:
     say_left_out(out, found.left_out)
 
 
+def _plain(text: str) -> str:
+    """What others wrote, for a terminal: no markup, nothing that is not printed."""
+    return escape(
+        "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    )
+
+
 def say_left_out(out: Console, left_out: dict[str, str]) -> None:
     """Each bag that is left out, with the reason."""
     if left_out:
         out.print(f"left out: {len(left_out)} bags")
     for name, reason in list(left_out.items())[:LISTED]:
-        out.print(f"  {name}: {reason}", soft_wrap=True, markup=False, highlight=False)
+        out.print(f"  {_plain(name)}: {_plain(reason)}", soft_wrap=True, highlight=False)
     if len(left_out) > LISTED:
         out.print(f"  and {len(left_out) - LISTED} more")

@@ -171,6 +171,11 @@ class Check:
             return files.parse_document(self._answer.read(), source="verdict")
         return {"refused": f"the kernel ended with status {self._process.returncode}"}
 
+    @property
+    def seconds(self) -> float:
+        """s since it began."""
+        return time.monotonic() - self._ends + MAX_TIME
+
     def close(self) -> None:
         """Call it off, or let go of what is left of it."""
         self._process.kill()

@@ -1,5 +1,6 @@
 """Fitness, clocks and losses of every bag of a fleet, as one table."""
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,7 +20,7 @@ from bags.recordings.definitions import read_definitions, texts_of
 from bags.tools.fitness import Level, check_fitness
 from bags.tools.info import LOST
 from nlsid_core.errors import BagError, DataError
-from nlsid_core.files import canonical
+from nlsid_core.files import canonical, write_atomically
 from nlsid_core.progress import Progress, silent
 
 UNREAD = "not read"
@@ -104,13 +105,12 @@ def check_fleet(
 ) -> list[Checked]:
     """A row a bag, in the order of `bags`; one that cannot be reached is `not read`."""
     with Manifest(manifest) as kept:
-        answers = ask(CheckBag(config), bags, workers, kept, progress=progress)
-    return [
-        Checked(answer.name, robot_of(answer.name), UNREAD, trouble=answer.reason)
-        if answer.reason
-        else Checked(**_document(answer.content))
-        for answer in answers
-    ]
+        return [
+            Checked(answer.name, robot_of(answer.name), UNREAD, trouble=answer.reason)
+            if answer.reason
+            else Checked(**_document(answer.content))
+            for answer in ask(CheckBag(config), bags, workers, kept, progress=progress)
+        ]
 
 
 def _document(content: bytes) -> dict[str, Any]:
@@ -135,5 +135,6 @@ def write_parquet(rows: Sequence[Any], out: Path) -> None:
         from pyarrow import parquet
     except ImportError as error:
         raise DataError("Parquet needs pyarrow: pip install 'nlsid[fleet]'") from error
-    out.parent.mkdir(parents=True, exist_ok=True)
-    parquet.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), out)
+    stream = io.BytesIO()
+    parquet.write_table(pa.Table.from_pylist([asdict(row) for row in rows]), stream)
+    write_atomically(out, stream.getvalue())

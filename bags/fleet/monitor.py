@@ -6,7 +6,7 @@ import math
 import pickle
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -39,18 +39,19 @@ RARE = 0.01  # probability of the second bound that is stated, where there are b
 BINS = 10  # of the histogram, of what the assumption allows
 LEAST = 3  # bags of a month, and calibration trials, that are compared
 UNREAD = "not read"
+COPY = "copy"  # of a recording that another bag has: judged there
 
 
 @dataclass(frozen=True)
 class Judged:
     """One bag: its verdict, and the numbers behind it.
 
-    verdict: of `Replay`, or `not read`. reason: why it is not inside. assumption: which one was
-    broken first, in words. spent: the largest part of what is assumed that was used (None: not
+    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: which one
+    was broken first, in words. spent: the largest part of what is assumed that was used (None: not
     measured), at spent_at, s of the run. margin: the least (None: nothing judged), margin_at: s.
     start: of the bag, spent_when, and bad_from: of the first bad sample, all ISO 8601 in UTC.
-    alarm: of the second alarm. judged, span: s. filled: samples nobody
-    measured. digest: of the recording.
+    alarm: of the second alarm. judged, span: s. filled: samples nobody measured. digest: of the
+    recording.
     """
 
     bag: str
@@ -239,19 +240,29 @@ def monitor_fleet(
     """
     task = JudgeBag(proved, centre, definitions)
     with Manifest(manifest) as kept:
-        answers = ask(task, bags, workers, kept, progress=progress)
-    rows = [
-        Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
-        if answer.reason
-        else Judged(**_document(answer.content))
-        for answer in answers
-    ]
+        rows = [
+            Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
+            if answer.reason
+            else Judged(**_document(answer.content))
+            for answer in ask(task, bags, workers, kept, progress=progress)
+        ]
     design: Any = proved.design
-    made_of: set[str] = set()
-    if isinstance(design.funnel, TubeFunnel):
-        for tube in design.funnel.tubes:
-            made_of |= {digest for _, digest in (*tube.designed_on, *tube.measured_on)}
-    return FleetVerdict(tuple(rows), calibration_spent(funnel, design), frozenset(made_of))
+    made_of = frozenset(design.made_with)
+    return FleetVerdict(tuple(counted_once(rows)), calibration_spent(funnel, design), made_of)
+
+
+def counted_once(rows: Sequence[Judged]) -> list[Judged]:
+    """The rows, but the second of a recording (by its digest, or all numbers) is a `copy`."""
+    first: dict[object, str] = {}
+    counted = []
+    for row in rows:
+        numbers = replace(row, bag="", robot="", digest="") if row.judged else None
+        marks = [mark for mark in (row.digest, numbers) if mark]
+        if known := [first[mark] for mark in marks if mark in first]:
+            row = Judged(row.bag, row.robot, COPY, f"the same recording as {known[0]}")
+        first |= dict.fromkeys(marks, row.bag)
+        counted.append(row)
+    return counted
 
 
 def calibration_spent(funnel: Path, design: AnyDesign) -> tuple[float, ...]:

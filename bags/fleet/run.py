@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -12,7 +12,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -36,7 +36,7 @@ class Task(Protocol):
         """The answer, some kilobytes. Whatever it raises is the reason why there is none."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Answer:
     """Of one bag: content, or the reason why there is none.
 
@@ -61,8 +61,11 @@ def ask(
     *,
     strict: bool = False,
     progress: Progress = silent,
-) -> list[Answer]:
+) -> Iterator[Answer]:
     """The answers in the order of `bags` (by name), whoever gave them and whenever they came.
+
+    All are there before the first is given. Until then the manifest holds what they say, so that
+    memory does not.
 
     A bag of which the worker dies is asked of again, alone, and given up when it dies again. With
     `strict` the first bag without an answer raises BagError. Raises DataError if the workers are
@@ -77,26 +80,30 @@ def ask(
         except (OSError, BagError) as error:
             answers[name] = Answer(bag, name, reason=_said(error))
             continue
-        content = manifest.find(keys[name])
-        if content is None:
-            fresh.append(name)
+        if keys[name] in manifest:
+            answers[name] = Answer(bag, name, kept=True)
         else:
-            answers[name] = Answer(bag, name, content, kept=True)
+            fresh.append(name)
     if strict and (lost := [answer for answer in answers.values() if answer.reason]):
         raise BagError(f"{lost[0].bag}: {lost[0].reason}")
-    with closing(_asked(task, {name: bags[name] for name in fresh}, workers)) as given:
+    asked = {name: (bags[name], keys[name]) for name in fresh}
+    with closing(_asked(task, asked, workers)) as given:
         for answer in given:
-            answers[answer.name] = answer
             if answer.reason and strict:
                 raise BagError(f"{answer.bag}: {answer.reason}")
             if not answer.reason:
                 manifest.keep(keys[answer.name], str(answer.bag), answer.content)
+            answers[answer.name] = replace(answer, bag=bags[answer.name], content=b"")
             progress(f"{len(answers)} of {len(bags)} bags: {answer.name}", len(answers) / len(bags))
-    return [answers[name] for name in bags]
+    for name in bags:
+        answer = answers.pop(name)
+        yield answer if answer.reason else replace(answer, content=manifest.find(keys.pop(name)))
 
 
-def _asked(task: Task, bags: Mapping[str, Path], workers: Workers) -> Generator[Answer, None, None]:
-    """An answer for each bag, as they come."""
+def _asked(
+    task: Task, bags: Mapping[str, tuple[Path, str]], workers: Workers
+) -> Generator[Answer, None, None]:
+    """An answer for each bag (where it is, its key), as they come."""
     if not bags:
         return
     waiting, suspects = deque(bags), deque[str]()
@@ -107,10 +114,10 @@ def _asked(task: Task, bags: Mapping[str, Path], workers: Workers) -> Generator[
         while waiting or suspects or running:
             while suspects and not running:
                 name = suspects.popleft()
-                running[_submitted(executor, task, bags[name], name)] = name
+                running[_submitted(executor, task, *bags[name], name)] = name
             while waiting and not suspects and len(running) < workers.window:
                 name = waiting.popleft()
-                running[_submitted(executor, task, bags[name], name)] = name
+                running[_submitted(executor, task, *bags[name], name)] = name
                 if next(reversed(running)).done():
                     break  # in this process: said at once
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -121,14 +128,14 @@ def _asked(task: Task, bags: Mapping[str, Path], workers: Workers) -> Generator[
                 if error is None:
                     yield future.result()
                 elif not isinstance(error, BrokenExecutor):
-                    yield Answer(bags[name], name, reason=_said(error))
+                    yield Answer(bags[name][0], name, reason=_said(error))
                 else:
                     broken = True
                     deaths[name] += 1
                     if deaths[name] < DEATHS:
                         suspects.append(name)
                     else:
-                        yield Answer(bags[name], name, reason=f"its worker died {DEATHS} times")
+                        yield Answer(bags[name][0], name, reason=f"its worker died {DEATHS} times")
             if broken:
                 suspects.extend(running.values())
                 for name in running.values():
@@ -140,24 +147,31 @@ def _asked(task: Task, bags: Mapping[str, Path], workers: Workers) -> Generator[
         workers.close(executor)
 
 
-def _submitted(executor: Executor, task: Task, bag: Path, name: str) -> "Future[Answer]":
+def _submitted(executor: Executor, task: Task, bag: Path, key: str, name: str) -> "Future[Answer]":
     try:
-        return executor.submit(answered, task, bag, name)
+        return executor.submit(answered, task, bag, key, name)
     except BrokenExecutor as error:  # a worker has died since the last look
         failed: Future[Answer] = Future()
         failed.set_exception(error)
         return failed
 
 
-def answered(task: Task, bag: Path, name: str) -> Answer:
-    """What a worker does: the task, with whatever it raises as the reason."""
+def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
+    """What a worker does: the task, with whatever it raises as the reason.
+
+    key: of the bag as it was listed. If it is another afterwards there is no answer: ranges of two
+    files would be taken for one recording.
+    """
     started = time.monotonic()
     content, reason = b"", ""
+    again = bag.anew() if isinstance(bag, RemotePath) else bag
     try:
         content = task(bag, name)
+        if key_of(again, name, task.asked) != key:
+            content, reason = b"", "it changed while it was read; start the command again"
     except Exception as error:  # bags are untrusted: whatever one of them causes is about it alone
         reason = _said(error)
-    requests, fetched = _traffic(bag)
+    requests, fetched = map(sum, zip(_traffic(bag), _traffic(again), strict=True))
     if isinstance(bag, RemotePath):
         bag.forget()
     seconds = time.monotonic() - started

@@ -5,11 +5,14 @@ What is sent is the trials themselves, resampled: 16 bytes a sample of a respons
 does, on the same numbers in the same order, so its result is the same to the last bit.
 """
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
+
+import numpy as np
 
 from bags.chain.config import Config
 from bags.chain.steps import Trials, by_use, read_signals_of
@@ -67,9 +70,8 @@ def read_fleet(
     `strict` the first of them raises. Raises DataError if no bag is left, or for the split.
     """
     with Manifest(out / MANIFEST) as manifest:
-        answers = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
-    left_out = {answer.name: answer.reason for answer in answers if answer.reason}
-    trials = usable_trials(answers, left_out)
+        given = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
+        answers, trials, left_out = usable_trials(given)
     if strict and left_out:
         name, reason = next(iter(left_out.items()))
         raise BagError(f"{bags[name]}: {reason}")
@@ -79,25 +81,44 @@ def read_fleet(
     return FleetTrials(by_use(Dataset(tuple(trials)), config), tuple(answers), left_out)
 
 
-def usable_trials(answers: list[Answer], left_out: dict[str, str]) -> list[Trajectory]:
-    """The trials of the answers in their order; adds to `left_out` what does not go with the first,
-    and the second copy of a recording. An answer that is read keeps no content.
+def usable_trials(
+    given: Iterable[Answer],
+) -> tuple[list[Answer], list[Trajectory], dict[str, str]]:
+    """The answers without what they say, their trials, and who is left out, with the reason.
+
+    Left out is what was not read, what does not go with the first trial, and the second copy of a
+    recording: another with its digest, or with the same samples, which noise does not repeat.
     """
+    answers: list[Answer] = []
     trials: list[Trajectory] = []
+    left_out: dict[str, str] = {}
     recorded: dict[str, str] = {}
-    for k, answer in enumerate(answers):
+    for answer in given:
+        answers.append(replace(answer, content=b""))
         if answer.reason:
+            left_out[answer.name] = answer.reason
             continue
-        answers[k] = replace(answer, content=b"")
         own = decoded(answer.content, source=f"{answer.name}: not trials")[""].trajectories
-        first = recorded.setdefault(own[0].digest, answer.name)
-        if first != answer.name:
-            left_out[answer.name] = f"the same recording as {first}"
+        marks = [own[0].digest, *samples_digest(own)]
+        if known := [recorded[mark] for mark in marks if mark in recorded]:
+            left_out[answer.name] = f"the same recording as {known[0]}"
             continue
+        recorded |= dict.fromkeys(marks, answer.name)
         try:
             Dataset((*trials[:1], *own))
         except NlsidError as error:
             left_out[answer.name] = str(error)
             continue
         trials += own
-    return trials
+    return answers, trials, left_out
+
+
+def samples_digest(trials: Sequence[Trajectory]) -> list[str]:
+    """One digest of all samples of a bag; none if every response rests, as that may come twice."""
+    if not any(np.ptp(trial.y, axis=0).any() for trial in trials):
+        return []
+    digest = hashlib.sha256()
+    for trial in trials:
+        for values in (trial.t, trial.y, trial.u):
+            digest.update(f"{values.shape}".encode() + values.tobytes())
+    return [digest.hexdigest()]

@@ -194,7 +194,8 @@ class Width:
         mean = f"{_up(self.half_width)} {self.unit}".strip()
         if self.least is None or self.most is None:
             return mean
-        return f"{mean} on average, {_up(self.least)} to {_up(self.most)} as the commands go"
+        span = f"{_up(self.least)} to {_up(self.most)}"
+        return f"{mean} on average over the calibration trials, {span} as their commands go"
 
     @property
     def part(self) -> str:

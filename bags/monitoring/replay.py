@@ -1,10 +1,12 @@
 """Offline monitoring: a bag's messages through the same sampling and monitor as the live node."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from bags.designs.design import AnyDesign, is_tube
 from bags.designs.documents import Proved
@@ -12,9 +14,11 @@ from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Forecasted, Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
-from bags.signals.sampling import FILLED, LOST, MOST_FILLED, said_filled
+from bags.signals.reader import bag_digest
+from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
 from nlsid_core.running.comparison import Centre
@@ -23,6 +27,9 @@ from nlsid_core.running.reading import Reading, Status, cause
 Definitions = Mapping[str, Definition]
 STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
+
+
+MOST_WIDE: Final = 0.05  # of the samples: a tube wider than the signal in more is said
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +80,27 @@ class Replay:
         """The same in words, of how many; empty if there is none."""
         count = sum(not reading.starts for reading in self.readings)
         return said_filled(self.filled, count)
+
+    @property
+    def said_wide(self) -> str:
+        """In how many samples the tube is wider than all that was measured here; empty if few."""
+        judged = [r for r in self.judged if r.measured]
+        widths = np.array(
+            [list(r.half_widths) or [self.half_width] * len(r.measured) for r in judged]
+        )
+        if not widths.any():
+            return ""
+        ranges = np.ptp(np.array([r.measured for r in judged]), axis=0)
+        share = (widths > ranges).mean(axis=0)
+        worst = int(np.argmax(share))
+        if share[worst] <= MOST_WIDE:
+            return ""
+        which = f" of output {worst}" if len(share) > 1 else ""
+        return (
+            f"in {100 * share[worst]:.0f} % of the samples judged the half-width{which} is more "
+            f"than the whole range measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
+            + ": the tube says nothing there"
+        )
 
     @property
     def unjudged(self) -> tuple[Reading, ...]:
@@ -164,6 +192,42 @@ def _unjudged(reading: Reading) -> bool:
     return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
 
 
+@dataclass(frozen=True)
+class ToJudge:
+    """Bags to hold against a design, and those that it was made with, each with its use.
+
+    One that it was made with is judged only if all of them are such.
+    """
+
+    judged: tuple[Path, ...]
+    used: Mapping[Path, str]
+
+    @property
+    def said(self) -> list[str]:
+        """A line for each use, with the names of its bags; empty if there is none."""
+        uses: dict[str, list[str]] = {}
+        for path, use in self.used.items():
+            uses.setdefault(use, []).append(trial_name(path))
+        what = "judged all the same" if set(self.judged) & set(self.used) else "not judged"
+        return [f"{what}: {', '.join(names)} (used for {use})" for use, names in uses.items()]
+
+
+def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[str] = ()) -> ToJudge:
+    """The bags that the design was not made with, by their content, else all of them.
+
+    A verdict on a recording that made a design says little. validation: names of bags that orders
+    and bases were chosen by.
+    """
+    made_with = design.made_with
+    used: dict[Path, str] = {}
+    for bag in bags:
+        if use := made_with.get(bag_digest(bag)):
+            used[bag] = use
+        elif trial_name(bag) in validation:
+            used[bag] = "validation"
+    return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
+
+
 def replay_bag(
     proved: Proved[AnyDesign],
     bag: Path | str,
@@ -234,6 +298,23 @@ def _replayed(
     return stamped, watch.forecasts
 
 
+def samples_of(
+    design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
+) -> list[Sample]:
+    """The samples that a monitor of the design makes of a bag's messages, in order.
+
+    Raises BagError if the bag cannot be read or does not hold the funnel's signals.
+    """
+    sampler, place_of, found = design.sampler(), place(bag), []
+    with Bag(place_of, definitions=definitions) as source:
+        _check(sampler, source, place_of)
+        for message in source.messages(sampler.topics):
+            stamp_ns = sampler.stamp(message.data, message.log_time_ns)
+            decoded = decode(message.data, *source.types_on(message.topic))
+            found += sampler.message(message.topic, stamp_ns, decoded)
+    return found + sampler.flush()
+
+
 def announced_runs(
     design: AnyDesign, bag: Path | str, definitions: Definitions | None = None
 ) -> list[Run]:
@@ -248,18 +329,14 @@ def announced_runs(
 def _fed(
     watch: Watch, bag: Path, definitions: Definitions | None, *, announced: bool
 ) -> Iterator[list[Stamped]]:
-    """What `watch` says to every message, in log order."""
-    design = watch.design
-    digest = design.digest
+    """What `watch` says to every message, by log time; as recorded where it goes back itself."""
+    digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
-        for topic in watch.pairing.topics:
-            kind = source.types_on(topic)
-            try:
-                watch.pairing.check(topic, *kind)
-            except BagError as error:
-                raise BagError(f"{bag}: {error}") from error
+        _check(watch.pairing, source, bag)
         run_topics = _run_topics(source) if announced else []
-        for message in source.messages([*run_topics, *watch.pairing.topics]):
+        topics = watch.pairing.topics
+        set_back = watch.pairing.clock == "log" and bool(source.log_order(topics).back)
+        for message in source.messages([*run_topics, *topics], as_recorded=set_back):
             if message.topic in run_topics:
                 run = _run(message, source)
                 if run.funnel == digest:
@@ -268,6 +345,16 @@ def _fed(
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
             decoded = decode(message.data, *source.types_on(message.topic))
             yield watch.message(message.topic, stamp_ns, decoded)
+
+
+def _check(sampler: Sampler, source: Bag, bag: Path) -> None:
+    """BagError unless the bag has the signals and their clock."""
+    for topic in sampler.topics:
+        kind = source.types_on(topic)
+        try:
+            sampler.check(topic, *kind)
+        except BagError as error:
+            raise BagError(f"{bag}: {error}") from error
 
 
 def _run_topics(source: Bag) -> list[str]:

@@ -156,7 +156,8 @@ class Watch:
         if self.pairing.late_responses > before:
             back = seconds(self._newest_ns, stamp_ns)
             where = topic or self.pairing.responses[0]
-            readings += self.missing(f"time went back by {back:g} s on {where}")
+            went = f"time went back by {back:g} s on {where}"
+            readings += self.missing(went, doubted=True)
         return readings
 
     def flush(self, until_ns: int | None = None) -> list[Stamped]:

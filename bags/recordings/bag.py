@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from rosbags.typesys.store import Typestore
 
-from bags.recordings.batch import Batch
+from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import COMPRESSED, bag_files
 from bags.recordings.mcap_records import MAGIC
@@ -164,9 +164,23 @@ class Bag:
         for key, batch in self._storage.batches(self._keys(topics)):
             yield self.channels[key], batch
 
-    def messages(self, topics: Sequence[str] | None = None) -> Iterator[Message]:
-        """The messages on `topics` (None: on all) by log time; equal log times as recorded."""
-        for raw in self._storage.messages(self._keys(topics)):
+    def log_order(self, topics: Sequence[str]) -> LogOrder:
+        """Where the log times of `topics` go back inside a file."""
+        order = LogOrder()
+        for channel, batch in self.batches(topics):
+            order.add(channel.key, batch.log_ns)
+        return order
+
+    def messages(
+        self, topics: Sequence[str] | None = None, *, as_recorded: bool = False
+    ) -> Iterator[Message]:
+        """The messages on `topics` (None: on all) by log time; equal log times as recorded.
+
+        as_recorded: in the order of the files instead. Only MCAP files tell it.
+        """
+        storage = self._storage
+        ordered = storage.recorded if as_recorded else storage.messages
+        for raw in ordered(self._keys(topics)):
             channel = self.channels[raw.key]
             yield Message(channel.topic, channel.msgtype, raw.log_ns, raw.data, raw.publish_ns)
 

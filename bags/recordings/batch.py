@@ -41,6 +41,27 @@ class Batch:
         return Batch(self.buffer, *(column[rows] for column in columns))
 
 
+class LogOrder:
+    """Whether the log times of one or several channels go back inside a file: a clock was set.
+
+    back: for each place, how many messages are before it, the log time before it and at it (ns).
+    Messages by log time would hide it: those of two times come in turn.
+    """
+
+    def __init__(self) -> None:
+        self.back: list[tuple[int, int, int]] = []
+        self._newest: dict[int, int] = {}
+        self._count = 0
+
+    def add(self, channel: int, log_ns: IntArray) -> None:
+        """The next messages of a channel of one file: log_ns (N,), N > 0, as recorded."""
+        before = np.concatenate([[self._newest.get(channel, log_ns[0])], log_ns[:-1]])
+        for k in np.flatnonzero(log_ns < before):
+            self.back.append((self._count + int(k), int(before[k]), int(log_ns[k])))
+        self._newest[channel] = int(log_ns[-1])
+        self._count += len(log_ns)
+
+
 class BatchBuilder:
     """Collects single messages of one topic into batches of bounded size."""
 

@@ -112,30 +112,25 @@ class McapFile:
         for block in self.contents.blocks:
             yield from self.block_batches(block, channels)
 
-    def block_batches(
-        self, block: Block, channels: Collection[int], *, use_index: bool = True
-    ) -> Iterator[tuple[int, Batch]]:
+    def block_batches(self, block: Block, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
         """The messages of one block, one batch per channel that has any."""
-        index = block.index if use_index else None
+        index = block.index
         if index is not None and not any(channel in index for channel in channels):
             return
-        sparse = isinstance(block, ListedBlock) and not block.compression
+        where = f"the message index of the chunk at byte {block.offset}"
+        edges: IntArray | None = None
         if isinstance(block, ListedBlock) and self._prepared is not None:
-            block = self._prepared.block(block, channels)
-            index = block.index
-        if sparse and self._prepared is not None:
-            buffer = self._prepared.content(block)
-        else:
+            buffer, offsets, edges = self._prepared.records(block, channels)
+        elif index is None:
             buffer = self.content(block)
-        if index is None:
             offsets = {c: np.array(o, dtype=np.int64) for c, o in walk_messages(buffer).items()}
             where = f"the block at byte {block.offset}"
         else:
+            buffer = self.content(block)
             offsets = {c: self._indexed(*index[c]) for c in channels if c in index}
-            where = f"the message index of the chunk at byte {block.offset}"
         for channel in channels:
             if len(found := offsets.get(channel, ())):
-                yield channel, messages_at(buffer, np.asarray(found), channel, where)
+                yield channel, messages_at(buffer, np.asarray(found), channel, where, edges)
 
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""

@@ -132,10 +132,14 @@ def walk_channels(content: bytes) -> tuple[list[Schema], list[Channel]]:
     return schemas, channels
 
 
-def messages_at(content: bytes, offsets: IntArray, channel: int, where: str) -> Batch:
+def messages_at(
+    content: bytes, offsets: IntArray, channel: int, where: str, edges: IntArray | None = None
+) -> Batch:
     """The messages whose records are at `offsets`; BagError unless all are messages of `channel`.
 
-    Gathered through overlapping views, so that no message costs a step of Python.
+    Gathered through overlapping views, so that no message costs a step of Python. edges: ascending,
+    where records begin or end, the last end among them; no message goes past the next (None: where
+    those of the channel begin).
     """
     last = len(content) - MESSAGE.itemsize
     if last < 0 or (offsets < 0).any() or (offsets > last).any():
@@ -154,7 +158,8 @@ def messages_at(content: bytes, offsets: IntArray, channel: int, where: str) -> 
     start = offsets + MESSAGE.itemsize
     size = length.astype(np.int64) - MESSAGE_FIXED
     ends = start + size
-    if ends[-1] > len(content) or (ends[:-1] > offsets[1:]).any():
+    edges = np.append(offsets, len(content)) if edges is None else edges
+    if (ends > edges[np.searchsorted(edges, offsets, side="right")]).any():
         raise BagError(f"{where} points at messages that overlap")
     return Batch(
         content,

@@ -8,7 +8,7 @@ Source: the MCAP specification, https://mcap.dev/spec.
 import struct
 import zlib
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +34,7 @@ from bags.recordings.mcap_records import (
     add_channel,
     add_schema,
     parse,
+    uncompressed,
     walk_records,
 )
 from bags.recordings.remote import GAP_BYTES, TAIL_BYTES, RemotePath
@@ -135,6 +136,11 @@ def _listed(chunk: ChunkIndex, limit: int) -> ListedBlock:
     if record < len(MAGIC) or end > limit or offset + chunk.compressed_size != data_end:
         raise BagError(f"the summary's chunk at byte {record} does not lie in the file")
     places = sorted(chunk.message_index_offsets.items(), key=lambda entry: entry[1])
+    if not chunk.compression and chunk.uncompressed_size != chunk.compressed_size:
+        raise BagError(
+            f"the chunk at byte {record} has {chunk.compressed_size} bytes without compression, "
+            f"and says {chunk.uncompressed_size}"
+        )
     edges = [at for _, at in places] + [end]
     if places and (edges[0] < data_end or edges[-2] > end):
         raise BagError(f"the message indexes of the chunk at byte {record} are not behind it")
@@ -164,27 +170,47 @@ class Prepared:
         self._place = {block.offset: i for i, block in enumerate(self._blocks)}
         self._channels: frozenset[int] = frozenset()
         self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
+        self._runs: dict[int, tuple[IntArray, IntArray]] = {}  # and what is fetched of it
 
-    def block(self, block: ListedBlock, channels: Collection[int]) -> Block:
-        """The block with its index read, and with everything fetched that the channels need."""
+    def records(
+        self, block: ListedBlock, channels: Collection[int]
+    ) -> tuple[bytes, dict[int, IntArray], IntArray]:
+        """Records of the block, where in them each channel's messages begin, and where any of
+        them ends at the latest.
+
+        They are those of the wanted messages, one behind the other; of a compressed block, all.
+        """
         if not self._channels.issuperset(channels):
             self._channels, self._ready = frozenset(channels), {}
         if block.offset not in self._ready:
             window = list(self._window(block))
             self._path.fetch(_span(ahead) for ahead in window)
             self._ready = {ahead.offset: self._entries_of(ahead) for ahead in window}
+            plain = [ahead for ahead in window if not ahead.compression]
+            self._runs = {ahead.offset: self._runs_of(ahead) for ahead in plain}
             self._path.fetch(
-                span for ahead in window if not ahead.compression for span in self._messages(ahead)
+                (at + start, at + end)
+                for at, (starts, ends) in self._runs.items()
+                for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
             )
-        return self._indexed(block)
-
-    def content(self, block: Block) -> bytes:
-        """An uncompressed block's records, with zeros where nothing was wanted."""
-        content = bytearray(block.uncompressed_size)
-        for start, end in self._messages(block):
-            at = start - block.offset
-            content[at : at + end - start] = self._path.read_range(start, end)
-        return bytes(content)
+        offsets = self._ready[block.offset]
+        if block.compression:
+            header = self._path.read_range(block.record, block.end)
+            crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
+            at = block.offset - block.record
+            content = uncompressed(replace(block, crc=crc), header[at : at + block.size])
+            return content, offsets, _sorted(*offsets.values(), [len(content)])
+        starts, ends = self._runs[block.offset]
+        after = np.cumsum(ends - starts)
+        content = b"".join(
+            self._path.read_range(block.offset + start, block.offset + end)
+            for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
+        )
+        placed = {}
+        for channel in self._channels & offsets.keys():
+            run = np.searchsorted(starts, offsets[channel], side="right") - 1
+            placed[channel] = offsets[channel] - ends[run] + after[run]
+        return content, placed, _sorted(*placed.values(), after)
 
     def _window(self, first: ListedBlock) -> Iterator[ListedBlock]:
         held = 0
@@ -195,37 +221,18 @@ class Prepared:
                 held += block.size
                 yield block
 
-    def _messages(self, block: Block) -> list[tuple[int, int]]:
-        """(first byte, end) of the wanted messages' records: runs without a gap of GAP_BYTES.
-
-        A record ends where the next record of a message begins.
+    def _runs_of(self, block: ListedBlock) -> tuple[IntArray, IntArray]:
+        """First bytes and ends, in the block, of the wanted messages' records: of runs without a
+        gap of GAP_BYTES. A record ends where the next record of a message begins.
         """
         every = self._ready[block.offset]
-        size = block.uncompressed_size
-        starts = np.unique(np.concatenate([*every.values(), [size]]))
-        if starts[0] < 0 or starts[-1] > size:
-            raise BagError(f"a message index of the chunk at byte {block.offset} points outside it")
-        wanted = [every[channel] for channel in self._channels & every.keys()]
-        first = np.unique(np.concatenate(wanted)) if wanted else np.empty(0, np.int64)
+        starts = _sorted(*every.values(), [block.size])
+        first = _sorted(*(every[channel] for channel in self._channels & every.keys()))
         if not len(first):
-            return []
+            return first, first
         ends = starts[np.searchsorted(starts, first, side="right")]
         gaps = np.flatnonzero(first[1:] > ends[:-1] + GAP_BYTES)
-        runs = block.offset + first[np.r_[0, gaps + 1]], block.offset + ends[np.r_[gaps, -1]]
-        return list(zip(*(edge.tolist() for edge in runs), strict=True))
-
-    def _indexed(self, block: ListedBlock) -> Block:
-        index = {}
-        for channel, (at, _) in (block.index or {}).items():
-            index[channel] = (at + RECORD.size + 6, len(self._ready[block.offset][channel]))
-        crc = 0
-        if block.compression:
-            header = self._path.read_range(block.record, block.offset)
-            crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
-        return Block(
-            block.offset, block.size, block.compression, block.uncompressed_size, crc,
-            block.start_ns, index,
-        )  # fmt: skip
+        return first[np.r_[0, gaps + 1]], ends[np.r_[gaps, -1]]
 
     def _entries_of(self, block: ListedBlock) -> dict[int, IntArray]:
         return {channel: self._entries(block, channel) for channel in block.index or ()}
@@ -247,6 +254,11 @@ class Prepared:
             raise BagError(f"{where} points outside its chunk")
         offsets: IntArray = found["offset"].astype(np.int64)
         return offsets
+
+
+def _sorted(*places: Any) -> IntArray:
+    """All of them in order, each once."""
+    return np.unique(np.concatenate([np.empty(0, np.int64), *places]).astype(np.int64))
 
 
 def _span(block: ListedBlock) -> tuple[int, int]:

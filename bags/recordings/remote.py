@@ -15,6 +15,7 @@ import stat
 import time
 from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PosixPath
@@ -31,8 +32,13 @@ FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before e
 LONGEST_WAIT: Final = 10.0
 REFUSALS: Final = (FileNotFoundError, PermissionError, ImportError, ValueError, TypeError)
 MAY_PASS: Final = (408, 425, 429)  # of the HTTP statuses 400 to 499
+SHORTEST_SECRET: Final = 6  # letters
 
 _URL: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):/{1,2}(?=[^/])")
+_CHAINED: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*::[A-Za-z]")
+_SECRET: Final = re.compile(
+    r"(?<=//)[^/\s'\"]*@|(?<=[?])[^\s'\"<>]+"
+)  # of a URL in an error's text
 _WILD: Final = re.compile(r"[*?\[]")
 
 T = TypeVar("T")
@@ -58,8 +64,8 @@ class RemotePath(PosixPath):
     """A file or a folder that fsspec reads; the parts of its URL are the parts of the path.
 
     patience: s that may be lost with failing requests. Instances keep what they fetched, at most
-    HELD_BYTES a file; `requests` and `fetched` (bytes) count what was asked of storage. A copy in
-    another process knows the entry, and has fetched nothing.
+    HELD_BYTES a file; `requests` and `fetched` (bytes) count what was asked of storage, but for
+    listings. A copy in another process knows the entry, and has fetched nothing.
     """
 
     patience: float = PATIENCE
@@ -98,8 +104,44 @@ class RemotePath(PosixPath):
     def entry(self) -> Entry:
         """What storage says of it. FileNotFoundError if it is gone, BagError without an answer."""
         if self._entry is None:
-            self._entry = _entry(self._asked(lambda fs, name, _: fs.info(name)))
+            self._entry = self._asked(self._described)
         return self._entry
+
+    def _described(self, left: float) -> Entry:
+        self.requests += 1
+        if (s3 := self._s3) is not None and (key := self._key):
+            with suppress(FileNotFoundError):  # it may be a folder
+                return _entry(s3.head(key))
+        fs, name, limit = _storage(self, left)
+        return _entry(fs.info(name, **limit))
+
+    def _listed(self, left: float) -> list[dict[str, Any]]:
+        fs, name, limit = _storage(self, left)
+        found: list[dict[str, Any]] = fs.ls(name, detail=True, **limit)
+        return found
+
+    def _matching(self, left: float) -> dict[str, dict[str, Any]]:
+        fs, name, limit = _storage(self, left)
+        found: dict[str, dict[str, Any]] = fs.glob(name, detail=True, **limit)
+        return found
+
+    @property
+    def _key(self) -> str:
+        """Of an object of S3, in its bucket."""
+        return "/".join(self.parts[2:])
+
+    @property
+    def _s3(self) -> "_ByObstore | None":
+        """What fetches ranges and heads of S3 objects for little time; None where it cannot."""
+        if self.parts[0] != "s3:" or "AWS_ACCESS_KEY_ID" not in os.environ:
+            return None
+        return _by_obstore(self.parts[1], os.environ.get("AWS_ENDPOINT_URL", ""), self.patience)
+
+    def anew(self) -> "RemotePath":
+        """The same place, of which nothing is known yet; what is lost is lost for it, too."""
+        again = _rebuilt(str(self), self.patience, None)
+        again._lost = self._lost
+        return again
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:  # noqa: ARG002 - as Path has it
         """Whether storage has it."""
@@ -127,7 +169,7 @@ class RemotePath(PosixPath):
 
     def iterdir(self) -> Iterator["RemotePath"]:  # type: ignore[override]
         """What is in the folder."""
-        for found in self._asked(lambda fs, name, _: fs.ls(name, detail=True)):
+        for found in self._asked(self._listed):
             name = str(found["name"]).rstrip("/").rpartition("/")[2]
             if name and name != self.name:
                 child = self / name
@@ -168,6 +210,8 @@ class RemotePath(PosixPath):
                 merged[-1][1] = max(merged[-1][1], end)
             else:
                 merged.append([start, end])
+        if merged and merged[-1][1] > self.entry.size:
+            raise BagError(f"{self} has {self.entry.size} bytes and says to read {merged[-1][1]}")
         for first in range(0, len(merged), TOGETHER):
             self._fetch_all(merged[first : first + TOGETHER])
 
@@ -175,14 +219,12 @@ class RemotePath(PosixPath):
         starts, ends = ([span[k] for span in spans] for k in (0, 1))
         size = self.entry.size
 
-        def ask(fs: Any, name: str, limit: dict[str, float]) -> list[bytes]:
+        def ask(left: float) -> list[bytes]:
             self.requests += len(starts)
-            store = (
-                _obstore(name.partition("/")[0], self.patience) if self.parts[0] == "s3:" else None
-            )
-            if store is not None:
-                parts = store(name.partition("/")[2], starts, ends)
+            if (s3 := self._s3) is not None:
+                parts = s3.ranges(self._key, starts, ends)
             else:
+                fs, name, limit = _storage(self, left)
                 parts = fs.cat_ranges([name] * len(starts), starts, ends, **limit)
             return [
                 _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
@@ -232,15 +274,16 @@ class RemotePath(PosixPath):
             order.pop(0)
         self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
-    def _asked(self, ask: Callable[[Any, str, dict[str, float]], T]) -> T:
-        """The answer of storage, asked again with growing waits while the patience lasts."""
+    def _asked(self, ask: Callable[[float], T]) -> T:
+        """The answer of storage, asked again with growing waits while the patience lasts.
+
+        ask: it is told how many seconds of it are left.
+        """
         wait = FIRST_WAIT
         while True:
             started = time.monotonic()
             try:
-                fs, name = _storage(str(self))
-                left = max(1.0, self.patience - self._lost)
-                return ask(fs, name, {"timeout": left} if fs.async_impl else {})
+                return ask(max(1.0, self.patience - self._lost))
             except REFUSALS:
                 raise
             except Exception as error:  # every protocol raises its own
@@ -296,18 +339,24 @@ def place(given: Path | str, *, patience: float | None = None) -> Path:
     was made of a URL, `s3:/bucket/...`, is taken for it. Raises BagError for a URL that carries a
     password, a token or a query: names of bags are written into files.
     """
-    text = str(given)
+    text = str(given).lstrip()
     if not isinstance(given, RemotePath):
         found = _URL.match(text)
         if text.startswith("file:/"):
             return Path("/" + text.removeprefix("file:").lstrip("/"))
+        if _CHAINED.match(text):
+            raise BagError(
+                f"{text.partition(':')[0]}::...: URLs behind each other are not read; give the "
+                "last one"
+            )
         if found is None:
             return Path(given)
         protocol, rest = found.group(1).lower(), text[found.end() :]
-        if protocol in ("http", "https") and "?" in rest:
+        if cut := re.search("[?#]" if protocol in ("http", "https") else "[?][^/]*=", rest):
             raise BagError(
-                f"{protocol}://{rest.partition('?')[0]}: a query may hold a secret, and names are "
-                "written into files; give a URL without it, and credentials in the environment"
+                f"{protocol}://{rest[: cut.start()].rpartition('@')[2]}: a query may hold a "
+                "secret, and names are written into files; give a URL without it, and credentials "
+                "in the environment"
             )
         if "@" in rest.partition("/")[0]:
             raise BagError(
@@ -335,7 +384,7 @@ def matching(path: Path) -> list[Path]:
     if not isinstance(path, RemotePath):
         start = Path(path.anchor)
         return sorted(start.glob(str(path.relative_to(start))))
-    found = path._asked(lambda fs, name, _: fs.glob(name, detail=True))
+    found = path._asked(path._matching)
     protocol = path.parts[0]
     places: list[Path] = []
     for name, described in sorted(found.items()):
@@ -353,38 +402,60 @@ def _rebuilt(text: str, patience: float, entry: Entry | None) -> RemotePath:
     return path
 
 
-def _storage(url: str) -> tuple[Any, str]:
-    """The file system of a URL, and its name for the file."""
+def _storage(path: RemotePath, left: float) -> tuple[Any, str, dict[str, float]]:
+    """The file system of a URL, its name for the file, and the limit of a request of `left` s."""
     try:
         from fsspec.core import url_to_fs
 
-        found: tuple[Any, str] = url_to_fs(url, use_listings_cache=False)
+        fs, name = url_to_fs(str(path), use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise BagError(
-            f"{url} cannot be read: {error}; bags in object storage need `pip install "
+            f"{path} cannot be read: {error}; bags in object storage need `pip install "
             "'nlsid[fleet]'`"
         ) from error
-    return found
+    return fs, name, {"timeout": left} if fs.async_impl else {}
 
 
-_Ranges = Callable[[str, list[int], list[int]], list[Any]]
+@dataclass(frozen=True)
+class _ByObstore:
+    """The objects of an S3 bucket, with credentials from the environment's variables.
 
-
-def _obstore(bucket: str, patience: float) -> _Ranges | None:
-    """Ranges of an object (key, starts, ends) of an S3 bucket, by obstore.
-
-    None where obstore is not installed, or where credentials are not in the environment's variables
-    but in profiles, which it does not read.
+    It does not read those of profiles. Raises FileNotFoundError, PermissionError and obstore's own.
     """
-    if "AWS_ACCESS_KEY_ID" not in os.environ:
-        return None
-    return _by_obstore(bucket, os.environ.get("AWS_ENDPOINT_URL", ""), patience)
+
+    bucket: str
+    store: Any
+    get_ranges: Callable[..., Any]
+    get_head: Callable[..., Any]
+    missing: tuple[type[Exception], ...]
+    forbidden: tuple[type[Exception], ...]
+
+    def ranges(self, key: str, starts: list[int], ends: list[int]) -> list[Any]:
+        """The bytes from each start to its end."""
+        return self._answered(
+            lambda: list(self.get_ranges(self.store, key, starts=starts, ends=ends, coalesce=0)),
+            key,
+        )
+
+    def head(self, key: str) -> dict[str, Any]:
+        """What fsspec's info says of it."""
+        found = self._answered(lambda: self.get_head(self.store, key), key)
+        return {"size": found["size"], "ETag": found["e_tag"], "mtime": found["last_modified"]}
+
+    def _answered(self, ask: Callable[[], T], key: str) -> T:
+        try:
+            return ask()
+        except self.missing as error:
+            raise FileNotFoundError(f"s3://{self.bucket}/{key} is not there") from error
+        except self.forbidden as error:
+            raise PermissionError(f"s3://{self.bucket}/{key}: {_short(error)}") from error
 
 
 @cache
-def _by_obstore(bucket: str, endpoint: str, patience: float) -> _Ranges | None:
+def _by_obstore(bucket: str, endpoint: str, patience: float) -> _ByObstore | None:
+    """None where obstore is not installed."""
     try:
-        from obstore import get_ranges
+        from obstore import get_ranges, head
         from obstore.exceptions import (
             NotFoundError,
             PermissionDeniedError,
@@ -395,17 +466,11 @@ def _by_obstore(bucket: str, endpoint: str, patience: float) -> _Ranges | None:
         return None
     options: Any = {"allow_http": endpoint.startswith("http://"), "timeout": f"{patience:g}s"}
     no_retries: Any = {"max_retries": 0}  # RemotePath repeats, and counts what it loses
-    store = S3Store(bucket, client_options=options, retry_config=no_retries)
-
-    def ranges(key: str, starts: list[int], ends: list[int]) -> list[Any]:
-        try:
-            return list(get_ranges(store, key, starts=starts, ends=ends, coalesce=0))
-        except (NotFoundError, FileNotFoundError) as error:
-            raise FileNotFoundError(f"s3://{bucket}/{key} is not there") from error
-        except (PermissionDeniedError, UnauthenticatedError) as error:
-            raise PermissionError(f"s3://{bucket}/{key}: {_short(error)}") from error
-
-    return ranges
+    return _ByObstore(
+        bucket, S3Store(bucket, client_options=options, retry_config=no_retries),
+        get_ranges, head,
+        (NotFoundError, FileNotFoundError), (PermissionDeniedError, UnauthenticatedError),
+    )  # fmt: skip
 
 
 def _entry(described: dict[str, Any]) -> Entry:
@@ -430,4 +495,9 @@ def _whole(part: Any, start: int, end: int, size: int) -> bytes:
 
 
 def _short(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).partition(chr(10))[0][:200]}"
+    """The first line of what it says, without what a redirection or a server told of secrets."""
+    line = str(error).partition("\n")[0][:200]
+    for name, value in os.environ.items():
+        if len(value) >= SHORTEST_SECRET and re.search("KEY|SECRET|TOKEN|PASSWORD", name):
+            line = line.replace(value, "...")
+    return f"{type(error).__name__}: {_SECRET.sub('...', line)}"

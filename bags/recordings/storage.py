@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypeAlias
 
 from rosbags.interfaces import (
     Connection,
@@ -59,6 +59,15 @@ class Raw:
     data: bytes
 
 
+# log time (ns), file, block, place in it, channel's key, publish time (ns), data: in this order
+Entry: TypeAlias = tuple[int, int, int, int, int, int, bytes]
+
+
+def _raw(entry: Entry) -> Raw:
+    log_ns, *_, key, publish_ns, data = entry
+    return Raw(key, log_ns, publish_ns, data)
+
+
 def defined(channel: Channel, definitions: Mapping[str, Definition]) -> Channel:
     """The channel, with the given definition of its type where its file has none."""
     given = definitions.get(channel.msgtype)
@@ -83,6 +92,9 @@ class Storage(Protocol):
 
     def messages(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages by log time; equal log times as recorded."""
+
+    def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
+        """The messages in the order of the files, where the storage tells it; else by log time."""
 
     def close(self) -> None:
         """Close the files."""
@@ -146,6 +158,13 @@ class McapStorage:
                 for channel, batch in file.batches(wanted):
                     yield wanted[channel], batch
 
+    def recorded(self, keys: Collection[int]) -> Iterator[Raw]:
+        """The messages in the order of the files."""
+        for n, file in enumerate(self.files):
+            for i, block in enumerate(file.contents.blocks):
+                for entry in sorted(self._entries(n, i, block, keys), key=lambda entry: entry[3]):
+                    yield _raw(entry)
+
     def messages(self, keys: Collection[int]) -> Iterator[Raw]:
         """The messages by log time; equal log times as recorded.
 
@@ -155,13 +174,13 @@ class McapStorage:
         for n, file in enumerate(self.files):
             parts += [(b.start_ns, n, i, b) for i, b in enumerate(file.contents.blocks)]
         parts.sort(key=lambda part: part[:3])
-        waiting: list[tuple[int, int, int, int, int, int, bytes]] = []
+        waiting: list[Entry] = []
         held = 0
         for start_ns, n, i, block in parts:
             while waiting and waiting[0][0] < start_ns:
-                log_ns, *_, key, publish_ns, data = heapq.heappop(waiting)
-                held -= len(data)
-                yield Raw(key, log_ns, publish_ns, data)
+                entry = heapq.heappop(waiting)
+                held -= len(entry[-1])
+                yield _raw(entry)
             for entry in self._entries(n, i, block, keys):
                 heapq.heappush(waiting, entry)
                 held += len(entry[-1])
@@ -171,12 +190,9 @@ class McapStorage:
                     "in time; sort the file first (`mcap sort`)"
                 )
         while waiting:
-            log_ns, *_, key, publish_ns, data = heapq.heappop(waiting)
-            yield Raw(key, log_ns, publish_ns, data)
+            yield _raw(heapq.heappop(waiting))
 
-    def _entries(
-        self, n: int, i: int, block: Block, keys: Collection[int]
-    ) -> Iterator[tuple[int, int, int, int, int, int, bytes]]:
+    def _entries(self, n: int, i: int, block: Block, keys: Collection[int]) -> Iterator[Entry]:
         file, known = self.files[n], self._keys[n]
         wanted = {channel: key for channel, key in known.items() if key in keys}
         with reading(file.path):
@@ -242,6 +258,8 @@ class RosbagsStorage:
                 streams.append(self._read(path, reader, wanted, place))
             first += len(connections)
         return heapq.merge(*streams, key=lambda raw: raw.log_ns)
+
+    recorded = messages  # rosbags tells no other order
 
     def _read(
         self, path: Path, reader: Any, wanted: Sequence[Connection], place: Mapping[int, int]

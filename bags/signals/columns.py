@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from bags.recordings.bag import Bag
-from bags.recordings.batch import Batch
+from bags.recordings.batch import Batch, LogOrder
 from bags.recordings.cdr import Gatherer, UnreadableMessageError
 from bags.recordings.message_types import decode, is_stamped
 from bags.signals.signal import SignalPath, Step
@@ -30,7 +30,8 @@ MAX_ANNOUNCED: Final = 2**22  # messages; a bag's counts are not trusted with mo
 class Columns:
     """Signals of one topic over N messages.
 
-    log_ns, publish_ns: (N,) ns. stamp_ns: (N,) ns, the header's stamps; None without a header.
+    log_ns, publish_ns: (N,) ns. back: where log times go back inside a file (`LogOrder`).
+    stamp_ns: (N,) ns, the header's stamps; None without a header.
     values: signal -> (N,), in the message's unit.
     """
 
@@ -39,6 +40,7 @@ class Columns:
     publish_ns: IntArray
     stamp_ns: IntArray | None
     values: Mapping[str, FloatArray]
+    back: Sequence[tuple[int, int, int]] = ()
 
     def __len__(self) -> int:
         return len(self.log_ns)
@@ -53,6 +55,14 @@ def stream_columns(
     All are checked against the types in the bag before a message is read. Raises BagError where
     `signals` or the bag are wrong.
     """
+    for _, columns in _parts(bag, signals, progress):
+        yield columns
+
+
+def _parts(
+    bag: Bag, signals: Mapping[str, SignalPath], progress: Progress
+) -> Iterator[tuple[int, Columns]]:
+    """(channel, its next messages), in the order of the bag's files."""
     topics: dict[str, dict[str, SignalPath]] = {}
     for name, signal in signals.items():
         topics.setdefault(signal.topic, {})[name] = signal
@@ -60,7 +70,7 @@ def stream_columns(
     total = sum(c.count for c in bag.channels if c.topic in readers)
     done = 0
     for channel, batch in bag.batches(list(readers)):
-        yield readers[channel.topic].read(batch)
+        yield channel.key, readers[channel.topic].read(batch)
         done += len(batch)
         progress("reading", done / max(total, 1))
 
@@ -76,8 +86,8 @@ def read_columns(
     for name, signal in signals.items():
         names.setdefault(signal.topic, []).append(name)
     growing = {topic: _Growing(bag, topic, columns) for topic, columns in names.items()}
-    for part in stream_columns(bag, signals, progress=progress):
-        growing[part.topic].append(part)
+    for channel, part in _parts(bag, signals, progress):
+        growing[part.topic].append(channel, part)
     return {topic: growing.pop(topic).columns() for topic in names}
 
 
@@ -166,8 +176,10 @@ class _Growing:
         self._times = np.empty((3 if self._stamped else 2, capacity), dtype=np.int64)
         self._values = np.empty((len(names), capacity))
         self._length = 0
+        self._order = LogOrder()
 
-    def append(self, part: Columns) -> None:
+    def append(self, channel: int, part: Columns) -> None:
+        self._order.add(channel, part.log_ns)
         start, self._length = self._length, self._length + len(part)
         if self._length > self._times.shape[1]:
             more = max(self._length, 2 * self._times.shape[1]) - start
@@ -193,4 +205,5 @@ class _Growing:
             times[1],
             times[2] if self._stamped else None,
             dict(zip(self._names, values, strict=True)),
+            self._order.back,
         )

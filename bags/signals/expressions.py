@@ -25,6 +25,7 @@ import re
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -74,6 +75,7 @@ class Expression:
     operations: tuple[Operation, ...] = ()
 
     @classmethod
+    @lru_cache(maxsize=256)
     def parse(cls, text: str) -> "Expression":
         """Read `path|operation|...`; BagError says what is wrong with it."""
         path, *parts = text.split("|")
@@ -350,6 +352,7 @@ def _operation(part: str, text: str) -> Operation:
     return Operation(name, unit=argument)
 
 
+@lru_cache(maxsize=256)
 def _path_unit(path: SignalPath, msgtype: str, types: Typestore) -> str:
     wanted = ".".join(step.field + ("[*]" if step.picks else "") for step in path.steps)
     paths = {found: owners for found, _, owners in numeric_paths(msgtype, types)}

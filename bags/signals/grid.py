@@ -9,6 +9,7 @@ from typing import Any, Final, overload
 
 import numpy as np
 
+from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.remote import place
@@ -357,17 +358,16 @@ def _read_trials(
     if several := [text for text in named if Expression.parse(text).path.every]:
         raise BagError(f"{several[0]} is several signals; name one element of it for each")
     wanted = one_clock([Expression.parse(text) for text in named])
-    read = read_signals(
-        path,
-        named,
-        sort=options["sort"],
-        drop_duplicates=options["drop_duplicates"],
-        unfinished=options["unfinished"],
-        gaps_in=texts["responses"] if options["split_gaps"] else (),
-        definitions=definitions,
-    )
-    _refuse_other_clocks(path, read, wanted)
-    origin = bag_origin(path, unfinished=options["unfinished"])
+    with Bag(path, unfinished=options["unfinished"], definitions=definitions) as bag:
+        read = read_signals(
+            bag,
+            named,
+            sort=options["sort"],
+            drop_duplicates=options["drop_duplicates"],
+            gaps_in=texts["responses"] if options["split_gaps"] else (),
+        )
+        _refuse_other_clocks(path, read, wanted)
+        origin = bag_origin(bag)
     responses = [read[text] for text in texts["responses"]]
     trials = to_trajectories(
         responses,

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -48,7 +49,7 @@ class Samples:
 
 
 def read_signals(
-    bag: Path | str,
+    bag: Bag | Path | str,
     paths: Sequence[str],
     *,
     clock: str | None = None,
@@ -61,6 +62,7 @@ def read_signals(
 ) -> dict[str, Samples]:
     """The signals `paths` (see `bags.signals.signal`, `bags.signals.expressions`) of a bag.
 
+    bag: where it is; or one that is open, for which unfinished and definitions were said then.
     clock: which times are the stamps of the signals whose text has no `|clock(...)` (None: header
     stamps, log time for types without a header).
     sort: put messages in the order of their stamps instead of refusing stamps that go back.
@@ -76,7 +78,7 @@ def read_signals(
     if clock is not None and clock not in CLOCKS:
         raise BagError(f"no clock '{clock}'; there are: {', '.join(CLOCKS)}")
     named = {"header": HEADER_STAMP, "log": LOG_TIME, "": clock}
-    with Bag(bag, unfinished=unfinished, definitions=definitions) as source:
+    with _opened(bag, unfinished, definitions) as source:
         wanted = expanded(source, paths)
         kinds = {e.path.topic: source.types_on(e.path.topic) for e in wanted.values()}
         for expression in wanted.values():
@@ -119,13 +121,13 @@ def bag_digest(bag: Path | str) -> str:
     return digest
 
 
-def bag_origin(bag: Path | str, *, unfinished: bool = False) -> Json:
+def bag_origin(bag: Bag | Path | str, *, unfinished: bool = False) -> Json:
     """What a dataset's provenance says of a bag: digest, files with their sizes, custom data.
 
     The digest of a remote file is of what storage says of it and of its end (docs/decisions/0027):
     its content is not read for it.
     """
-    with Bag(bag, unfinished=unfinished) as source:
+    with _opened(bag, unfinished) as source:
         digest = hashlib.sha256()
         for file in source.files:
             if isinstance(file, RemotePath):
@@ -145,6 +147,17 @@ def bag_metadata(bag: Path | str) -> dict[str, str]:
     """The bag's own key-value pairs (`custom_data`); empty if it has none. BagError as above."""
     with Bag(bag) as source:
         return source.custom
+
+
+def _opened(
+    bag: Bag | Path | str,
+    unfinished: bool,
+    definitions: Mapping[str, Definition] | None = None,
+) -> AbstractContextManager[Bag]:
+    """The bag, opened and closed here unless it is open."""
+    if isinstance(bag, Bag):
+        return nullcontext(bag)
+    return Bag(bag, unfinished=unfinished, definitions=definitions)
 
 
 def stamp_text(stamp_ns: int) -> str:
@@ -208,6 +221,7 @@ class _Topic:
             self._stamps = columns.stamp_ns
         else:
             self._stamps = columns.log_ns if clock == LOG_TIME else columns.publish_ns
+        self._back = columns.back if clock == LOG_TIME and not sort else ()
         if sort and (np.diff(self._stamps) < 0).any():
             order = np.argsort(self._stamps, kind="stable")
             self._stamps = self._stamps[order]
@@ -226,13 +240,15 @@ class _Topic:
             raise BagError(
                 f"{self._where}: every header stamp is 0; its publisher does not fill it in"
             )
-        steps = np.diff(stamps)
-        if len(back := np.flatnonzero(steps < 0)):
-            i = int(back[0])
+        back = self._back or [
+            (int(i) + 1, int(stamps[i]), int(stamps[i + 1]))
+            for i in np.flatnonzero(np.diff(stamps) < 0)
+        ]
+        if back:
+            at, before, after = back[0]
             raise BagError(
-                f"{self._where}: time goes back by {-int(steps[i]) / 1e9:g} s at message {i + 1}: "
-                f"{self._clock} {stamp_text(int(stamps[i]))}, then "
-                f"{stamp_text(int(stamps[i + 1]))} "
+                f"{self._where}: time goes back by {(before - after) / 1e9:g} s at message {at}: "
+                f"{self._clock} {stamp_text(before)}, then {stamp_text(after)} "
                 f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
             )
 

@@ -112,6 +112,7 @@ class Sampler:
                 "or |linear(T s), or none"
             )
         self.on_grid = all(gridded)
+        self._single = all(len(part) == 1 for part in self.excitations)
         self.response_topics = tuple(dict.fromkeys(s.path.topic for s in self.responses))
         self._recorded: dict[int, str] = {}  # signal -> unit of the number in its messages
         self._on: dict[str, list[int]] = {topic: [] for topic in self.topics}
@@ -255,21 +256,23 @@ class Sampler:
             stamp_ns = self._next_stamp()
             if stamp_ns is None:
                 return given
-            awaited = self._kept[:n] if stamp_ns <= until_ns else self._kept
-            if until_ns < math.inf and not all(kept.is_certain(stamp_ns) for kept in awaited):
-                return given
+            if until_ns < math.inf:
+                for kept in self._kept[:n] if stamp_ns <= until_ns else self._kept:
+                    if kept.certain_ns < stamp_ns:
+                        return given
             given += self._lost_before(stamp_ns)
             self._take_stamp(stamp_ns)
             values = [kept.value_at(stamp_ns) for kept in self._kept]
             self._released_ns = stamp_ns
             if self.on_grid:
                 self._leap(values[:n])
-            if all(map(math.isfinite, values)):
+            complete = all(map(math.isfinite, values))
+            if complete:
                 self._started = True
             elif not self._started:
                 self.incomplete += 1
                 continue
-            missing = "" if all(map(math.isfinite, values)) else self._why(stamp_ns, values)
+            missing = "" if complete else self._why(stamp_ns, values)
             filled = "" if missing or not self.on_grid else self._filled(stamp_ns)
             u = self._multiplied(values[n:])
             given.append(Sample(stamp_ns, tuple(values[:n]), u, missing, filled))
@@ -303,6 +306,8 @@ class Sampler:
 
     def _multiplied(self, values: Sequence[float]) -> tuple[float, ...]:
         """The excitations from the values of all their factors."""
+        if self._single:
+            return tuple(values)
         left = iter(values)
         return tuple(math.prod(next(left) for _ in part) for part in self.excitations)
 
@@ -364,6 +369,7 @@ class _Kept:
         self.values: list[float] = []
         self.targets: list[float] = []  # with a lag, what the values go to
         self.newest_ns: float = -math.inf
+        self.certain_ns: float = -math.inf  # nothing to come changes what the value is until then
         self.first_ns: int | None = None
 
     def add(self, stamp_ns: int, value: float) -> None:
@@ -379,6 +385,7 @@ class _Kept:
             self.stamps.append(stamp_ns)
             self.values.append(value)
             self.newest_ns = stamp_ns
+            self.certain_ns = stamp_ns + (self.match_ns or 0)
         else:
             at = bisect_right(self.stamps, stamp_ns)
             self.stamps.insert(at, stamp_ns)
@@ -392,12 +399,6 @@ class _Kept:
         """The first stamp after `stamp_ns`; infinite if there is none yet."""
         at = bisect_right(self.stamps, stamp_ns)
         return self.stamps[at] if at < len(self.stamps) else math.inf
-
-    def is_certain(self, stamp_ns: int) -> bool:
-        """Whether nothing that is still to come changes the value at `stamp_ns`."""
-        if self.match_ns is None:
-            return self.newest_ns >= stamp_ns
-        return self.newest_ns >= stamp_ns - self.match_ns
 
     def value_at(self, stamp_ns: int) -> float:
         """The value of a sample; older values are forgotten, as samples only get later."""

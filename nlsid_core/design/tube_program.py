@@ -10,7 +10,7 @@ Source: docs/certificate_tube.md.
 import warnings
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, TypeAlias
 
 import cvxpy
 import numpy as np
@@ -20,12 +20,14 @@ from scipy.signal import lfilter
 from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.design.increment_form import Form
 
+Leaf: TypeAlias = FloatArray | tuple[FloatArray, FloatArray]  # vertices, or `independent_rows`
 cp: Any = cvxpy  # its functions are not seen by type checkers
 SCALES = (1.0, 1e2, 1e4)  # of the balance, tried in order: slow vertices spread what V is worth
 ROOM = 1e-6  # least eigenvalue asked for, in balanced units
 WORST = 0.3  # part of it that a solution has to have
 TAU_ROOM = 1e-3  # relative, given up of τ for the exact proof
 UNREACHED = 1e-4  # of the Gramian's mean: noise on states that no injection moves
+MANY = 4  # vertices, above which one matrix stands for all of them where it can
 LARGEST = 1e4  # entry of a multiplier in balanced units
 ROUNDS = 6  # of cutting planes, most of the time 2-4
 CUT = 1e-3  # relative, by which a window may exceed the level at which R is designed
@@ -113,7 +115,11 @@ def _balanced(
         for F, H in form.modes
     ]
     D = np.linalg.inv(form.mean[:, :m] * nu) if m else np.zeros((0, 0))
-    leaves = [D @ E @ S for E in form.leaves]
+    ends = [independent_rows(E) if len(E) > MANY and not form.ray else None for E in form.leaves]
+    leaves: list[Leaf] = [D @ E @ S for E in form.leaves]
+    if ends and None not in ends:
+        D = np.diag(1.0 / nu)
+        leaves = [(D @ mean @ S, D @ half @ S) for mean, half in ends]  # type: ignore[misc]
     windows = _Windows([part / sizes for part in e], rho)
     solution = None
     for _ in range(ROUNDS if p > 1 else 1):
@@ -166,7 +172,7 @@ class _Windows:
 
 def _program(
     modes: list[tuple[FloatArray, FloatArray]],
-    leaves: list[FloatArray],
+    leaves: list[Leaf],
     rho: float,
     m: int,
     windows: list[FloatArray],
@@ -205,6 +211,14 @@ def _program(
         Ns: list[Any] = []
         for M in forms:
             N: Any
+            if isinstance(vertices, tuple):  # mean and half
+                mean, half = (np.hstack([part, np.zeros((m, p))]) for part in vertices)
+                T = cp.Variable(m, nonneg=True)
+                constraints.append(T <= LARGEST)
+                Ns.append(mean.T @ cp.diag(T))
+                cross = mean.T @ cp.diag(T) @ mean - half.T @ cp.diag(T) @ half
+                constraints.append(M + (cross + cross.T) / 2.0 >> room)
+                continue
             if ray:
                 T = cp.Variable((1, 1), nonneg=True)
                 N = cp.vstack([T, np.zeros((size - 1, 1))])
@@ -237,6 +251,25 @@ def _program(
     if only is not None:
         found = [[finsler(np.asarray(M.value), only) for M in forms]]
     return np.asarray(P.value), R_found, np.asarray(tau.value), found
+
+
+def independent_rows(vertices: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """ē and h (m, m + n), where the vertices are all rows e_j = ē_j ± h_j; else None.
+
+    With N = ē'T, T >= 0 diagonal, N E + E'N' is at least ē'Tē - h'Th at all of them, 2xy being
+    x² + y² at most: one matrix in place of 2^m.
+    """
+    low, high = vertices[0], vertices[-1]
+    free = [j for j in range(len(low)) if not np.array_equal(low[j], high[j])]
+    if len(vertices) != 2 ** len(free):
+        return None
+    for vertex in vertices:
+        if any(
+            not np.array_equal(row, a) and not np.array_equal(row, b)
+            for row, a, b in zip(vertex, low, high, strict=True)
+        ):
+            return None
+    return (low + high) / 2.0, (high - low) / 2.0
 
 
 def finsler(M: FloatArray, E: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ from nlsid_core.identification.block_cascade import (
     identify_block_cascade,
 )
 from nlsid_core.identification.cells import CellClass
+from nlsid_core.identification.feedback import FeedbackClass
 from nlsid_core.identification.fit import Candidate, Fit, History, Proof, Step, stated_rate
 from nlsid_core.identification.identify import Selection, Tried, identify, select
 from nlsid_core.identification.implicit_class import ImplicitClass
@@ -50,6 +51,7 @@ __all__ = [
     "CellClass",
     "CertifiedRse",
     "CertifiedSem",
+    "FeedbackClass",
     "FirstRse",
     "Fit",
     "History",

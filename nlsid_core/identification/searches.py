@@ -15,6 +15,11 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
+from nlsid_core.identification.feedback import (
+    FeedbackClass,
+    identify_feedback,
+    identify_unproved,
+)
 from nlsid_core.identification.fit import History, Proof, Step
 from nlsid_core.identification.implicit_class import (
     ImplicitClass,
@@ -175,7 +180,7 @@ def state_affine(
         unknowns or there is no other start.
         """
         at_hand = [c.model for c in trail.candidates if c.proof is not None]
-        starts = [_least_error(at_hand, train)] if at_hand else []
+        starts = [_least_error(at_hand, train, problem.weights)] if at_hand else []
         if problem.is_bounded_by_leading or not starts:
             starts.append(_certified(problem, trail, method))
         proofs = [(start, prove_stability(start)) for start in starts]
@@ -186,7 +191,7 @@ def state_affine(
         ]
         if not reached:
             raise Infeasible("no proof for the last certified iterate, where the last step starts")
-        return _least_error(reached, train)
+        return _least_error(reached, train, problem.weights)
 
     trail.add(CertifiedSem, last_step)
     return trail
@@ -244,6 +249,27 @@ def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwo
         trail.history = History(trail.history.value, steps)
         return model, proof
 
+    trail.add_proved(CertifiedSem, search)
+    return trail
+
+
+def feedback(train: Dataset, model_class: FeedbackClass, task: Task) -> Trail[CellNetwork]:
+    """Filters with feedback through a static map, unrolled; the loop itself for comparison."""
+    trail: Trail[CellNetwork] = Trail(
+        task, prove_stability, f"held-back error, rms [{_unit(train)}]"
+    )
+    fitted, judged = hold_out(train)
+
+    def search(method: CertifiedSem) -> tuple[CellNetwork, Proof]:
+        model, proof, steps = identify_feedback(
+            train, fitted, judged, model_class, transient=task.transient,
+            slowest=min(MAX_RADIUS, task.searched_rate), steps=method.iterations,
+            progress=task.progress,
+        )  # fmt: skip
+        trail.history = History(trail.history.value, steps)
+        return model, proof
+
+    trail.add(Sem, lambda _: identify_unproved(train, model_class, transient=task.transient))
     trail.add_proved(CertifiedSem, search)
     return trail
 
@@ -316,11 +342,14 @@ def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | No
         return None
 
 
-def _least_error(models: Sequence[T], train: Dataset) -> T:
-    """The model that simulates the training data best; Infeasible if there is none."""
+def _least_error(models: Sequence[T], train: Dataset, weights: FloatArray | None = None) -> T:
+    """The model that simulates the training data best; Infeasible if there is none.
+
+    weights: (n_y,), as of `simulation_percent`.
+    """
     if not models:
         raise Infeasible("no start of the search leads to a model that can be used")
-    return min(models, key=lambda model: simulation_percent(model, train))
+    return min(models, key=lambda model: simulation_percent(model, train, weights=weights))
 
 
 def _best_minimum(
@@ -424,6 +453,7 @@ OFFERS: dict[type, Offer] = {
     ),
     BlockCascadeClass: Offer(block_cascade, (Sem,), (), needs_validation=True),
     CellClass: Offer(cells, (CertifiedSem,), ()),
+    FeedbackClass: Offer(feedback, (CertifiedSem, Sem), (Sem,)),
     MonotoneClass: Offer(
         monotone,
         (MomentRie, Rie, LeastSquares, Sem, CertifiedSem),

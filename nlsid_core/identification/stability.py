@@ -32,7 +32,8 @@ LEAST_ROOM = 1e-3  # of 1 - rate of the worst vertex alone: what is asked for fi
 RATE_RISE = 4.0  # of 1 - rate from one attempt to the next, until one is not proved
 RATE_STEPS = 6  # bisections of 1 - rate, the first failure among them
 FEASIBLE = 1e-7  # least eigenvalue, in balanced units, that the kernel's exact decision can use
-MOST_HALVINGS = 100  # of the second filter's weight: beyond any coupling worth a model
+MOST_HALVINGS = 100  # of a layer's weight: beyond any coupling worth a model
+LEAST_PIVOT = 1e-3  # eigenvalue, in units of the diagonal, that the weight of a layer leaves
 LARGEST = 1e3  # entry of a multiplier in balanced units: where nothing else bounds it
 SPLITTING_ROUNDS = 16
 MOST_LEAVES = 64
@@ -112,9 +113,9 @@ def prove_stability(model: Any) -> StabilityProof | None:
         root = search.leaf(form.box)
         if len(root.E) == 1 and not form.ray:
             return _decided(model, _linear(search, root))
-        second = _after(search, root)
-        if second.any() and not search.form.ray and not form.box:
-            return _by_weights(model, search, root, second)
+        layer = _layers(search, root)
+        if layer is not None and not search.form.ray and not form.box:
+            return _by_weights(model, search, root, layer)
         if isinstance(model, StateAffineModel) and _is_bounded(model):
             return _decided(model, _by_programs(search, _between_ends(model, root)))
         return _decided(model, _by_programs(search, root))
@@ -190,23 +191,40 @@ def _linear(search: _Search, leaf: Leaf | None) -> StabilityProof | None:
     return StabilityProof(rate, P, {"N": N.tolist()})
 
 
-def _after(search: _Search, root: Leaf) -> NDArray[np.bool_]:
-    """(n,): the states that ν moves, if ν depends on none of them; else none."""
+def _layers(search: _Search, root: Leaf) -> NDArray[np.intp] | None:
+    """(n,): the layer of every state, if no ν depends on what it moves; else None.
+
+    A state's layer is the number of ν, one after the other, on the longest way to it; states that
+    depend on each other have the same one. ν come in their order in the form.
+    """
     m, F = search.m, search.F
-    second: NDArray[np.bool_] = np.asarray(F[:, :m].any(axis=1))
-    while (F[:, m:][:, second].any(axis=1) & ~second).any():
-        second = np.asarray(second | F[:, m:][:, second].any(axis=1))
-    depends = bool(root.E[:, :, m:][:, :, second].any())
-    return np.zeros_like(second) if depends else second
+    n = len(F)
+    reads, moves = (root.E[:, :, m:] != 0.0).any(axis=0), F[:, :m] != 0.0
+    among, passes = F[:, m:] != 0.0, (root.E[:, :, :m] != 0.0).any(axis=0)
+    layer: NDArray[np.intp] = np.zeros(n, dtype=np.intp)
+    for _ in range((n + m) * (m + 1)):
+        before = layer.copy()
+        depth = np.zeros(m, dtype=np.intp)
+        for j in range(m):
+            known = [layer[reads[j]].max(initial=0), depth[:j][passes[j, :j]].max(initial=0)]
+            depth[j] = 1 + max(known)
+        for i in range(n):
+            layer[i] = max(layer[i], depth[moves[i]].max(initial=0), layer[among[i]].max(initial=0))
+        if layer.max(initial=0) > m:
+            return None
+        if (layer == before).all():
+            return layer
+    return None
 
 
 def _by_weights(
-    model: Any, search: _Search, root: Leaf, second: NDArray[np.bool_]
+    model: Any, search: _Search, root: Leaf, layer: NDArray[np.intp]
 ) -> StabilityProof | None:
-    """P = diag(P₁, w P₂) of a filter, ν, and a filter: w is halved until the coupling is nothing.
+    """P = diag(w₀P₀, w₁P₁ …) of filters with ν between them: the weight of a layer is halved until
+    what couples it to those before it is nothing.
 
-    Each P_i solves (A/r)'P(A/r) - P + I = 0. N ζ = w(G'P₂G ν + G'P₂A₂x₂), G ν what ν moves x₂ by,
-    leaves w G'P₂G on ν, and what couples x₁ to the rest falls with w.
+    Each P_l solves (A/r)'P(A/r) - P + I = 0. N ζ = w(G'P_l G ν + G'P_l A x_l), G ν what ν moves
+    x_l by, leaves w G'P_l G on ν, and the coupling falls with w.
     """
     m, F = search.m, search.F
     A = F[:, m:]
@@ -214,27 +232,43 @@ def _by_weights(
     rate = radius + RATE_ROOM * (1.0 - radius)
     if not 0.0 < rate < 1.0 - SLOWEST:
         return None
-    first = ~second
-    P1, P2 = (_lyapunov(A[np.ix_(part, part)] / rate) for part in (first, second))
-    P2 = P2 / np.abs(P2).max()
-    G = F[second, :m]
-    size = G.T @ P2 @ G
-    size += np.trace(size) * 1e-3 * np.eye(m)
-    P, N = np.zeros_like(A), np.zeros((m + len(A), m))
-    if first.any():
-        P[np.ix_(first, first)] = P1 / np.abs(P1).max()
-    for halvings in range(MOST_HALVINGS):
-        weight = 0.5**halvings
-        P[np.ix_(second, second)] = weight * P2
-        N[:m] = weight * size
-        N[m:][second] = weight * A[np.ix_(second, second)].T @ P2 @ G
-        M = _gap(F, P, rate, m) + N @ root.E + (N @ root.E).transpose(0, 2, 1)
-        units = 1.0 / np.sqrt(np.maximum(np.einsum("vii->vi", M), np.finfo(float).tiny))
-        if np.linalg.eigvalsh(M * units[:, :, None] * units[:, None])[:, 0].min() > 0.0:
-            found = _decided(model, StabilityProof(rate, P.copy(), {"N": N.tolist()}))
-            if found is not None:
-                return found
-    return None
+    P, N, weight = np.zeros_like(A), np.zeros((m + len(A), m)), 1.0
+    done: NDArray[np.bool_] = np.zeros(m + len(A), dtype=bool)
+    for number in range(int(layer.max()) + 2):
+        part = np.flatnonzero(layer == number)  # of the last one none, but ν that move no state
+        G, own = F[part, :m], A[np.ix_(part, part)]
+        P_l = _lyapunov(own / rate) if len(part) else np.zeros((0, 0))
+        P_l /= np.abs(P_l).max(initial=1.0)
+        moves = G.any(axis=0) if len(part) else ~F[:, :m].any(axis=0)
+        size = G.T @ P_l @ G
+        size += (np.trace(size) * 1e-3 if len(part) else 1.0) * np.diag(moves.astype(float))
+        done[:m] |= moves
+        done[m + part] = True
+        for _ in range(MOST_HALVINGS):
+            P_with, N_with = P.copy(), N.copy()
+            P_with[np.ix_(part, part)] = weight * P_l
+            N_with[:m] += weight * size
+            N_with[m + part] = weight * own.T @ P_l @ G
+            cross = N_with @ root.E
+            M = _gap(F, P_with, rate, m) + cross + cross.transpose(0, 2, 1)
+            if _least_in_units(M[:, done][:, :, done]) > LEAST_PIVOT:
+                break
+            weight *= 0.5
+        else:
+            return None
+        P, N = P_with, N_with
+    return _decided(model, StabilityProof(rate, P, {"N": N.tolist()}))
+
+
+def _least_in_units(M: Matrices) -> float:
+    """The least eigenvalue of all, in units in which every diagonal entry is one."""
+    diagonals = np.einsum("vii->vi", M)
+    if not M.size:
+        return np.inf
+    if not diagonals.min() > 0.0:
+        return -np.inf
+    units = 1.0 / np.sqrt(diagonals)
+    return float(np.linalg.eigvalsh(M * units[:, :, None] * units[:, None])[:, 0].min())
 
 
 def _eliminated(search: _Search, E: FloatArray) -> tuple[FloatArray, FloatArray]:

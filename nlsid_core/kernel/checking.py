@@ -22,6 +22,7 @@ KINDS = (
     "funnel_composition",
     "polynomial_bound",
     "region_of_attraction",
+    "falsification",
 )
 # What makes proofs again whose kinds, of version 1, are not decided any more.
 FORMER = {
@@ -37,7 +38,7 @@ FORMER = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is proved: it exists only for a claim that was decided.
+    """What is proved, or proved to be false: it exists only for a claim that was decided.
 
     statement: one sentence. margin: how much room the proof has, in the unit that the kind states;
     rounded down when printed. assumptions: what the statement rests on and the kernel cannot know.
@@ -51,7 +52,8 @@ class Verdict:
     digests: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        lines = [f"PROVED {self.statement}, margin {text.below(self.margin)}"]
+        word = "FALSIFIED" if self.kind == "falsification" else "PROVED"
+        lines = [f"{word} {self.statement}, margin {text.below(self.margin)}"]
         return "\n".join(lines + [f"  assuming {assumption}" for assumption in self.assumptions])
 
 

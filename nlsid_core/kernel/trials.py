@@ -49,24 +49,25 @@ def read_measured(parts: dict[str, Node], what: str) -> Measured:
 
 def read_trials(trials: Node) -> list[Recorded]:
     """A list of {name, digest}; a digest may end in [first:end], samples of the recording."""
-    found = []
-    for trial in trials.items(0, MAX_TRIALS):
-        parts = trial.members("name digest")
-        parts["name"].text()
-        recording, cut, samples = parts["digest"].text().partition("[")
-        if not DIGEST.fullmatch(recording):
-            raise Rejected(
-                f"{trial.where}: a trial should have the digest of its recording, sha256: and 64 "
-                "digits or letters a-f"
-            )
-        if not cut:
-            found.append(Recorded(recording))
-            continue
-        window = WINDOW.fullmatch(samples)
-        if window is None or not int(window[1]) < int(window[2]) < LONGEST:
-            raise Rejected(f"{trial.where}: a window should be [first:end] with first < end")
-        found.append(Recorded(recording, int(window[1]), int(window[2])))
-    return found
+    return [read_trial(trial) for trial in trials.items(0, MAX_TRIALS)]
+
+
+def read_trial(trial: Node) -> Recorded:
+    """One {name, digest}."""
+    parts = trial.members("name digest")
+    parts["name"].text()
+    recording, cut, samples = parts["digest"].text().partition("[")
+    if not DIGEST.fullmatch(recording):
+        raise Rejected(
+            f"{trial.where}: a trial should have the digest of its recording, sha256: and 64 "
+            "digits or letters a-f"
+        )
+    if not cut:
+        return Recorded(recording)
+    window = WINDOW.fullmatch(samples)
+    if window is None or not int(window[1]) < int(window[2]) < LONGEST:
+        raise Rejected(f"{trial.where}: a window should be [first:end] with first < end")
+    return Recorded(recording, int(window[1]), int(window[2]))
 
 
 def shared(trials: list[Recorded], others: list[Recorded]) -> int:

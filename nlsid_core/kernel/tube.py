@@ -74,6 +74,11 @@ class Policy:
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
     """Decide {kind, about: {model, funnel}}, or with a policy beside them, by {multipliers}."""
+    return decide_tube(claim, proof, read)[0]
+
+
+def decide_tube(claim: Node, proof: Node, read: Read) -> tuple[Decision, Model, Node, list[Tube]]:
+    """`decide`; also the model in increment form and as its file has it, and the tubes."""
     about = claim.members("kind about")["about"]
     planned = type(about.value) is dict and "policy" in about.value
     roles = "model policy funnel" if planned else "model funnel"
@@ -122,7 +127,8 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
         assumptions += _response(model, funnel["response"], fitted)
     if "cusum" in funnel:
         _read_cusum(model, funnel["cusum"])
-    return Decision(_statement(model, policy, tubes), margin, tuple(assumptions), digests)
+    decision = Decision(_statement(model, policy, tubes), margin, tuple(assumptions), digests)
+    return decision, model, documents["model"], tubes
 
 
 def _modes(model: Model, policy: Policy | None) -> list[tuple[str, Model]]:
@@ -330,6 +336,17 @@ def _inside(model: Model, box: Node) -> str:
 
 def _assumed(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own: bool) -> list[str]:
     """What is assumed of the innovations. own: whether other tubes have other observers."""
+    energy, *peak = bounds(model, tube)
+    whose, assumed = " of its own observer" if own else "", tube.assumed
+    said = [f"innovation energy{whose}: {energy} ({calibration(assumed.measured, fitted_to)})"]
+    if assumed.peak is not None:
+        worth = calibration(assumed.peak[1], fitted_to)
+        said.append(f"innovation peak{whose}: {peak[0]} ({worth})")
+    return said
+
+
+def bounds(model: Model, tube: Tube) -> list[str]:
+    """The bound on the innovations' energy, and that on a single one if there is one, in words."""
     # One output and R = 1: V and E carry its unit squared.
     unit, energy, assumed = "", "e'Re", tube.assumed
     if len(model.y) == 1:
@@ -337,18 +354,14 @@ def _assumed(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own:
         energy = "e^2" if tube.R == [[1]] else f"{text.exact(tube.R[0][0])} e^2"
     level = Signal("", unit).quantity(text.below(assumed.level))
     growth = f"E+ = {text.exact(tube.rho)} E + {energy} from 0"
-    bound = f"E <= {level} after every sample, {growth}"
+    said = [f"E <= {level} after every sample, {growth}"]
     if assumed.follows is not None:
         g = formula(assumed.follows, 0, model.u)
-        bound = f"E <= {level} g after every sample, {growth}, g = {g}"
+        said = [f"E <= {level} g after every sample, {growth}, g = {g}"]
     if assumed.samples is not None:
-        bound = f"sum of {energy} <= {level} over {assumed.samples} samples"
-    whose = " of its own observer" if own else ""
-    said = [f"innovation energy{whose}: {bound} ({calibration(assumed.measured, fitted_to)})"]
+        said = [f"sum of {energy} <= {level} over {assumed.samples} samples"]
     if assumed.peak is not None:
-        peak, measured = assumed.peak
         room = " max(1, g)" if assumed.follows else ""
-        most = Signal("", unit).quantity(text.below(peak))
-        bound = f"{energy} <= {most}{room} at every sample"
-        said.append(f"innovation peak{whose}: {bound} ({calibration(measured, fitted_to)})")
+        most = Signal("", unit).quantity(text.below(assumed.peak[0]))
+        said.append(f"{energy} <= {most}{room} at every sample")
     return said

@@ -8,6 +8,7 @@ python -m nlsid_ros.demo.live --funnel DIR/funnel.json --bag BAG --out DIR [--js
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -15,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import rclpy
@@ -39,7 +41,7 @@ from nlsid_ros.messages import stamp_ns_of
 from nlsid_ros.processes import isolate, python, settings
 
 FAULT = "scaled by 0.6"
-PATIENCE = 30.0  # s for a process to come up or a message to arrive, on a loaded machine
+PATIENCE = 120.0  # s for a process to come up or a message to arrive, on a loaded machine
 SETTLE = 0.5  # s for the last messages of a pass
 MARGIN_TOLERANCE = 1e-9
 ALARM_LIMIT_MS = 50.0
@@ -131,10 +133,11 @@ def run_live(funnel: Path, bag: Path, out: Path) -> LiveResult:
     write_faulty_copy(bag, faulty, str(signals.responses[0].path), FAULTS[FAULT])
     recording = out / f"{bag.name}, recorded"
     with _observing(topics) as observer, _node("funnel_publisher", {"funnel": funnel}):
-        with _node("funnel_monitor", {"allow_old_stamps": True}):
-            _wait("the monitor to be ready", lambda: observer.has_said("funnel_monitor", " yet"))
-            with _node("trajectory_recorder", {"bag": recording, "topics": list(topics)}):
-                _wait("the recorder", lambda: observer.has_said("trajectory_recorder", ""))
+        with _node("funnel_monitor", {"allow_old_stamps": True}) as monitor:
+            ready = partial(observer.has_said, "funnel_monitor", " yet")
+            _wait("the monitor to be ready", ready, monitor)
+            with _node("trajectory_recorder", {"bag": recording, "topics": list(topics)}) as node:
+                _wait("the recorder", partial(observer.has_said, "trajectory_recorder", ""), node)
                 _play(bag, list(topics), listeners=3)
                 time.sleep(SETTLE)
             margins = dict(observer.margins)
@@ -227,11 +230,21 @@ def _node(
     return python(f"nlsid_ros.{name}", settings(parameters))
 
 
-def _wait(what: str, done: Callable[[], bool]) -> None:
+def _wait(
+    what: str, done: Callable[[], bool], process: subprocess.Popen[bytes] | None = None
+) -> None:
+    """Until it is done; NlsidError if the process that is to do it ends, or takes too long."""
     deadline = time.monotonic() + PATIENCE
     while not done():
+        if process is not None and process.poll() is not None:
+            raise NlsidError(f"{what}: its process ended with status {process.returncode}")
         if time.monotonic() > deadline:
-            raise NlsidError(f"waited {PATIENCE:g} s for {what}, in vain")
+            alive = "" if process is None else "Its process is alive. "
+            raise NlsidError(
+                f"waited {PATIENCE:g} s for {what}, in vain. {alive}{os.getloadavg()[0]:.0f} "
+                f"processes want {os.cpu_count()} processors now: on a busy computer repeat this, "
+                "or see that DDS reaches this computer's own processes"
+            )
         time.sleep(0.02)
 
 

@@ -18,6 +18,7 @@ from bags.monitoring.catching import (
     Width,
     what_it_catches,
 )
+from bags.monitoring.replay import Replay
 from bags.pictures.catching_plots import catching as draw
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.calibration import calibration_trials
@@ -26,6 +27,7 @@ from nlsid_core.design import OutputTubeDesign
 from nlsid_core.design.tube import energy, innovations
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
+from nlsid_core.running.reading import Reading, Status
 from tests.conftest import PERIOD, synthetic_dataset
 from tests.core.kernel.tube_claims import dataset
 from tests.core.kernel.tube_claims import design as follower
@@ -307,3 +309,17 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
     show.say_catching(console, found, None)
     said = " ".join(console.export_text().split())
     assert f"warning: {len(jumped)} of {len(jumped)} held-back trials, nothing put into" in said
+
+
+def test_a_tube_wider_than_what_was_measured_is_said_with_its_share_of_the_samples() -> None:
+    def replay(widths: list[float]) -> Replay:
+        readings = tuple(
+            Reading(0.1 * k, Status.INSIDE, 0.9, measured=(float(k % 2),), half_widths=(width,))
+            for k, width in enumerate(widths)
+        )
+        return Replay("drive", readings, tuple(range(len(widths))), "speed", "m/s", 0.0, 0.1)
+
+    said = replay([0.5] * 6 + [1.5] * 4).said_wide
+    assert said.startswith("in 40 % of the samples judged the half-width is more than the whole")
+    assert "range measured here, 1 m/s: the tube says nothing there" in said
+    assert replay([0.5] * 10).said_wide == replay([]).said_wide == ""

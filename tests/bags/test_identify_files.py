@@ -55,10 +55,12 @@ CLASSES: dict[str, tuple[dict[str, Any], Any]] = {
     "implicit": ({"model": "implicit", "lags": 2, "delays": [0, 1]}, ImplicitModel),
     "linear_states": ({"model": "linear_states"}, ImplicitModel),
     "cells": ({"model": "cells", "cells": 2, "intervals": 4}, CellNetwork),
+    "feedback": ({"model": "feedback", "lags": 2, "stages": 1, "imitated": 20}, CellNetwork),
 }  # fmt: skip
 COEFFICIENTS = {
     "linear": "a", "state_affine": "coefficients", "block_cascade": "a1", "monotone": "a",
     "implicit": "coefficients", "linear_states": "coefficients", "cells": "next",
+    "feedback": "next",
 }  # fmt: skip
 STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
 REASONS = {"rate": "the decrease of V", "delta": "inequality stable: not positive"}
@@ -383,6 +385,7 @@ def examples() -> list[dict[str, Any]]:
     return [content for block in blocks if "identification" in (content := yaml.safe_load(block))]
 
 
+@pytest.mark.slow  # the classes are identified above; here the page's own words for them are
 @pytest.mark.parametrize("example", examples(), ids=lambda e: "-".join(e) + str(len(str(e))))
 def test_every_example_of_the_how_to_runs(
     example: dict[str, Any], folder: Path, tmp_path: Path

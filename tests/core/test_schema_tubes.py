@@ -6,7 +6,9 @@ import jsonschema
 import pytest
 
 from nlsid_core import files
+from nlsid_core.arrays import Json
 from nlsid_core.designs import FUNNEL, PROOF
+from tests.core.kernel.falsification_claims import claim
 from tests.core.kernel.tube_claims import design
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
@@ -19,8 +21,21 @@ def test_every_written_document_validates_and_a_damaged_one_does_not(
     name: str, file: str, schema: str
 ) -> None:
     stated = files.load_document(SCHEMAS / f"{schema}.schema.json")
+    validates(design(name).documents()[file], stated)
+
+
+def test_a_falsification_validates() -> None:
+    stated = files.load_document(SCHEMAS / "proof_falsification.schema.json")
+    document, _ = claim("following")
+    validates(document, stated)
+    document["proof"]["energy"][0] = -1.0
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document, stated)
+
+
+def validates(document: Json, stated: Json) -> None:
+    """It does; with a member more or less it does not."""
     jsonschema.Draft202012Validator.check_schema(stated)
-    document = design(name).documents()[file]
     jsonschema.validate(document, stated)
     for damaged in (document | {"extra": 1}, {k: v for k, v in document.items() if k != "format"}):
         with pytest.raises(jsonschema.ValidationError):

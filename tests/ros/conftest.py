@@ -1,5 +1,6 @@
-"""What most tests over DDS need: the F1TENTH chain's files."""
+"""What every test over DDS needs, and what most do: a ROS domain, and the F1TENTH chain's files."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,13 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
 from nlsid_core.progress import silent
+from tests.ros.domains import own_domain
+
+
+@pytest.fixture(autouse=True)
+def domain() -> Iterator[None]:
+    with own_domain():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """A stand-in for a car and for its funnel's publisher, which can do what robots do wrong."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -16,17 +15,17 @@ from std_srvs.srv import Trigger
 from bags.designs.bundle import Bundle
 from bags.designs.documents import FUNNEL
 from nlsid_ros import qos
+from tests.ros.processes import SpinUntil, service
 
 MONITOR = "nlsid_ros.funnel_monitor"
 PERIOD_NS = 25_000_000
 GOOD = list(range(10))
-Spin = Callable[[Callable[[], bool]], None]
 
 
 class Robot:
     """Stands in for a car and for the funnel's publisher, and hears what is said of it."""
 
-    def __init__(self, node: Node, spin_until: Spin, folder: Path) -> None:
+    def __init__(self, node: Node, spin_until: SpinUntil, folder: Path) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[tuple[str, dict[str, str]]]] = {}
         self.levels: dict[str, bytes] = {}
@@ -64,13 +63,10 @@ class Robot:
 
     def begin(self) -> None:
         """Begin a new run."""
-        client = self.node.create_client(Trigger, "/funnel_monitor/restart")
-        self.spin_until(client.service_is_ready)
+        restart = service(self.node, self.spin_until, "/funnel_monitor/restart")
         self.said.clear()
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
+        self.spin_until(restart.call_async(Trigger.Request()).done)
         self.spin_until(lambda: self.has_said("restarted"))
-        self.node.destroy_client(client)
 
     def drive(
         self,

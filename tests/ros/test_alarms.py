@@ -21,17 +21,13 @@ from tests.ros.processes import (
     ros_test,
     set_parameter,
     stop,
-    use_domain_of_this_run,
 )
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
 
 
-def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(funnel: Path) -> None:
     slow: dict[str, object] = {
         "hysteresis": 1.0,
         "clear_after": 60.0,
@@ -57,10 +53,7 @@ def test_an_exit_is_said_at_once_whatever_is_done_against_chattering(
         stop(monitor)
 
 
-def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(funnel: Path) -> None:
     wary: dict[str, object] = {"warning_margin": 1.0, "stale_after": 5.0, "allow_old_stamps": True}
     with node_here("test_robot") as (node, spin_until), process(MONITOR, **wary) as monitor:
         robot = Robot(node, spin_until, funnel.parent)
@@ -74,10 +67,7 @@ def test_a_low_margin_is_a_warning_and_its_threshold_can_be_moved_in_mid_run(
         stop(monitor)
 
 
-def test_an_alarm_calls_the_services_it_was_given_once(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_an_alarm_calls_the_services_it_was_given_once(funnel: Path) -> None:
     called: list[str] = []
 
     def answer(name: str) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
@@ -107,11 +97,8 @@ def test_an_alarm_calls_the_services_it_was_given_once(
         stop(monitor)
 
 
-def test_every_alarm_calls_not_the_first_one_only(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
-) -> None:
+def test_every_alarm_calls_not_the_first_one_only(funnel: Path) -> None:
     """After a restart, and when a run is announced before anybody looked at the alarm."""
-    use_domain_of_this_run(monkeypatch)
     called: list[str] = []
 
     def serve(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -151,9 +138,8 @@ def test_every_alarm_calls_not_the_first_one_only(
 
 
 def test_an_alarm_with_nobody_to_call_says_so_and_calls_until_somebody_answers(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
+    funnel: Path,
 ) -> None:
-    use_domain_of_this_run(monkeypatch)
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, stale_after=5.0, allow_old_stamps=True, stop_service="/nobody") as monitor,

@@ -8,15 +8,14 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")
 
 from benchmarks.bridge_live import design_swing, live
-from tests.ros.processes import ros_test, use_domain_of_this_run
+from tests.ros.processes import ros_test
 
 pytestmark = [*ros_test, pytest.mark.slow]
 
 
 def test_live_verdicts_on_an_identified_robot_equal_the_replay_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    use_domain_of_this_run(monkeypatch)
     result = live(design_swing(tmp_path), tmp_path / "bag", seconds=8.0)
     assert result.runs == result.replayed >= 3
     assert result.judged == result.expected > 200

@@ -22,15 +22,10 @@ from bags.recordings.bag import Bag
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import STARTED, node_here, process, ros_test, stop
 
 pytestmark = ros_test
 TOPICS = "['/odom', '/cmd_vel', '/tracking_controller/run', '/funnel_monitor/events']"
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 class Loop:
@@ -169,7 +164,7 @@ def test_an_interrupted_controller_ramps_down_before_it_goes(funnel: Path) -> No
         spin_until(lambda: bool(commands) and commands[-1] > 0.2)
         running.send_signal(signal.SIGTERM)
         spin_until(lambda: commands[-1] == 0.0)
-        assert running.wait(timeout=10) == 0
+        assert running.wait(timeout=STARTED) == 0
     falling = np.diff(commands[commands.index(max(commands)) :])
     assert float(np.min(falling)) >= -2.0 * 0.025 * (1 + 1e-9)
     assert len(falling) >= 4

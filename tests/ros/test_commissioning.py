@@ -2,6 +2,7 @@
 
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from nlsid_core.designs import POLICY, VECTOR_FIELD
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.continuous_stage import stage
-from tests.ros.processes import STARTED, node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import STARTED, call, node_here, process, ros_test
 
 pytestmark = ros_test
 CONTROLLER, PERIOD_NS = "nlsid_ros.tracking_controller", 50_000_000
@@ -25,9 +26,8 @@ JOINTS = "sensor_msgs/msg/JointState"
 
 
 def test_an_unproved_policy_runs_in_its_mode_only_and_with_what_stops_the_robot(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
-    use_domain_of_this_run(monkeypatch)
     field, policy, _ = stage()
     files.write_document(tmp_path / VECTOR_FIELD, field.document())
     files.write_document(tmp_path / POLICY, policy.document())
@@ -62,19 +62,12 @@ def test_an_unproved_policy_runs_in_its_mode_only_and_with_what_stops_the_robot(
             assert "runs what is not proved: set stop_service" in refused.stdout.read()
         stack.enter_context(process(CONTROLLER, **settings, stop_service="/robot/stop"))
 
-        def call(name: str) -> Trigger.Response:
-            client = node.create_client(Trigger, f"/tracking_controller/{name}")
-            spin_until(client.service_is_ready)
-            answer = client.call_async(Trigger.Request())
-            spin_until(answer.done)
-            response: Trigger.Response = answer.result()
-            return response
-
-        answer = call("start")
+        start = partial(call, node, spin_until, "/tracking_controller/start")
+        answer = start()
         assert not answer.success
         assert "/robot/stop is not there" in answer.message
         node.create_service(Trigger, "/robot/stop", stop)
-        spin_until(lambda: node.count_subscribers("/joints") >= 1 and bool(call("start").success))
+        spin_until(lambda: node.count_subscribers("/joints") >= 1 and bool(start().success))
         first_ns, x = time.time_ns(), 0.9  # far outside of where any funnel of it would be
         for k in range(-1, 10):
             stamp_ns = first_ns + (k + 1) * PERIOD_NS
@@ -87,7 +80,7 @@ def test_an_unproved_policy_runs_in_its_mode_only_and_with_what_stops_the_robot(
                 assert commands[stamp_ns] == pytest.approx(float(policy(t, [x])[0]))
                 x += PERIOD_NS * 1e-9 * commands[stamp_ns]
         assert not stopped
-        assert call("stop").success
+        assert call(node, spin_until, "/tracking_controller/stop").success
         spin_until(lambda: bool(stopped))
     assert said
     assert all(text.startswith("COMMISSIONING, not proved: ") for _, text in said)

@@ -12,7 +12,6 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
 from bags.designs.design import Wiring
 from bags.designs.documents import load_proved
@@ -21,7 +20,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.continuous_stage import composed
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test
 
 pytestmark = ros_test
 PERIOD_NS = 50_000_000
@@ -31,10 +30,9 @@ WIRING = {"response": RESPONSE, "command": COMMAND, "period": 0.05}
 
 @pytest.mark.parametrize("stages", [1, 2])
 def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
-    stages: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    stages: int, tmp_path: Path
 ) -> None:
     """Two stages: a composition, of which controller and monitor say which stage is on."""
-    use_domain_of_this_run(monkeypatch)
     path, samples = composed(tmp_path) / COMPOSITION, 20 * stages
     if stages == 1:
         path = tmp_path / "from 0" / FUNNEL
@@ -64,7 +62,6 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
         node.create_subscription(JointState, "/effort", hear_command, qos.STREAM)
         node.create_subscription(JointState, "/funnel_monitor/margin", hear_margin, qos.STREAM)
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        start = node.create_client(Trigger, "/tracking_controller/start")
         patience = {"stale_after": 20.0}
         joints = "sensor_msgs/msg/JointState"
         types = {"response_type": joints, "command_type": joints}
@@ -74,12 +71,10 @@ def test_a_continuous_funnel_is_driven_and_every_margin_is_that_of_the_core(
             process("nlsid_ros.tracking_controller", **WIRING, **patience, **types, **limits)
         )
         stack.enter_context(process("nlsid_ros.funnel_monitor", **WIRING, **patience, **watching))
-        spin_until(lambda: has_said("tracking_controller", "idle") and start.service_is_ready())
+        spin_until(lambda: has_said("tracking_controller", "idle"))
         spin_until(lambda: node.count_subscribers("/joints") >= 2)
         spin_until(lambda: node.count_subscribers("/effort") >= 2)
-        answer = start.call_async(Trigger.Request())
-        spin_until(answer.done)
-        assert answer.result().success
+        assert call(node, spin_until, "/tracking_controller/start").success
         first_ns, x, run = time.time_ns(), 0.1, []
         for k in range(-1, samples + 1):  # the run starts with the second state that is heard
             stamp_ns = first_ns + (k + 1) * PERIOD_NS

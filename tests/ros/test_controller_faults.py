@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 from bags.designs.documents import MODEL, load_model
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test
 from tests.ros.robot import PERIOD_NS, Robot
 
 pytestmark = ros_test
@@ -48,12 +48,7 @@ class Driven(Robot):
 
     def call(self, service: str) -> Trigger.Response:
         """The answer of a service of the controller."""
-        client = self.node.create_client(Trigger, f"/{NAME}/{service}")
-        self.spin_until(client.service_is_ready)
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        response: Trigger.Response = answer.result()
-        return response
+        return call(self.node, self.spin_until, f"/{NAME}/{service}")
 
     def watch(self) -> None:
         """Stand in for the monitor that is required."""
@@ -93,8 +88,7 @@ class Driven(Robot):
 
 
 @pytest.fixture
-def stack(monkeypatch: pytest.MonkeyPatch) -> Iterator[ExitStack]:
-    use_domain_of_this_run(monkeypatch)
+def stack() -> Iterator[ExitStack]:
     with ExitStack() as stack:
         yield stack
 

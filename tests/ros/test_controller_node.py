@@ -26,7 +26,7 @@ from bags.monitoring.announcement import Run
 from nlsid_core import files
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test
 
 pytestmark = ros_test
 
@@ -78,12 +78,7 @@ class Stage:
 
     def call(self, service: str) -> Trigger.Response:
         """The answer of a service of the controller."""
-        client = self.node.create_client(Trigger, f"/tracking_controller/{service}")
-        self.spin_until(client.service_is_ready)
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        response: Trigger.Response = answer.result()
-        return response
+        return call(self.node, self.spin_until, f"/tracking_controller/{service}")
 
     def track(self, above: float = 0.1) -> None:
         """Begin, and wait until the robot is well on its way."""
@@ -99,9 +94,8 @@ class Stage:
 
 
 @pytest.fixture
-def stage(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Callable[..., Stage]]:
+def stage(funnel: Path) -> Iterator[Callable[..., Stage]]:
     """Sets a stage with parameters of the controller."""
-    use_domain_of_this_run(monkeypatch)
     with ExitStack() as stack:
         yield partial(Stage, stack, funnel)
 

@@ -23,7 +23,7 @@ from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.progress import silent
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test, stop
 from tests.ros.robot import GOOD, MONITOR, Robot
 
 pytestmark = ros_test
@@ -32,9 +32,8 @@ NODES = ("funnel_monitor", "tracking_controller")
 
 
 @pytest.fixture
-def robot(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Robot]:
+def robot(funnel: Path) -> Iterator[Robot]:
     """A robot with a monitor and a controller that listen to its bundle."""
-    use_domain_of_this_run(monkeypatch)
     with ExitStack() as stack:
         node, spin_until = stack.enter_context(node_here("test_robot"))
         stack.enter_context(process(MONITOR, stale_after=5.0, allow_old_stamps=True))
@@ -47,12 +46,7 @@ def robot(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Robot]:
 
 def start(robot: Robot) -> Trigger.Response:
     """The controller's answer to ~/start."""
-    client = robot.node.create_client(Trigger, "/tracking_controller/start")
-    robot.spin_until(client.service_is_ready)
-    answer = client.call_async(Trigger.Request())
-    robot.spin_until(answer.done)
-    response: Trigger.Response = answer.result()
-    return response
+    return call(robot.node, robot.spin_until, "/tracking_controller/start")
 
 
 def with_policy(bundle: Bundle, change: Callable[[Json], Json]) -> Bundle:
@@ -132,10 +126,7 @@ def test_a_second_publisher_is_refused_and_the_run_goes_on_as_it_was(robot: Robo
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_only_the_expected_funnel_is_used(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path, name: str
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_only_the_expected_funnel_is_used(funnel: Path, name: str) -> None:
     own = files.digest(funnel.read_bytes())
     other = "0" * 64
     with (

@@ -24,7 +24,7 @@ from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests.identified_bags import ONE, TWO, write_config, write_coupled_bags, write_saturating_bags
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test, stop
 from tests.ros.robot import MONITOR, Robot
 
 pytestmark = ros_test
@@ -42,9 +42,8 @@ def made(name: str, bags: Path, folder: Path) -> Path:
     return folder
 
 
-def test_live_is_replay_for_every_class(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_is_replay_for_every_class(tmp_path: Path) -> None:
     """Every second command comes after its response."""
-    use_domain_of_this_run(monkeypatch)
     folders = {}
     for name in (*ONE, *TWO):
         (tmp_path / name).mkdir()

@@ -3,7 +3,7 @@
 import json
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from subprocess import Popen
@@ -23,7 +23,16 @@ from std_srvs.srv import Trigger
 
 from bags.samples import f1tenth
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import (
+    SpinUntil,
+    call,
+    node_here,
+    process,
+    refusal,
+    ros_test,
+    service,
+    stop,
+)
 
 pytestmark = ros_test
 
@@ -35,15 +44,10 @@ class Excited(NamedTuple):
     """A node that hears (sent: stamp in ns, command) the excitation that runs in a process."""
 
     node: Node
-    spin_until: Callable[[Callable[[], bool]], None]
+    spin_until: SpinUntil
     running: Popen[str]
     start: Client
     sent: list[tuple[int, float]]
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 @contextmanager
@@ -60,8 +64,7 @@ def heard(parameters: dict[str, object]) -> Iterator[Excited]:
         process(EXCITATION, **(LIMITS | parameters)) as running,
     ):
         node.create_subscription(TwistStamped, "/cmd_vel", hear, qos.STREAM)
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
+        start = service(node, spin_until, "/excitation/start")
         spin_until(lambda: node.count_publishers("/cmd_vel") == 1)
         yield Excited(node, spin_until, running, start, sent)
 
@@ -77,7 +80,7 @@ def excite(
 
     with heard(parameters) as (node, spin_until, running, start, sent):
         node.create_subscription(String, "/excitation/experiment", hear_experiment, qos.DOCUMENT)
-        halt = node.create_client(Trigger, "/excitation/stop")
+        halt = service(node, spin_until, "/excitation/stop")
         settled = time.monotonic() + 0.5
         spin_until(lambda: time.monotonic() > settled)
         assert not sent, "nothing moves before it is asked to"
@@ -208,14 +211,10 @@ def test_a_recorder_that_does_not_answer_is_said(tmp_path: Path) -> None:
         process(EXCITATION, **LIMITS, recorder="trajectory_recorder") as running,
     ):  # fmt: skip
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
         spin_until(lambda: "waiting for ~/start" in said)
 
         def started() -> bool:
-            asked = start.call_async(Trigger.Request())
-            spin_until(asked.done)
-            return bool(asked.result().success)
+            return bool(call(node, spin_until, "/excitation/start").success)
 
         spin_until(lambda: node.count_clients("/trajectory_recorder/start") == 1)
         recorder.send_signal(signal.SIGSTOP)
@@ -238,7 +237,4 @@ def test_a_recorded_command_is_replayed_within_the_limits() -> None:
     "missing", [{"lowest": 0.0, "highest": 0.0, "slew": 1.0}, {"highest": 1.0, "slew": 0.0}]
 )
 def test_without_limits_it_does_not_run(missing: dict[str, object]) -> None:
-    with process(EXCITATION, **missing) as node:
-        output = node.communicate(timeout=20)[0]
-    assert node.returncode == 1
-    assert "to what the robot may do" in output
+    assert "to what the robot may do" in refusal(EXCITATION, **missing)

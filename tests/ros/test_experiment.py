@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_metadata
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test, service, stop
 
 pytestmark = ros_test
 
@@ -22,11 +22,6 @@ COMMAND, RESPONSE = "/joint_commands:effort[0]", "/joint_states:position[0]"
 LIMITS: dict[str, object] = {"lowest": -0.3, "highest": 0.3, "slew": 5.0, "fade": 0.2}
 SIGNAL: dict[str, object] = {"period": 0.01, "duration": 2.0, "pause": 0.8, "highest_hz": 4.0}
 SIGNAL |= {"command": COMMAND, "command_type": "sensor_msgs/msg/JointState"}
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repeats(
@@ -52,15 +47,12 @@ def test_each_repeat_has_a_bag_of_its_own_and_identification_knows_them_as_repea
         process("nlsid_ros.excitation", **excitation) as exciting,
     ):
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        start = node.create_client(Trigger, "/excitation/start")
-        bag = node.create_client(Trigger, "/trajectory_recorder/start")
-        spin_until(lambda: start.service_is_ready() and bag.service_is_ready())
+        service(node, spin_until, "/trajectory_recorder/start")  # it is known
         spin_until(lambda: node.count_subscribers("/joint_states") == 1)
         spin_until(lambda: node.count_subscribers("/joint_commands") == 2)
         spin_until(lambda: "idle" in said)
-        answer = start.call_async(Trigger.Request())
-        spin_until(answer.done)
-        assert answer.result().success, answer.result().message
+        answer = call(node, spin_until, "/excitation/start")
+        assert answer.success, answer.message
         spin_until(lambda: "done" in said)
         for process_ in (exciting, recorder, plant):
             stop(process_)
@@ -97,12 +89,9 @@ def test_without_the_recorder_it_was_told_of_nothing_moves() -> None:
         node_here("test_operator") as (node, spin_until),
         process("nlsid_ros.excitation", **excitation) as exciting,
     ):
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
-        answer = start.call_async(Trigger.Request())
-        spin_until(answer.done)
-        assert not answer.result().success
-        assert "there is no recorder trajectory_recorder" in answer.result().message
+        answer = call(node, spin_until, "/excitation/start")
+        assert not answer.success
+        assert "there is no recorder trajectory_recorder" in answer.message
         stop(exciting)
 
 
@@ -121,11 +110,9 @@ def test_a_recorder_that_is_busy_stops_the_experiment_before_it_moves(tmp_path: 
         process("nlsid_ros.excitation", **excitation) as exciting,
     ):
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        start = node.create_client(Trigger, "/excitation/start")
-        bag = node.create_client(Trigger, "/trajectory_recorder/start")
-        spin_until(lambda: start.service_is_ready() and bag.service_is_ready())
+        service(node, spin_until, "/trajectory_recorder/start")  # it is known
         spin_until(lambda: "idle" in said)
-        start.call_async(Trigger.Request())
+        service(node, spin_until, "/excitation/start").call_async(Trigger.Request())
         spin_until(lambda: any("no bag from the recorder: recording" in text for text in said))
         for process_ in (exciting, recorder):
             stop(process_)

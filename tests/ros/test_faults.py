@@ -1,10 +1,12 @@
 """What goes wrong on a robot, done to the monitor and the recorder over DDS."""
 
+import itertools
 import math
 import os
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -21,23 +23,30 @@ from std_msgs.msg import String
 
 from benchmarks.monitor import COMMAND, STATE, bundle_of, timing_funnel
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros import domains
+from tests.ros.domains import own_domain
+from tests.ros.processes import node_here, process, ros_test, stop
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
 
 
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> Iterator[None]:
+    """One for all these tests: they share a robot."""
+    with own_domain():
+        yield
+
+
 @pytest.fixture(scope="module")
 def robot(funnel: Path) -> Iterator[Robot]:
     """One robot with one monitor, which each test restarts."""
-    with pytest.MonkeyPatch.context() as patch:
-        use_domain_of_this_run(patch)
-        with (
-            node_here("test_robot") as (node, spin_until),
-            process(MONITOR, stale_after=0.5, allow_old_stamps=True) as monitor,
-        ):
-            yield Robot(node, spin_until, funnel.parent)
-            stop(monitor)
+    with (
+        node_here("test_robot") as (node, spin_until),
+        process(MONITOR, stale_after=0.5, allow_old_stamps=True) as monitor,
+    ):
+        yield Robot(node, spin_until, funnel.parent)
+        stop(monitor)
 
 
 @pytest.mark.parametrize(
@@ -170,25 +179,6 @@ def test_a_robot_that_is_silent_after_simulated_time_went_back_is_not_inside(
         stop(monitor)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"stale_after": -0.1}, "parameter stale_after (s without a response, or"),
-        ({"stale_after": "soon"}, "parameter stale_after"),
-        ({"nominal": "profil"}, "profil"),
-    ],
-)
-def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
-    robot: Robot, parameters: dict[str, object], message: str
-) -> None:
-    with process(MONITOR, **parameters, __node="misconfigured") as node:
-        output = node.communicate(timeout=20)[0]
-    assert robot.node is not None
-    assert node.returncode == 1
-    assert message in output
-    assert "Traceback" not in output
-
-
 def test_a_recorder_that_waits_for_simulated_time_says_so(robot: Robot, tmp_path: Path) -> None:
     settings: dict[str, object] = {"topics": "[/odom]", "bag": tmp_path / "bag"}
     with process("nlsid_ros.trajectory_recorder", **settings, use_sim_time=True) as recorder:
@@ -231,9 +221,8 @@ def test_a_recorder_whose_bag_is_taken_away_says_so(robot: Robot, tmp_path: Path
 
 @pytest.mark.parametrize("role", ["response", "excitation"])
 def test_an_array_of_another_length_is_named_and_a_run_goes_on_if_it_is_no_command(
-    monkeypatch: pytest.MonkeyPatch, role: str
+    role: str,
 ) -> None:
-    use_domain_of_this_run(monkeypatch)
     said: list[str] = []
 
     def hear(message: DiagnosticArray) -> None:
@@ -241,6 +230,7 @@ def test_an_array_of_another_length_is_named_and_a_run_goes_on_if_it_is_no_comma
 
     design = timing_funnel(1000)
     with (
+        own_domain(),
         node_here("test_joints") as (node, spin_until),
         process(MONITOR, source="/benchmark", stale_after=5.0, allow_old_stamps=True) as monitor,
     ):
@@ -280,12 +270,15 @@ def test_an_array_of_another_length_is_named_and_a_run_goes_on_if_it_is_no_comma
 def test_discovery_is_kept_to_this_machine_and_to_one_domain_per_test(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    domains = set()
-    for _ in range(3):
-        use_domain_of_this_run(monkeypatch)
-        assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
-        domains.add(os.environ["ROS_DOMAIN_ID"])
-        with node_here("test_elsewhere") as (node, spin_until):
+    """Another process that begins with the same number gets another domain too."""
+    names = []
+    with ExitStack() as stack:
+        for _ in range(3):
+            monkeypatch.setattr(domains, "_tried", itertools.count(7))
+            stack.enter_context(own_domain())
+            assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+            names.append(os.environ["ROS_DOMAIN_ID"])
+            node, spin_until = stack.enter_context(node_here("test_elsewhere"))
             spin_until(lambda: True)
             assert node.get_node_names() == ["test_elsewhere"]
-    assert len(domains) == 3
+    assert len(set(names)) == 3

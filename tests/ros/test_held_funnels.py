@@ -14,13 +14,12 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
 from examples.cart_pole import designed, truth
 from nlsid_core.arrays import FloatArray
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test
 
 pytestmark = ros_test
 HOLD = 0.002  # s
@@ -51,10 +50,7 @@ def moved(x: FloatArray, u: float) -> FloatArray:
     return x
 
 
-def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(folder: Path) -> None:
     commands: dict[int, float] = {}
     margins: dict[int, float] = {}
     said: dict[str, list[str]] = {}
@@ -80,7 +76,6 @@ def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(
         node.create_subscription(JointState, "/force", hear_command, qos.STREAM)
         node.create_subscription(JointState, "/funnel_monitor/margin", hear_margin, qos.STREAM)
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        start = node.create_client(Trigger, "/tracking_controller/start")
         patience = {"stale_after": 60.0, "period": HOLD}
         types = {"response_type": JOINTS, "command_type": JOINTS}
         limits = {"lowest": -40.0, "highest": 40.0, "stop_rate": 1000.0}
@@ -92,13 +87,11 @@ def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(
         stack.enter_context(
             process("nlsid_ros.tracking_controller", **WIRING, **patience, **types, **limits)
         )
-        spin_until(lambda: has_said("tracking_controller", "idle") and start.service_is_ready())
+        spin_until(lambda: has_said("tracking_controller", "idle"))
         stack.enter_context(process("nlsid_ros.funnel_monitor", **WIRING, **patience, **watching))
         spin_until(lambda: node.count_subscribers("/joints") >= 2)
         spin_until(lambda: node.count_subscribers("/force") >= 2)
-        answer = start.call_async(Trigger.Request())
-        spin_until(answer.done)
-        assert answer.result().success
+        assert call(node, spin_until, "/tracking_controller/start").success
         first_ns, x, k = time.time_ns(), np.array([0.01, 0.01, 0.0, 0.0]), 0
         while not has_said("tracking_controller", "idle; stopped"):
             stamp_ns = first_ns + k * PERIOD_NS
@@ -121,10 +114,7 @@ def test_the_cart_pole_swings_up_inside_its_funnel_over_dds(
     assert assuming == {f"each input is at most {HOLD:g} s old, and w stays in its box"}
 
 
-def test_samples_that_come_too_slowly_for_the_proof_are_refused_by_name(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_samples_that_come_too_slowly_for_the_proof_are_refused_by_name(folder: Path) -> None:
     said: list[str] = []
 
     def hear(message: DiagnosticArray) -> None:

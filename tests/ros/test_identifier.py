@@ -12,7 +12,6 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.chain.shipped import config_file
 from bags.designs import documents
@@ -22,17 +21,12 @@ from nlsid_core.models import DifferenceEquation
 from nlsid_core.proofs import check
 from nlsid_ros import qos
 from tests.bag_messages import START_NS, speed_bag
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test, stop
 
 pytestmark = ros_test
 
 IDENTIFIER = "nlsid_ros.model_identifier"
 AT_ONCE = 0.5  # s: a service's answer on a busy machine, while a worker takes seconds
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 def test_the_last_recording_is_identified_while_the_node_answers_at_once(tmp_path: Path) -> None:
@@ -70,20 +64,15 @@ def test_the_last_recording_is_identified_while_the_node_answers_at_once(tmp_pat
     ):
         node.create_subscription(String, "/model_identifier/model", hear_model, qos.DOCUMENT)
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        identify = node.create_client(Trigger, "/model_identifier/identify")
-        spin_until(identify.service_is_ready)
         spin_until(lambda: bool(said))
-        answer = identify.call_async(Trigger.Request())
-        spin_until(answer.done)
-        assert answer.result().success
+        assert call(node, spin_until, "/model_identifier/identify").success
         slowest, busy = 0.0, 0
         while not models:
             asked = time.monotonic()
-            again = identify.call_async(Trigger.Request())
-            spin_until(again.done)
+            again = call(node, spin_until, "/model_identifier/identify")
             slowest = max(slowest, time.monotonic() - asked)
-            busy += not again.result().success
-            if again.result().success:
+            busy += not again.success
+            if again.success:
                 break
         spin_until(lambda: bool(models))
         stop(identifier)
@@ -115,9 +104,7 @@ def test_a_folder_without_recordings_is_named(tmp_path: Path) -> None:
         process(IDENTIFIER, **settings) as identifier,
     ):
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, qos.EVENTS)
-        identify = node.create_client(Trigger, "/model_identifier/identify")
-        spin_until(identify.service_is_ready)
-        identify.call_async(Trigger.Request())
+        call(node, spin_until, "/model_identifier/identify")
         spin_until(lambda: any("empty is not a bag and holds none" in text for text in said))
         stop(identifier)
     assert not (tmp_path / "out").exists()
@@ -134,10 +121,7 @@ def test_ended_by_a_signal_it_takes_its_worker_with_it(tmp_path: Path, how: sign
         node_here("test_operator") as (node, spin_until),
         process(IDENTIFIER, **settings) as identifier,
     ):
-        identify = node.create_client(Trigger, "/model_identifier/identify")
-        spin_until(identify.service_is_ready)
-        answer = identify.call_async(Trigger.Request())
-        spin_until(answer.done)
+        call(node, spin_until, "/model_identifier/identify")
         children = Path(f"/proc/{identifier.pid}/task/{identifier.pid}/children").read_text()
         assert children.split()
         stop(identifier, how)

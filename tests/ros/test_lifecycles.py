@@ -1,7 +1,6 @@
 """Recorder, excitation and identifier: their lifecycles, and parameters that are refused."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterType
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.node import Node
-from rclpy.task import Future
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
@@ -22,12 +20,15 @@ from bags.recordings.bag import Bag
 from bags.samples import f1tenth
 from nlsid_ros import qos
 from tests.ros.processes import (
+    SpinUntil,
+    call,
     node_here,
     process,
+    refusal,
     ros_test,
+    service,
     set_parameter,
     stop,
-    use_domain_of_this_run,
 )
 
 pytestmark = ros_test
@@ -46,43 +47,6 @@ CYCLE = (
 OWN = {"use_sim_time", "start_type_description_service"}  # rclpy's
 
 
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
-
-
-def call(
-    node: Node, spin_until: Callable[[Callable[[], bool]], None], kind: type, name: str, ask: object
-) -> object:
-    """The answer of a lifecycle node's service, by one client as long as `node` lives.
-
-    A node drops an answer to a client that it does not know 0.1 s later (rmw_fastrtps issue 842),
-    and on a busy machine it may know it later than the client knows the service. So a new client
-    waits until a question that may be lost, asked by a client newer than itself, is answered: a
-    node learns of both in order.
-    """
-    known = {each.service_name: each for each in node.clients}
-    if name not in known:
-        known[name] = node.create_client(kind, name)
-        spin_until(known[name].service_is_ready)
-        probe = node.create_client(GetState, f"{name.rpartition('/')[0]}/get_state")
-        spin_until(probe.service_is_ready)
-        answers: list[Future] = []
-
-        def answered() -> bool:
-            if not answers or time.monotonic() > asked_at + len(answers):
-                answers.append(probe.call_async(GetState.Request()))
-            return any(each.done() for each in answers)
-
-        asked_at = time.monotonic()
-        spin_until(answered)
-        node.destroy_client(probe)
-    answer = known[name].call_async(ask)
-    spin_until(answer.done)
-    result: object = answer.result()
-    return result
-
-
 @pytest.mark.parametrize("name", NODES)
 def test_a_node_goes_through_its_lifecycle_twice(name: str, tmp_path: Path) -> None:
     settings = NODES[name] | {"autostart": False}
@@ -95,11 +59,7 @@ def test_a_node_goes_through_its_lifecycle_twice(name: str, tmp_path: Path) -> N
         process(f"nlsid_ros.{name}", **settings) as running,
     ):
         for transition, state in CYCLE * 2:
-            request = ChangeState.Request(transition=Transition(id=transition))
-            done = call(node, spin_until, ChangeState, f"/{name}/change_state", request)
-            assert done.success  # type: ignore[attr-defined]
-            now = call(node, spin_until, GetState, f"/{name}/get_state", GetState.Request())
-            assert now.current_state.id == state  # type: ignore[attr-defined]
+            assert asked(name, transition, node, spin_until) == (True, state)
         stop(running)
     if name == "trajectory_recorder":
         for bag in (tmp_path / "run", tmp_path / "run_2"):
@@ -115,14 +75,12 @@ ALL: dict[str, dict[str, object]] = {
 ALL["plant"] = {"kind": "pendulum"}
 
 
-def asked(
-    name: str, transition: int, node: Node, spin_until: Callable[[Callable[[], bool]], None]
-) -> tuple[bool, int]:
+def asked(name: str, transition: int, node: Node, spin_until: SpinUntil) -> tuple[bool, int]:
     """Whether the node says that the transition was made, and its state after it."""
-    request = ChangeState.Request(transition=Transition(id=transition))
-    done = call(node, spin_until, ChangeState, f"/{name}/change_state", request)
-    now = call(node, spin_until, GetState, f"/{name}/get_state", GetState.Request())
-    return done.success, now.current_state.id  # type: ignore[attr-defined]
+    wanted = Transition(id=transition)
+    done = call(node, spin_until, f"/{name}/change_state", ChangeState, transition=wanted)
+    now = call(node, spin_until, f"/{name}/get_state", GetState)
+    return done.success, now.current_state.id
 
 
 def settings_of(name: str, folder: Path) -> dict[str, object]:
@@ -176,10 +134,8 @@ def test_what_is_still_on_its_way_when_a_node_is_deactivated_does_not_end_it() -
         process(f"nlsid_ros.{name}") as running,
     ):
         design = node.create_publisher(String, "/funnel_publisher/design", qos.DOCUMENT)
-        restart = node.create_client(Trigger, f"/{name}/restart")
-        manager = node.create_client(ChangeState, f"/{name}/change_state")
-        spin_until(manager.service_is_ready)
-        spin_until(restart.service_is_ready)
+        restart = service(node, spin_until, f"/{name}/restart")
+        manager = service(node, spin_until, f"/{name}/change_state", ChangeState)
         for _ in range(10):
             for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
                 request = ChangeState.Request(transition=Transition(id=transition))
@@ -205,36 +161,30 @@ def test_every_parameter_is_described_bounded_and_cannot_be_changed_while_it_run
         process(f"nlsid_ros.{name}", **settings, __ns="/robot") as running,
     ):
         full = f"/robot/{name}"
-        configure = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-        done = call(node, spin_until, ChangeState, f"{full}/change_state", configure)
-        assert done.success  # type: ignore[attr-defined]
-        listed = call(
-            node, spin_until, ListParameters, f"{full}/list_parameters", ListParameters.Request()
-        )
+        configure = Transition.TRANSITION_CONFIGURE
+        assert asked(f"robot/{name}", configure, node, spin_until)[0]
+        listed = call(node, spin_until, f"{full}/list_parameters", ListParameters)
         names = [
             each
-            for each in listed.result.names  # type: ignore[attr-defined]
+            for each in listed.result.names
             if each not in OWN and not each.startswith("qos_overrides")
         ]
         assert len(names) >= 4
-        ask = DescribeParameters.Request(names=names)
-        described = call(node, spin_until, DescribeParameters, f"{full}/describe_parameters", ask)
-        now = call(
-            node,
-            spin_until,
-            GetParameters,
-            f"{full}/get_parameters",
-            GetParameters.Request(names=names),
+        described, now = (
+            call(node, spin_until, f"{full}/{what}_parameters", kind, names=names)
+            for what, kind in (("describe", DescribeParameters), ("get", GetParameters))
         )
-        for each, value in zip(described.descriptors, now.values, strict=True):  # type: ignore[attr-defined]
+        for each, value in zip(described.descriptors, now.values, strict=True):
             assert each.description, each.name
             if each.type == ParameterType.PARAMETER_DOUBLE:
                 assert len(each.floating_point_range) == 1, each.name
             if each.type == ParameterType.PARAMETER_INTEGER:
                 assert len(each.integer_range) == 1, each.name
-            change = SetParameters.Request(parameters=[Parameter(name=each.name, value=value)])
-            answer = call(node, spin_until, SetParameters, f"{full}/set_parameters", change)
-            [result] = answer.results  # type: ignore[attr-defined]
+            change = [Parameter(name=each.name, value=value)]
+            answer = call(
+                node, spin_until, f"{full}/set_parameters", SetParameters, parameters=change
+            )
+            [result] = answer.results
             assert not result.successful
             assert result.reason == f"{each.name}: read when the node is configured"
         stop(running)
@@ -281,8 +231,4 @@ def test_parameters_are_read_when_the_node_is_configured() -> None:
 def test_a_parameter_that_makes_no_sense_is_refused_at_the_start(
     name: str, wrong: dict[str, object], message: str
 ) -> None:
-    with process(f"nlsid_ros.{name}", **(NODES[name] | wrong)) as node:
-        output = node.communicate(timeout=20)[0]
-    assert node.returncode == 1
-    assert message in output
-    assert "Traceback" not in output
+    assert message in refusal(f"nlsid_ros.{name}", **(NODES[name] | wrong))

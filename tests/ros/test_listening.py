@@ -1,6 +1,5 @@
 """`nlsid init --live`: a configuration from a robot that is running, over DDS."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,44 +8,29 @@ import pytest
 
 from bags.chain.config import load_config
 from bags.samples import dart
-from tests.ros.domains import fresh_domain
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
 
 pytestmark = pytest.mark.ros
 
 
-@pytest.fixture
-def environment() -> dict[str, str]:
-    """Discovery kept to this machine and to this test."""
-    return os.environ | {
-        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": fresh_domain(),
-    }
-
-
-def init_live(
-    config: Path, environment: dict[str, str], *options: str
-) -> subprocess.CompletedProcess[str]:
+def init_live(config: Path, *options: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "bags.commands.cli", "init", "--live", "--out", str(config)]
     return subprocess.run(
-        [*command, "--yes", *options], capture_output=True, text=True, env=environment,
+        [*command, "--yes", *options], capture_output=True, text=True,
         timeout=200, check=False,
     )  # fmt: skip
 
 
-def test_a_running_robot_is_looked_at_for_a_first_configuration(
-    tmp_path: Path, environment: dict[str, str]
-) -> None:
+def test_a_running_robot_is_looked_at_for_a_first_configuration(tmp_path: Path) -> None:
     """A real car's drive, played in real time to whoever listens."""
     drive = next(bag for bag in dart() if bag.name == "rubbery_20240916_151759")
     player = [sys.executable, "-m", "nlsid_ros.bag_player", "--ros-args", "-p", f"bag:={drive}"]
     topics = ["-p", "topics:=['/command', '/motion']", "-p", "wait_for:=1"]
     config = tmp_path / "robot.yaml"
-    with subprocess.Popen([*player, *topics], env=environment) as robot:
+    with subprocess.Popen([*player, *topics]) as robot:
         try:
-            done = init_live(config, environment, "--seconds", "12")
+            done = init_live(config, "--seconds", "12")
         finally:
             robot.kill()
     assert done.returncode == 0, done.stdout + done.stderr
@@ -59,9 +43,9 @@ def test_a_running_robot_is_looked_at_for_a_first_configuration(
     assert "nlsid identify TRIALS" in done.stdout
 
 
-def test_where_nothing_runs_this_is_said(tmp_path: Path, environment: dict[str, str]) -> None:
+def test_where_nothing_runs_this_is_said(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
-    done = init_live(config, environment, "--seconds", "1")
+    done = init_live(config, "--seconds", "1")
     assert done.returncode == 2
     assert "nothing was heard" in done.stderr or "no number varies" in done.stderr
     assert not config.exists()

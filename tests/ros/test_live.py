@@ -1,7 +1,6 @@
 """The live chain over real DDS, every node a process of its own."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,27 +16,16 @@ from bags.setup.candidates import look
 from bags.setup.proposal import propose
 from bags.setup.written import yaml_text
 from nlsid_core.progress import silent
-from tests.ros.domains import fresh_domain
 
 pytest.importorskip("rclpy", reason="needs rclpy (extra `ros`)")
+
+from tests.ros.processes import STARTED
 
 pytestmark = pytest.mark.ros
 
 
-@pytest.fixture
-def environment() -> dict[str, str]:
-    """Discovery kept to this machine and to this test."""
-    return os.environ | {
-        "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_DOMAIN_ID": fresh_domain(),
-    }
-
-
-def test_live_nodes_agree_with_the_offline_replay(
-    funnel: Path, tmp_path: Path, environment: dict[str, str]
-) -> None:
-    seen = played_live(funnel, tmp_path, environment)
+def test_live_nodes_agree_with_the_offline_replay(funnel: Path, tmp_path: Path) -> None:
+    seen = played_live(funnel, tmp_path)
     assert seen["sent"] == seen["recorded"] == 241
     assert seen["margins"] == seen["margins_expected"] == 117
     assert seen["margin_difference"] <= 1e-9
@@ -46,13 +34,13 @@ def test_live_nodes_agree_with_the_offline_replay(
     assert seen["expected"] in seen["alarm"]
 
 
-def played_live(funnel: Path, folder: Path, environment: dict[str, str]) -> dict[str, Any]:
+def played_live(funnel: Path, folder: Path) -> dict[str, Any]:
     """What the live demonstration saw of trial 5; it says itself whether all is as it should be."""
     trial = next(bag for bag in f1tenth() if bag.name == "trial_05")
     command = [sys.executable, "-m", "nlsid_ros.demo.live", "--json"]
     options = ["--funnel", str(funnel), "--bag", str(trial), "--out", str(folder / "live")]
     done = subprocess.run(
-        command + options, capture_output=True, text=True, env=environment, timeout=200, check=False
+        command + options, capture_output=True, text=True, timeout=200, check=False
     )
     assert done.stdout, done.stderr
     seen: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
@@ -62,7 +50,7 @@ def played_live(funnel: Path, folder: Path, environment: dict[str, str]) -> dict
 
 
 def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_replay(
-    tmp_path: Path, environment: dict[str, str]
+    tmp_path: Path,
 ) -> None:
     """The F1TENTH car: speed and steering commands to speed and yaw rate, over DDS."""
     bags, config, out = f1tenth(), tmp_path / "robot.yaml", tmp_path / "two_by_two"
@@ -77,7 +65,7 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
     settings = load_config(config)
     identify_bags(bags, settings, out, progress=silent)
     design_funnel_files(out / documents.MODEL, settings, out)
-    seen = played_live(out / documents.FUNNEL, tmp_path, environment)
+    seen = played_live(out / documents.FUNNEL, tmp_path)
     assert seen["sent"] == seen["recorded"] == 361
     assert seen["margins"] == seen["margins_expected"] > 100
     assert seen["margin_difference"] == 0.0
@@ -86,7 +74,7 @@ def test_two_commands_and_two_responses_on_three_topics_are_judged_live_as_in_re
 
 @pytest.mark.parametrize("damage", ["forged", "no proof", "no funnel"])
 def test_the_publisher_refuses_what_is_not_proved(
-    funnel: Path, tmp_path: Path, environment: dict[str, str], damage: str
+    funnel: Path, tmp_path: Path, damage: str
 ) -> None:
     for name in (documents.MODEL, documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
         (tmp_path / name).write_bytes((funnel.parent / name).read_bytes())
@@ -102,7 +90,7 @@ def test_the_publisher_refuses_what_is_not_proved(
     parameter = f"funnel:={tmp_path / documents.FUNNEL}"
     done = subprocess.run(
         [sys.executable, "-m", "nlsid_ros.funnel_publisher", "--ros-args", "-p", parameter],
-        capture_output=True, text=True, env=environment, timeout=60, check=False,
+        capture_output=True, text=True, timeout=STARTED, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert "not published, not proved" in done.stderr + done.stdout

@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test
 from tests.ros.robot import GOOD, MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
@@ -23,9 +23,8 @@ LATE = 1.0  # s that the machine may be busy
 
 
 @pytest.fixture
-def watched(monkeypatch: pytest.MonkeyPatch, funnel: Path) -> Iterator[Callable[..., Robot]]:
+def watched(funnel: Path) -> Iterator[Callable[..., Robot]]:
     """A robot and its monitor, which takes parameters."""
-    use_domain_of_this_run(monkeypatch)
     with ExitStack() as stack:
         node, spin_until = stack.enter_context(node_here("test_robot"))
 

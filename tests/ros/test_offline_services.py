@@ -11,7 +11,6 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
@@ -25,16 +24,11 @@ from nlsid_core import files
 from nlsid_core.models import DifferenceEquation
 from nlsid_core.progress import silent
 from nlsid_ros import qos
-from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import ROOT, call, node_here, process, ros_test, service, stop
 
 pytestmark = ros_test
 
 CONFIG = config_file("f1tenth.yaml")
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 def test_a_model_is_identified_on_request_published_and_can_be_called_off(tmp_path: Path) -> None:
@@ -54,24 +48,17 @@ def test_a_model_is_identified_on_request_published_and_can_be_called_off(tmp_pa
     ):
         node.create_subscription(String, "/model_identifier/model", hear_model, qos.DOCUMENT)
         node.create_subscription(DiagnosticArray, "/diagnostics", hear_status, qos.EVENTS)
-        names = ("identify", "cancel")
-        identify, cancel = (node.create_client(Trigger, f"/model_identifier/{n}") for n in names)
-        spin_until(lambda: identify.service_is_ready() and cancel.service_is_ready())
+        identify, cancel = "/model_identifier/identify", "/model_identifier/cancel"
+        service(node, spin_until, cancel)  # known before it is needed
         spin_until(lambda: "idle" in said)
 
-        first = identify.call_async(Trigger.Request())
-        spin_until(first.done)
-        again = identify.call_async(Trigger.Request())
-        spin_until(again.done)
-        called_off = cancel.call_async(Trigger.Request())
-        spin_until(called_off.done)
-        assert first.result().success
-        assert not again.result().success, "one at a time"
-        assert called_off.result().success
+        assert call(node, spin_until, identify).success
+        assert not call(node, spin_until, identify).success, "one at a time"
+        assert call(node, spin_until, cancel).success
         spin_until(lambda: "cancelled" in said)
         assert not models
 
-        identify.call_async(Trigger.Request())
+        call(node, spin_until, identify)
         spin_until(lambda: bool(models))
         spin_until(lambda: any("PROVED" in text for text in said))
         stop(identifier)

@@ -8,14 +8,13 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from geometry_msgs.msg import TwistStamped
-from std_srvs.srv import Trigger
 
 from bags.signals.signal import SignalPath
 from bags.signals.vector import SignalVector
 from nlsid_core.errors import BagError
 from nlsid_ros import qos
 from nlsid_ros.messages import SignalMessage
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import call, node_here, process, ros_test
 
 pytestmark = ros_test
 
@@ -59,11 +58,8 @@ def test_a_message_that_is_all_signal_has_no_others_to_refuse() -> None:
     assert whole.make(0, [1, 2, 3, 4, 5, 6]).twist.angular.z == 6.0
 
 
-def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves() -> None:
     """Steps of speed while another node steers; when that one stops, the robot goes to rest."""
-    use_domain_of_this_run(monkeypatch)
     sent: list[TwistStamped] = []
     with (
         node_here("test_robot") as (node, spin_until),
@@ -71,22 +67,15 @@ def test_what_is_not_the_signal_is_passed_through_from_a_topic_or_nothing_moves(
     ):
         node.create_subscription(TwistStamped, "/cmd_vel", sent.append, qos.STREAM)
         steering = node.create_publisher(TwistStamped, "/teleop", qos.STREAM)
-        start = node.create_client(Trigger, "/excitation/start")
-        spin_until(start.service_is_ready)
         spin_until(lambda: node.count_subscribers("/teleop") == 1)
-        refused = start.call_async(Trigger.Request())
-        spin_until(refused.done)
-        assert refused.result().message == (
-            "nothing on /teleop for 1 s, which has the other fields"
-        )
+        refused = call(node, spin_until, "/excitation/start")
+        assert refused.message == "nothing on /teleop for 1 s, which has the other fields"
         message = TwistStamped()
         message.twist.linear.x, message.twist.angular.z = 9.0, 0.7
         timer = node.create_timer(0.1, lambda: steering.publish(message))
         settled = time.monotonic() + 0.5
         spin_until(lambda: time.monotonic() > settled)
-        asked = start.call_async(Trigger.Request())
-        spin_until(asked.done)
-        assert asked.result().success
+        assert call(node, spin_until, "/excitation/start").success
         spin_until(lambda: len(sent) > 50)
         timer.cancel()
         quiet = [0, time.monotonic()]

@@ -14,22 +14,16 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 from builtin_interfaces.msg import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 
 from nlsid_core.arrays import FloatArray
 from nlsid_ros import qos
-from tests.ros.processes import ROOT, node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import ROOT, STARTED, call, node_here, process, refusal, ros_test, stop
 
 pytestmark = ros_test
 MUJOCO = pytest.mark.skipif(
     subprocess.run([sys.executable, "-c", "import mujoco"], check=False).returncode != 0,
     reason="needs the extra `sim`",
 )
-
-
-@pytest.fixture(autouse=True)
-def _domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    use_domain_of_this_run(monkeypatch)
 
 
 class Ear:
@@ -60,7 +54,6 @@ def heard(
             JointState, "/joint_states", lambda m: ear.hear(m, clock.now().nanoseconds), qos.STREAM
         )
         commands = node.create_publisher(JointState, "/joint_commands", qos.STREAM)
-        pushing = node.create_client(Trigger, "/plant/push")
         stack.enter_context(process("nlsid_ros.plant", **parameters))
         spin_until(lambda: len(ear.t) > 10 and commands.get_subscription_count() == 1)
         if torque is not None:
@@ -68,8 +61,7 @@ def heard(
             message.header.stamp = clock.now().to_msg()
             commands.publish(message)
         if pushed:
-            spin_until(pushing.service_is_ready)
-            spin_until(pushing.call_async(Trigger.Request()).done)
+            call(node, spin_until, "/plant/push")
         before = len(ear.t)
         spin_until(lambda: len(ear.t) >= before + samples)
     return ear
@@ -154,10 +146,7 @@ def test_a_push_is_seen_and_only_where_it_acts() -> None:
     ],
 )
 def test_a_plant_that_cannot_be_made_says_why(parameters: dict[str, object], said: str) -> None:
-    with process("nlsid_ros.plant", **parameters) as running:
-        output = running.communicate(timeout=30)[0]
-    assert running.returncode == 1
-    assert said in output
+    assert said in refusal("nlsid_ros.plant", **parameters)
 
 
 def test_without_mujoco_its_robots_are_an_error_that_names_the_extra(tmp_path: Path) -> None:
@@ -170,7 +159,7 @@ def test_without_mujoco_its_robots_are_an_error_that_names_the_extra(tmp_path: P
     script = tmp_path / "without_mujoco.py"
     script.write_text(f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{hidden}")
     done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=STARTED, check=False
     )
     assert done.returncode == 1
     assert "pip install 'nlsid[sim]'" in done.stderr

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,27 +22,25 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import standard_definition
 from bags.recordings.message_types import decode
 from nlsid_core.errors import BagError
 from nlsid_ros import qos
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import SpinUntil, call, node_here, process, ros_test, stop
 
 pytestmark = ros_test
 
 RECORDER = "nlsid_ros.trajectory_recorder"
 GOALS = "nav_msgs/msg/Goals"  # installed, but younger than the definitions that rosbags ships
 SHARE = Path(sys.prefix) / "share"
-Spin = Callable[[Callable[[], bool]], None]
 
 
 class Robot:
     """Publishes stamped joint positions, hears diagnostics, calls the recorder's services."""
 
-    def __init__(self, node: Node, spin_until: Spin) -> None:
+    def __init__(self, node: Node, spin_until: SpinUntil) -> None:
         self.node, self.spin_until = node, spin_until
         self.sent: list[bytes] = []
         self.joints = node.create_publisher(JointState, "/joints", qos.STREAM)
@@ -75,17 +73,12 @@ class Robot:
             time.sleep(every)
 
     def ask(self, what: str) -> tuple[bool, str]:
-        client = self.node.create_client(Trigger, f"/trajectory_recorder/{what}")
-        self.spin_until(client.service_is_ready)
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        self.node.destroy_client(client)
-        return answer.result().success, answer.result().message
+        answer = call(self.node, self.spin_until, f"/trajectory_recorder/{what}")
+        return answer.success, answer.message
 
 
 @pytest.fixture
-def robot(monkeypatch: pytest.MonkeyPatch) -> Iterator[Robot]:
-    use_domain_of_this_run(monkeypatch)
+def robot() -> Iterator[Robot]:
     with node_here("test_robot") as (node, spin_until):
         yield Robot(node, spin_until)
 

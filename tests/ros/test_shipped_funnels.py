@@ -26,7 +26,7 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test
 
 pytestmark = ros_test
 STEPS = 4  # of Runge-Kutta in a sample
@@ -79,10 +79,7 @@ def moved(shipped: Shipped, x: FloatArray, u: FloatArray, seconds: float) -> Flo
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_shipped_funnel_is_driven_to_its_goal_over_dds(
-    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_a_shipped_funnel_is_driven_to_its_goal_over_dds(name: str, tmp_path: Path) -> None:
     shipped = SHIPPED[name]
     found = shipped.designed()
     found.save(tmp_path)

@@ -28,7 +28,7 @@ from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
 from tests import implicit_models
 from tests.core.kernel.tube_claims import MODELS, dataset
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test, stop
 from tests.ros.robot import MONITOR, PERIOD_NS, Robot
 
 pytestmark = ros_test
@@ -46,8 +46,7 @@ def tube(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def robot(monkeypatch: pytest.MonkeyPatch, tube: Path) -> Iterator[Robot]:
-    use_domain_of_this_run(monkeypatch)
+def robot(tube: Path) -> Iterator[Robot]:
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, stale_after=5.0, allow_old_stamps=True) as monitor,
@@ -85,10 +84,7 @@ def test_an_unknown_command_ends_the_run_and_a_new_one_begins_by_itself(robot: R
     assert math.isnan(margins[stamp_ns(bad + 1)]), "a new run takes samples to begin"
 
 
-def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(
-    monkeypatch: pytest.MonkeyPatch, tube: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(tube: Path) -> None:
     ahead_ns, forecasts = 10 * PERIOD_NS, dict[int, dict[str, float]]()
 
     def hear(message: JointState) -> None:
@@ -114,10 +110,7 @@ def test_forecasts_are_published_for_later_stamps_and_hold_what_then_comes(
         assert numbers["low"] < 0.0 < numbers["high"], "the car stands still, as it is told"
 
 
-def test_of_a_robot_in_motion_nothing_is_said_until_the_start_has_faded(
-    monkeypatch: pytest.MonkeyPatch, tube: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_of_a_robot_in_motion_nothing_is_said_until_the_start_has_faded(tube: Path) -> None:
     given = {"stale_after": 5.0, "allow_old_stamps": True, "nominal": "motion"}
     with (
         node_here("test_robot") as (node, spin_until),
@@ -138,9 +131,7 @@ def test_of_a_robot_in_motion_nothing_is_said_until_the_start_has_faded(
 
 
 @contextmanager
-def sprung(
-    monkeypatch: pytest.MonkeyPatch, folder: Path
-) -> Iterator[tuple[Robot, Callable[[FloatArray, FloatArray], FloatArray]]]:
+def sprung(folder: Path) -> Iterator[tuple[Robot, Callable[[FloatArray, FloatArray], FloatArray]]]:
     """A robot on a cubic spring, watched by a tube that is proved for commands up to 1.5 N.
 
     The second sends outputs (N,) and commands (N,) sample by sample and returns the margins (N,).
@@ -171,7 +162,6 @@ def sprung(
             spin_until(lambda stamp=stamp: stamp in margins)  # type: ignore[misc]
         return np.array([margins[stamp] for stamp in stamps])
 
-    use_domain_of_this_run(monkeypatch)
     with (
         node_here("test_robot") as (node, spin_until),
         process(MONITOR, stale_after=5.0, allow_old_stamps=True) as monitor,
@@ -183,14 +173,12 @@ def sprung(
         stop(monitor)
 
 
-def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(tmp_path: Path) -> None:
     far = 50
     trial = dataset(MODELS["implicit_box"](), 300, 1, 100).trajectories[0]
     u = trial.u[:, 0].copy()
     u[far] = 1.6
-    with sprung(monkeypatch, tmp_path) as (robot, send):
+    with sprung(tmp_path) as (robot, send):
         margins = send(trial.y[:, 0], u)
         robot.spin_until(lambda: robot.has_said("outside the box in which the tube is proved"))
     assert (margins[20:far] >= 0.0).all()
@@ -199,13 +187,11 @@ def test_a_box_that_is_left_is_named_and_nothing_is_judged_there(
     assert (margins[far + 10 :] >= 0.0).all(), "a new run begins inside the box"
 
 
-def test_innovations_that_add_up_on_one_side_warn_while_the_tube_is_kept(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_innovations_that_add_up_on_one_side_warn_while_the_tube_is_kept(tmp_path: Path) -> None:
     trial = dataset(MODELS["implicit_box"](), 300, 1, 100).trajectories[0]
     y = trial.y[:, 0].copy()
     y[40:] += 0.1  # m/s: within what is assumed
-    with sprung(monkeypatch, tmp_path) as (robot, send):
+    with sprung(tmp_path) as (robot, send):
         margins = send(y, trial.u[:, 0])
         robot.spin_until(lambda: robot.has_said("cusum alarm"))
     assert (margins[20:] >= 0.0).all(), "it changes no verdict"

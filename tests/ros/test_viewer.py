@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs ROS (extra `ros`)")
 
 from bags.designs import documents
 from nlsid_core.funnels.tube import TubeFunnel
-from tests.ros.processes import node_here, process, ros_test, stop, use_domain_of_this_run
+from tests.ros.processes import node_here, process, ros_test, stop
 from tests.ros.robot import GOOD, MONITOR, Robot
 
 pytestmark = ros_test
@@ -50,10 +50,7 @@ class Reader:
                 yield json.loads(line[6:])
 
 
-def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(
-    monkeypatch: pytest.MonkeyPatch, funnel: Path
-) -> None:
-    use_domain_of_this_run(monkeypatch)
+def test_the_page_says_what_the_monitor_says_and_that_it_is_gone(funnel: Path) -> None:
     port = free_port()
     proved = documents.load_proved(funnel).design.funnel
     assert isinstance(proved, TubeFunnel)

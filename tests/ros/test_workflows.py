@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,6 @@ from geometry_msgs.msg import TwistStamped
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from bags.chain.config import load_config
 from bags.chain.steps import design_funnel_files, identify_bags
@@ -35,7 +34,7 @@ from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from nlsid_ros import qos
 from nlsid_ros.messages import stamp_ns_of
-from tests.ros.processes import ROOT, node_here, process, ros_test, use_domain_of_this_run
+from tests.ros.processes import ROOT, STARTED, SpinUntil, call, node_here, process, ros_test
 
 pytestmark = ros_test
 
@@ -46,7 +45,7 @@ PATIENT = ["stale_after:=1.0", "command_wait:=0.5"]  # the machine may be busy w
 class Operator:
     """Hears what the nodes say and calls their services."""
 
-    def __init__(self, node: Node, spin_until: Callable[[Callable[[], bool]], None]) -> None:
+    def __init__(self, node: Node, spin_until: SpinUntil) -> None:
         self.node, self.spin_until = node, spin_until
         self.said: dict[str, list[str]] = {}
         self.values: dict[str, dict[str, str]] = {}
@@ -71,12 +70,8 @@ class Operator:
 
     def asks(self, service: str) -> str:
         """Call a std_srvs/Trigger; why it did not succeed, empty if it did."""
-        client = self.node.create_client(Trigger, service)
-        self.spin_until(client.service_is_ready)
-        answer = client.call_async(Trigger.Request())
-        self.spin_until(answer.done)
-        self.node.destroy_client(client)
-        return "" if answer.result().success else str(answer.result().message)
+        answer = call(self.node, self.spin_until, service)
+        return "" if answer.success else str(answer.message)
 
     def waits(self, seconds: float) -> None:
         """Let time pass."""
@@ -85,8 +80,7 @@ class Operator:
 
 
 @pytest.fixture
-def operator(monkeypatch: pytest.MonkeyPatch) -> Iterator[Operator]:
-    use_domain_of_this_run(monkeypatch)
+def operator() -> Iterator[Operator]:
     with node_here("test_operator") as (node, spin_until):
         yield Operator(node, spin_until)
 
@@ -114,7 +108,7 @@ def test_monitor_only_on_an_existing_stack(operator: Operator, funnel: Path) -> 
         with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
             operator.hears("funnel_monitor", "inside")
             operator.hears("funnel_monitor", "unknown: no speed for 1 s")
-            assert player.wait(timeout=20) == 0
+            assert player.wait(timeout=STARTED) == 0
     assert not operator.has_said("funnel_monitor", "outside")
     assert not operator.has_said("funnel_monitor", "violated")
 
@@ -197,7 +191,7 @@ def test_a_tube_without_a_policy_is_monitored_for_as_long_as_the_robot_runs(
         with process("nlsid_ros.bag_player", bag=trial, topics=topics) as player:
             operator.hears("funnel_monitor", "inside")
             operator.spin_until(lambda: {stamp for stamp, _ in expected} <= heard.keys())
-            assert player.wait(timeout=20) == 0
+            assert player.wait(timeout=STARTED) == 0
         operator.hears("funnel_monitor", "unknown: no speed for 1 s")
     assert len(expected) > 100
     assert [(stamp, heard[stamp]) for stamp, _ in expected] == expected
@@ -373,7 +367,7 @@ def test_what_is_recorded_and_excited_is_what_the_configuration_names(
 def called(*service: str) -> "subprocess.CompletedProcess[str]":
     """`nlsid call`."""
     command = [sys.executable, "-m", "bags.commands.cli", "call", *service]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=STARTED, check=False)
 
 
 def renamed(bag: Path, target: Path, topics: dict[str, str]) -> None:
@@ -391,7 +385,7 @@ def test_a_workflow_that_is_told_too_little_says_what_it_takes() -> None:
     command = [sys.executable, "-m", "bags.commands.cli", "live", "closed_loop"]
     done = subprocess.run(
         [*command, "funnel:=x.json", "highest:=1.0", "plants:=true"],
-        capture_output=True, text=True, cwd=ROOT, timeout=60, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=STARTED, check=False,
     )  # fmt: skip
     assert done.returncode == 2
     assert "'plants:=true' is not one of the arguments of closed_loop.launch.xml" in done.stderr

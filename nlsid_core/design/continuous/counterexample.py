@@ -131,7 +131,9 @@ def _linear(
     identity, box = np.eye(field.n), true.uncertain
     middle = box.mean(axis=1)
     corners = middle + np.vstack([np.diag(end - middle) for end in box.T])
-    across, by_w, by_error = [], [], []
+    across: list[FloatArray] = []
+    by_w: list[FloatArray] = []
+    by_error: list[FloatArray] = []
     for s, h in zip(((t[:-1] + t[1:]) / 2).tolist(), np.diff(t).tolist(), strict=True):
         x, u, K = policy.x(s), policy.u(s), policy.K(s)
         A, B = field.jacobians(s, x, u)

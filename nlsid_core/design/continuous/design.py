@@ -53,7 +53,7 @@ class ContinuousSearch:
 
     def __str__(self) -> str:
         return (
-            f"{len(self.proved.pieces)} pieces proved, volume integral {self.history[-1][1]:.4g}, "
+            f"volume integral {self.history[-1][1]:.4g}, found and proved in "
             f"{sum(self.seconds.values()):.2f} s"
         )
 

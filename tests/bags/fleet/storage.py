@@ -68,12 +68,16 @@ def drive(
 
 @contextmanager
 def web_server(
-    folder: Path, fault: Fault | None = None, *, bytes_per_s: Mapping[str, float] | None = None
+    folder: Path,
+    fault: Fault | None = None,
+    *,
+    bytes_per_s: Mapping[str, float] | None = None,
+    moved: str = "",
 ) -> Iterator[str]:
     """The files of a folder over HTTP with ranges and ETags; yields the URL.
 
     fault: what a GET is answered with instead. Status 200 to it means: half of the bytes.
-    bytes_per_s: of an answer, by path; others are sent at once.
+    bytes_per_s: of an answer, by path; others are sent at once. moved: where status 302 points.
     """
     count: dict[str, int] = {}
 
@@ -116,6 +120,8 @@ def web_server(
         ) -> None:
             self.send_response(code)
             self.send_header("Content-Length", str(length))
+            if code == 302:
+                self.send_header("Location", moved)
             if span:
                 self.send_header("Content-Range", span)
             if tag:

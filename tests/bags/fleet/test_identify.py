@@ -6,7 +6,9 @@ import sqlite3
 import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -188,13 +190,102 @@ def test_what_is_no_manifest_is_refused(tmp_path: Path) -> None:
         Manifest(tmp_path / MANIFEST)
 
 
+def test_two_recordings_with_the_same_samples_are_one(tmp_path: Path, config: Path) -> None:
+    """An object and its copy of another storage have other digests."""
+    folder = fleet(tmp_path / "fleet", 3)
+    drive(folder / "copied" / "drive.mcap", seed=2, samples=120, chunk_size=2**20)
+    found = read_fleet(
+        named_bags([folder / "*" / "*.mcap"]), load_config(config), tmp_path, workers=Workers()
+    )
+    assert found.left_out == {"robot_0/drive_2": "the same recording as copied/drive"}
+
+
+def test_a_bag_that_changes_while_it_is_read_is_named_and_not_kept(
+    tmp_path: Path, config: Path
+) -> None:
+    """Chunks of one recording and the end of another would pass for a third."""
+    pytest.importorskip("fsspec")
+    pytest.importorskip("aiohttp")
+    local = drive(tmp_path / "web" / "drive.mcap", samples=120, image_bytes=1000)
+    other = drive(tmp_path / "other.mcap", seed=1, samples=120, image_bytes=1000)
+    assert local.stat().st_size == other.stat().st_size
+    swapped: list[int] = []
+
+    def swap(_: str, number: int) -> None:
+        if number == 2 and not swapped:
+            swapped.append(number)
+            local.write_bytes(other.read_bytes())
+
+    task = ReadTrials(load_config(config))
+    with web_server(tmp_path / "web", swap) as url, Manifest(tmp_path / MANIFEST) as manifest:
+        first, second = (
+            next(ask(task, named_bags([Path(f"{url}/drive.mcap")]), Workers(), manifest))
+            for _ in range(2)
+        )
+    assert swapped
+    assert first.reason == "it changed while it was read; start the command again"
+    assert not second.reason
+    assert not second.kept
+
+
+def test_two_runs_may_share_a_manifest(tmp_path: Path) -> None:
+    def write(k: int) -> None:
+        with Manifest(tmp_path / MANIFEST) as manifest:
+            for row in range(50):
+                manifest.keep(f"{k} {row}", "bag", f"{k} {row}".encode())
+
+    with ThreadPoolExecutor(4) as several:
+        list(several.map(write, range(4)))
+    with Manifest(tmp_path / MANIFEST) as manifest:
+        for k in range(4):
+            for row in range(50):
+                assert manifest.find(f"{k} {row}") == f"{k} {row}".encode()
+
+
+def test_a_manifest_that_cannot_be_used_is_not_to_be_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another run has it, or a row of it is none: never a verdict, and no loss of what is kept."""
+    monkeypatch.setattr("bags.fleet.manifest.BUSY", 0.1)
+    with Manifest(tmp_path / MANIFEST) as manifest:
+        manifest.keep("a", "bag", b"content")
+        with sqlite3.connect(tmp_path / MANIFEST, isolation_level=None) as other:
+            other.execute("begin immediate")
+            with pytest.raises(DataError, match=r"fleet\.sqlite cannot be used: .*locked"):
+                manifest.keep("b", "bag", b"content")
+            other.execute("update bags set content = 5")
+            other.execute("commit")
+        with pytest.raises(DataError, match="a row of this manifest"):
+            manifest.find("a")
+
+
+def test_what_is_answered_is_on_the_disk_and_not_in_memory(tmp_path: Path) -> None:
+    class Long:
+        asked = "long"
+
+        def __call__(self, bag: Path, name: str) -> bytes:  # noqa: ARG002
+            return name.encode() * 50_000
+
+    (tmp_path / "bag").write_text("")
+    bags = {f"{k:02d}": tmp_path / "bag" for k in range(60)}
+    tracemalloc.start()
+    try:
+        with Manifest(None) as manifest:
+            for name, answer in zip(bags, ask(Long(), bags, Workers(), manifest), strict=True):
+                assert answer.content == name.encode() * 50_000
+            _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 1e6, "60 answers are 6 MB"
+
+
 def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Path) -> None:
     bags = {}
     for name in "abcdef":
         bags[name] = tmp_path / name
         bags[name].write_text(name)
     with Manifest(tmp_path / MANIFEST) as manifest:
-        answers = ask(Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest)
+        answers = [*ask(Deadly(tmp_path, always="c", once="e"), bags, Workers(2), manifest)]
     assert [a.name for a in answers] == list("abcdef")
     assert [a.name for a in answers if a.reason] == ["c"]
     assert "its worker died" in answers[2].reason

@@ -1,16 +1,20 @@
 """Bags are read where they lie, by the ranges that are needed, and refused by name if they fail."""
 
 import pickle
+import socket
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType
 
 from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
 from bags.recordings.mcap_file import McapFile
-from bags.recordings.remote import RemotePath, is_url, place
+from bags.recordings.mcap_records import walk_records
+from bags.recordings.remote import Entry, RemotePath, is_url, place
 from bags.samples import f1tenth
 from bags.signals.reader import bag_origin, read_signals
 from nlsid_core.errors import BagError
@@ -57,7 +61,7 @@ def test_of_an_uncompressed_file_only_the_wanted_messages_are_fetched(
     read_signals(path, WANTED)
     bag_origin(path)
     assert path.fetched < 0.01 * local.stat().st_size
-    assert path.requests <= 1 + 13 + 100  # the end, an index a chunk, what is between two images
+    assert path.requests <= 2 + 13 + 100  # its size, its end, an index a chunk, between images
 
 
 def test_of_a_compressed_file_only_the_chunks_with_wanted_topics_are_fetched(
@@ -77,7 +81,7 @@ def test_of_a_compressed_file_only_the_chunks_with_wanted_topics_are_fetched(
 def test_a_small_file_is_one_request(bucket: Bucket, tmp_path: Path) -> None:
     path = remote(bucket.put(drive(tmp_path / "d.mcap", samples=10), "d.mcap"))
     read_signals(path, WANTED)
-    assert path.requests == 1
+    assert path.requests == 2, "how long it is, and all of it"
     assert path.fetched == path.entry.size
 
 
@@ -122,12 +126,64 @@ def test_local_files_and_urls_are_told_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["https://host/d.mcap?X-Amz-Signature=secret", "https://user:secret@host/d.mcap"]
+    "url",
+    [
+        "https://host/d.mcap?X-Amz-Signature=secret",
+        "https://user:secret@host/d.mcap",
+        "https://user:secret@host/d.mcap?secret",
+        "https://host/d.mcap#token=secret",
+        "s3://bucket/d.mcap?X-Amz-Signature=secret",
+        "simplecache::https://user:secret@host/d.mcap",
+        " s3://key:secret@bucket/d.mcap",
+    ],
 )
 def test_a_url_with_a_secret_is_refused_without_repeating_it(url: str) -> None:
     with pytest.raises(BagError) as refusal:
         place(url)
     assert "secret" not in str(refusal.value).replace("may hold a secret", "")
+
+
+def test_an_error_tells_no_secret_of_a_redirection_or_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "hidden-in-the-environment")
+    drive(tmp_path / "d.mcap", samples=10)
+    with web_server(tmp_path, lambda *_: 403) as other:
+        there = other.replace("http://", "http://user:pass-word@")
+        place_of = f"{there}/d.mcap?X-Amz-Signature=abcdef&key=hidden-in-the-environment"
+        with (
+            web_server(tmp_path, lambda *_: 302, moved=place_of) as url,
+            pytest.raises(BagError, match=r"storage refuses it: .*403") as refusal,
+        ):
+            remote(f"{url}/d.mcap").read_range(0, 10)
+    for secret in ("abcdef", "hidden-in", "pass-word"):
+        assert secret not in str(refusal.value)
+
+
+@pytest.mark.parametrize("protocol", ["http", "s3"])
+def test_a_server_that_never_answers_is_given_up_after_the_patience(
+    protocol: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asked for ranges, for what a file is, and for what a pattern means."""
+    s3fs = pytest.importorskip("s3fs")
+    monkeypatch.setattr(s3fs.S3FileSystem, "_cache", {})  # those of other tests know their server
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        for key in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_DEFAULT_REGION"):
+            monkeypatch.setenv(key, "silent")
+        monkeypatch.setenv("AWS_ENDPOINT_URL", url)
+        begin = url if protocol == "http" else "s3://silent"
+        known = remote(f"{begin}/d.mcap", patience=1.0)
+        known._entry = Entry(1000, False, "")
+        for ask in (
+            lambda: known.read_range(0, 10),
+            lambda: remote(f"{begin}/d.mcap", patience=1.0).entry,
+            lambda: expand_bags([remote(f"{begin}/folder/*.mcap", patience=1.0)]),
+        ):
+            started = time.monotonic()
+            with pytest.raises(BagError, match="did not deliver; 1 s were lost"):
+                ask()
+            assert time.monotonic() - started < 10.0
 
 
 def test_a_server_that_is_busy_is_asked_again(tmp_path: Path) -> None:
@@ -160,7 +216,7 @@ def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
     url = bucket.put(drive(tmp_path / "d.mcap", samples=60, image_bytes=40_000), "d.mcap")
     by_obstore, by_fsspec = remote(url), RemotePath(place(url))
     found = read_signals(by_obstore, WANTED)
-    monkeypatch.setattr("bags.recordings.remote._obstore", lambda *_: None)
+    monkeypatch.setattr("bags.recordings.remote._by_obstore", lambda *_: None)
     wanted = read_signals(by_fsspec, WANTED)
     for text in WANTED:
         np.testing.assert_array_equal(found[text].values, wanted[text].values)
@@ -308,6 +364,42 @@ def test_commands_are_found_where_no_image_is(bucket: Bucket, tmp_path: Path) ->
     with Bag(path) as bag:
         assert sum(len(batch) for _, batch in bag.batches([CMD])) == 200
     assert path.fetched < 0.1 * local.stat().st_size
+
+
+@pytest.mark.parametrize("said", [2**32, 2**63])
+def test_a_chunk_that_says_it_is_huge_is_refused_before_it_is_fetched(
+    tmp_path: Path, said: int
+) -> None:
+    content = bytearray(drive(tmp_path / "d.mcap", image_bytes=1000).read_bytes())
+    summary = int.from_bytes(content[-28:-20], "little")
+    for opcode, _, end in walk_records(bytes(content[summary:-8])):
+        if opcode == Opcode.CHUNK_INDEX:
+            content[summary + end - 8 : summary + end] = said.to_bytes(8, "little")
+    content[-12:-8] = bytes(4)  # no checksum
+    (tmp_path / "d.mcap").write_bytes(content)
+    with web_server(tmp_path) as url:
+        path = remote(f"{url}/d.mcap", patience=5.0)
+        with pytest.raises(BagError, match=f"without compression, and says {said}"):
+            read_signals(path, WANTED)
+        assert path.fetched < 2**15
+
+
+def test_a_message_that_says_it_is_longer_than_its_record_is_refused(tmp_path: Path) -> None:
+    """It would be made of what was fetched behind it."""
+    local = drive(tmp_path / "d.mcap", image_bytes=30_000, samples=20)
+    with McapFile(local) as file:
+        block = file.contents.blocks[0]
+        command = next(c.id for c in file.contents.channels.values() if c.topic == CMD)
+        at = block.offset + int(file._indexed(*(block.index or {})[command])[0])
+    content = bytearray(local.read_bytes())
+    length = int.from_bytes(content[at + 1 : at + 9], "little")
+    content[at + 1 : at + 9] = (length + 1).to_bytes(8, "little")
+    local.write_bytes(content)
+    with (
+        web_server(tmp_path) as url,
+        pytest.raises(BagError, match="messages that overlap"),
+    ):
+        read_signals(remote(f"{url}/d.mcap"), [COMMAND])
 
 
 def test_a_huge_file_without_a_summary_is_refused_before_it_is_fetched(tmp_path: Path) -> None:

@@ -155,6 +155,35 @@ def test_the_command_says_who_was_outside_and_that_one_was_not_read(
     assert kept.exists()
 
 
+def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: Path) -> None:
+    """Byte for byte, and with other bytes but the same messages."""
+    original = drive(tmp_path / "a" / "drive.mcap", samples=117)
+    for folder in "bc":
+        (tmp_path / folder).mkdir()
+    (tmp_path / "b" / "drive.mcap").write_bytes(original.read_bytes())
+    drive(tmp_path / "c" / "drive.mcap", samples=117, chunk_size=2**20)
+    found = monitor_fleet(
+        named_bags([tmp_path / "*" / "*.mcap"]), design, documents.load_proved(design),
+        centre=Centre.COMMAND, definitions={}, workers=Workers(),
+    )  # fmt: skip
+    assert [row.verdict for row in found.rows][1:] == ["copy", "copy"]
+    assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
+    assert [row.bag for row in found.others] == ["a/drive"]
+    assert sum(found.histogram) == 1
+
+
+def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: Path) -> None:
+    fleet = tmp_path / "fleet" / "robot[red]"
+    drive(fleet / "a[bold][/red]\x1b[2J.mcap", samples=117)
+    (fleet / "b[/bold].mcap").write_bytes(b"no bag")
+    for given in (["check", "--config", str(CONFIG)], ["monitor", "--funnel", str(design)]):
+        done = CliRunner().invoke(app, ["fleet", *given, str(fleet)], env={"COLUMNS": "200"})
+        assert done.exit_code == 1, done.output
+        assert "a[bold][/red]\N{REPLACEMENT CHARACTER}[2J" in done.output
+        assert "b[/bold]" in done.output
+        assert "\x1b[2J" not in done.output
+
+
 def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
     bags = {path.name: path for path in f1tenth()[:3]}
     (tmp_path / "cut.mcap").write_bytes(b"no bag")
@@ -185,8 +214,8 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
     pytest.importorskip("fsspec")
     pytest.importorskip("aiohttp")
     web = tmp_path / "web"
-    for name in ("cut", "busy", "late", "gone", "slow", "good"):
-        drive(web / f"{name}.mcap", samples=117)
+    for seed, name in enumerate(("cut", "busy", "late", "gone", "slow", "good")):
+        drive(web / f"{name}.mcap", samples=117, seed=seed)
     content = (web / "cut.mcap").read_bytes()
     (web / "cut.mcap").write_bytes(content[: len(content) // 2])
     asked: Counter[str] = Counter()

@@ -9,7 +9,7 @@ import contextlib
 import json
 import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -23,6 +23,7 @@ from nlsid_core.kernel import Rejected
 from tests.core.kernel import (
     oracle_composition,
     oracle_continuous,
+    oracle_falsification,
     oracle_polynomial,
     oracle_sampled,
     oracle_stability,
@@ -41,6 +42,7 @@ ORACLES: dict[str, Callable[[Json, Mapping[str, Json]], bool]] = {
     "sampled_funnel": oracle_sampled.agrees,
     "continuous_funnel": oracle_continuous.agrees,
     "funnel_composition": oracle_composition.agrees,
+    "falsification": oracle_falsification.agrees,
 }
 WILD: tuple[Any, ...] = (
     0, -0.0, 1, -1, 1e-300, 5e-324, 1e300, 1.7976931348623157e308, 2**53, 1e-12, True, None, "1/3",
@@ -124,14 +126,14 @@ def bind_again(forged: Case) -> None:
                 binding["digest"] = files.digest(encoded(forged.about[binding["file"]]))
 
 
-def run(count: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Decide `count` mutants; `false_proved` counts those that an oracle does not prove.
+def run(count: int, rng: np.random.Generator, kinds: Collection[str] = ORACLES) -> dict[str, Any]:
+    """Decide `count` mutants of `kinds`; `false_proved` counts those that an oracle does not prove.
 
     judged: by kind, how many were proved and then decided by its oracle.
     """
     outcomes = dict.fromkeys(("proved", "rejected", "not decided", "false_proved"), 0)
     judged = dict.fromkeys(ORACLES, 0)
-    cases = corpus()
+    cases = [case for case in corpus() if case.kind in kinds]
     for k in range(count):
         original = cases[k % len(cases)]
         forged = mutant(original, rng)

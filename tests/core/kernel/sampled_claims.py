@@ -1,5 +1,6 @@
 """Sampled funnels of one state written by hand: documents and proofs whose truth is known."""
 
+import random
 from dataclasses import dataclass, field
 from fractions import Fraction
 from math import ceil, log2
@@ -12,6 +13,7 @@ Json = dict[str, Any]
 Rows = list[list[float]]
 NAMES = {"model": "model.json", "policy": "policy.json", "funnel": "funnel.json"}
 DIGEST = "sha256:" + 64 * "2"
+UP = 1 + 1e-7  # of a bound over what is true
 
 
 @dataclass
@@ -152,3 +154,50 @@ class Scalar:
 def _squares(rows: Rows) -> Json:
     """Rows as whole numbers over 2^40, rounded up."""
     return {"unit": 40, "factors": [[[ceil(v * 2**40) for v in row] for row in rows]]}
+
+
+def one_step(form: str, rng: random.Random, room: float) -> tuple[Scalar, bool]:
+    """x⁺ = a x + b u, one step; and whether its claim is true, from the closed form in Fractions.
+
+    room: by which part the claim is on the safe side of what is true; negative if it is false.
+    """
+    a, b, k, A = (rng.uniform(-1.0, 1.0) for _ in range(4))
+    S, S_next = rng.uniform(1.0, 1.9), rng.uniform(0.3, 0.45)
+    s, bound, rate = rng.uniform(0.5, 2.0), rng.uniform(0.01, 0.5), 1.0
+    if form == "fading":
+        rate = rng.uniform(0.7, 0.99)
+    slope, ratio = Fraction(a) - Fraction(b) * Fraction(k), Fraction(S_next) / Fraction(S)
+    mu, off = abs(slope) * ratio, abs(slope - Fraction(A)) * ratio  # of |x̄|, and of |r|
+    added = {"peak": Fraction(bound), "response": off * Fraction(bound)}.get(form, Fraction(0))
+    needed = mu * Fraction(s) + added
+    least_gain = Fraction(rate) / (Fraction(rate) - mu**2)  # gain μ² = (gain - 1) rate
+    of_gain = form in ("energy", "fading") and rng.random() < 0.5
+    after = float(needed) * (1 + (1e-5 if of_gain else room))
+    gain = float(least_gain) * (1 + (room if of_gain else 1e-5))
+    if form not in ("energy", "fading"):
+        gain = 1.0
+    elif gain < 1:
+        return one_step(form, rng, room)
+    reach = min(float(mu) * s * UP, float(Fraction(after) - added))  # claims what it needs
+    chains = ("tube", "inlet")
+    claim = Scalar(
+        {(1, 0): a, (0, 1): b},
+        x=[0.0, 0.0],
+        u=[0.0],
+        K=[k],
+        S=[S, S_next],
+        A=[A],
+        tube=[s, after],
+        inlet=[s, after],
+        reach={chain: [reach] for chain in chains},
+        sigma={chain: [[[float(mu)]]] for chain in chains},
+        form=form,
+        bound=bound,
+        measured=bound,
+        rate=rate,
+        gain=gain,
+    )
+    claim.curvature = [float(off if form == "response" else mu) * UP * S * claim.T(0)]
+    stays = needed <= Fraction(after)
+    forgets = form in ("peak", "response") or Fraction(gain) >= least_gain
+    return claim, stays and forgets

@@ -26,7 +26,11 @@ from nlsid_core import kernel, proofs, second
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
 from tests.core.kernel import mutations
+from tests.core.kernel.sampled_claims import one_step
+from tests.forged_tracking import FORGERIES, forged
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
+from tests.tracked import designed
+from tests.tracked import write as write_design
 
 Json = dict[str, Any]
 ROOT = Path(__file__).resolve().parents[3]
@@ -168,12 +172,18 @@ def test_both_kernels_refuse_a_forgery(
 MODELS = (
     "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
     "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
-    "stability/linear", "stability/network",
+    "tube/lasting_cascade", "stability/linear", "stability/network", "stability/cascade",
     "stability/moving_lags", "stability/split", "stability/two_outputs",
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*MODELS, "continuous_funnel/clipped", "continuous_funnel/pushed"])
+SAMPLED = tuple(f"sampled_funnel/{form}" for form in ("response", "peak", "energy", "fading"))
+COMPOSED = "funnel_composition/two"
+
+
+@pytest.mark.parametrize(
+    "name", [*MODELS, *SAMPLED, COMPOSED, "continuous_funnel/clipped", "continuous_funnel/pushed"]
+)
 def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
     """And each of them counts: another one prints as another file."""
     generate = generator()
@@ -210,7 +220,7 @@ def test_a_file_that_is_not_in_canonical_form_is_refused(tmp_path: Path) -> None
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [*MODELS, *SAMPLED, COMPOSED])
 def test_coq_proves_the_theorem_of_a_model(name: str, build: Path) -> None:
     done = accepted(CORPUS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
@@ -274,18 +284,42 @@ ASSUMED = "funnel.json tubes 0 assumption"
         ("lasting_two_outputs", at("claim.proof.json proof multipliers 0 N", []), "3 to 3 entries"),
         ("lasting_network", at("model.json into 0 0", 1.0), "a map should use earlier ones only"),
         ("lasting_network", at("model.json maps 0 knots 0", 5.0), "should increase"),
+        ("lasting_cascade", at("model.json f spacing", 0.0), "the spacing should be > 0"),
+        ("lasting_cascade", at("model.json f coefficients", [0.0, 1.0, 2.0]), "4 to"),
+        ("lasting_cascade", at("model.json b1 1", [1.0]), "3 to 3 entries"),
+        ("lasting_cascade", at("model.json b2", [[1.0]]), "2 to 2 entries"),
         ("lasting_implicit_ray", at("funnel.json box", {"y": [[-1, 1]], "u": [[-1, 1]]}),
          "a box of a model that needs none"),
         ("engaged", at("policy.json u 0 0", 7.0), "outside the model's range"),
         ("engaged", at("policy.json period", 0.2), "another period"),
         ("engaged", at("policy.json L 0 0", 0.0), "L is not the policy's"),
+        ("response", at("model.json kind", "map"), "should be one of state_map"),
+        ("response", at("model.json x 1 name", "angle"), "two signals of one name"),
+        ("response", at("model.json exponents 4", [0, 63, 63]), "a degree above 63"),
+        ("response", at("model.json exponents 4", [0, 60, 0]), "too many monomials in a step"),
+        ("response", at("model.json bags 0 digest", WINDOW + "2[3:9]"), "was fitted to"),
+        ("response", at("policy.json period", 0.04), "another period"),
+        ("response", at("policy.json L", [[1.0]]), "2 to 2 entries"),
+        ("response", at("funnel.json tube 0", 5.0), "starts outside the inlet"),
+        ("response", at("funnel.json roots", [1.0]), "unknown members: 'roots'"),
+        ("response", at("funnel.json assumption rate", 0.5), "rate is 1 but in form fading"),
+        ("response", at("funnel.json assumption gain", 2.0), "gain is 1 in forms"),
+        ("response", at("funnel.json assumption measured", 0.015), "below what was measured"),
+        ("response", at("funnel.json assumption form", "linear"), "should be one of response"),
+        ("response", at("funnel.json assumption measured_on 0 digest", WINDOW + "2[0:5]"),
+         "a window is no commissioning run"),
+        ("energy", at("funnel.json assumption rate", 1.5), "rate <= 1"),
+        ("fading", at("claim.proof.json proof steps 0 kappa", -1.0), "kappa >= 0"),
+        ("peak", at("claim.proof.json proof steps 0 curvature", [-1.0]), "curvature >= 0"),
+        ("peak", at("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
     ],
 )  # fmt: skip
 def test_a_file_that_the_pages_do_not_allow_is_refused(
     name: str, forge: Callable[[Files], None], said: str, tmp_path: Path
 ) -> None:
     """By both kernels; with the file as it is, both have nothing against it."""
-    folder, generate = CORPUS / "tube" / name, generator()
+    sampled = CORPUS / "sampled_funnel" / name
+    folder, generate = sampled if sampled.exists() else CORPUS / "tube" / name, generator()
     files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
     assert generate.decided(put(files, tmp_path)) == (0, "")
     forge(files)
@@ -310,9 +344,10 @@ def test_a_number_that_is_not_written_as_a_float64_is_refused(tmp_path: Path) ->
 
 
 def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> None:
-    """Of mutants of tubes and stability, without the checker that decides the numbers."""
+    """Of mutants of tubes, stability and sampled funnels, without the checker of the numbers."""
     generate, rng = generator(), np.random.default_rng(3)
-    cases = [case for case in mutations.corpus() if case.kind in ("tube", "stability")]
+    kinds = ("tube", "stability", "sampled_funnel")
+    cases = [case for case in mutations.corpus() if case.kind in kinds]
     refused = 0
     for k in range(120):
         forged = mutations.mutant(cases[k % len(cases)], rng)
@@ -330,7 +365,8 @@ def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> Non
 def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path) -> None:
     found = mutated(400, tmp_path / "mutant", program.parent / "second")
     assert found["differ"] == {}
-    for kind in ("tube", "stability", "continuous_funnel"):
+    kinds = ("tube", "stability", "continuous_funnel", "sampled_funnel", "funnel_composition")
+    for kind in kinds:
         assert min(found["decided"][f"{said} {kind}"] for said in ("accepted", "refused")) > 2
 
 
@@ -375,6 +411,20 @@ def multipliers_gone(files: Files) -> None:
     N[:] = [[[0.0 for _ in row] for row in matrix] for matrix in N]
 
 
+def spline_steeper(files: Files) -> None:
+    """Four times, where it is steepest."""
+    c = files["model.json"]["f"]["coefficients"]
+    steepest = max(range(len(c) - 1), key=lambda i: c[i + 1] - c[i])
+    rise = 3.0 * (c[steepest + 1] - c[steepest])
+    c[steepest + 1 :] = [entry + rise for entry in c[steepest + 1 :]]
+
+
+def filter_stronger(files: Files) -> None:
+    """Twice what goes from the spline into the second filter."""
+    b2 = files["model.json"]["b2"]
+    b2[:] = [[2 * entry for entry in row] for row in b2]
+
+
 def feedback_stronger(files: Files) -> None:
     """Ten times: the tube was made for less."""
     K = files["policy.json"]["K"]
@@ -397,12 +447,14 @@ def program(build: Path) -> Path:
 @pytest.mark.parametrize(
     "forge",
     [fades_faster, narrower, tau_larger, storage_of_another_size, indefinite,
-     outputs_counted_twice, multipliers_gone, feedback_stronger],
+     outputs_counted_twice, multipliers_gone, feedback_stronger, spline_steeper, filter_stronger],
 )  # fmt: skip
 def test_both_kernels_refuse_a_forged_tube(
     forge: Callable[[Files], None], build: Path, program: Path, tmp_path: Path
 ) -> None:
-    folder = CORPUS / "tube" / ("engaged" if forge is feedback_stronger else "lasting_two_outputs")
+    of_cascades = forge in (spline_steeper, filter_stronger)
+    planned = "engaged" if forge is feedback_stronger else "lasting_two_outputs"
+    folder = CORPUS / "tube" / ("lasting_cascade" if of_cascades else planned)
     files = {path.name: json.loads(path.read_text()) for path in folder.glob("*.json")}
     forge(files)
     proof = put(files, tmp_path)
@@ -412,6 +464,100 @@ def test_both_kernels_refuse_a_forged_tube(
     done = accepted(proof, build)
     assert done.returncode != 0
     assert "theorem.v" in done.stderr, "refused by Coq, not before"
+
+
+@needs_coq
+@pytest.mark.coq
+def test_every_forged_sampled_funnel_is_refused(program: Path, tmp_path: Path) -> None:
+    """Those that the first kernel's tests hold; the funnel that they were made of is accepted."""
+    assert second.opinion(write_design(designed(), tmp_path), program).verdict == "accepted"
+    for what in FORGERIES:
+        proof = write_design(forged(designed(), what), tmp_path)
+        assert second.opinion(proof, program).verdict == "refused", what
+
+
+@needs_coq
+@pytest.mark.coq
+def test_a_forged_sampled_funnel_has_no_theorem(build: Path, tmp_path: Path) -> None:
+    proof = write_design(forged(designed(), "curvature made smaller"), tmp_path)
+    done = accepted(proof, build)
+    assert done.returncode != 0
+    assert "theorem.v" in done.stderr, "refused by Coq, not before"
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
+def test_sampled_claims_are_decided_as_the_closed_form_decides(
+    form: str, program: Path, tmp_path: Path
+) -> None:
+    generate, rng = generator(), random.Random(form)
+    for i in range(20):
+        claim, true = one_step(form, rng, 1e-5 if i % 2 else -1e-5)
+        files: Files = {f"{role}.json": content for role, content in claim.documents().items()}
+        about = {role: {"file": f"{role}.json"} for role in ("model", "policy", "funnel")}
+        files["claim.proof.json"] = proofs.proof_document(
+            {"kind": "sampled_funnel", "about": about}, claim.proof()
+        )
+        found, _ = generate.decided(put(files, tmp_path), checker=program.parent / "second")
+        assert found == (0 if true else 1)
+
+
+def start_narrower(case: mutations.Case) -> None:
+    """Stage 2 starts 1 % narrower: stage 1 no longer ends inside it."""
+    case.about["stage2.funnel.json"]["rho"][0] *= 0.99
+
+
+def multiplier_raised(case: mutations.Case) -> None:
+    """Past 1 the S-lemma gives nothing."""
+    case.document["proof"]["multipliers"] = [1.01]
+
+
+def multiplier_negative(case: mutations.Case) -> None:
+    """Less than nothing."""
+    case.document["proof"]["multipliers"] = [-0.5]
+
+
+def stages_swapped(case: mutations.Case) -> None:
+    """Proofs and all."""
+    about = case.document["claim"]["about"]
+    about["stage1"], about["stage2"] = about["stage2"], about["stage1"]
+
+
+def stage_repeated(case: mutations.Case) -> None:
+    """Stage 1 follows itself."""
+    about = case.document["claim"]["about"]
+    about["stage2"] = dict(about["stage1"])
+
+
+def stage_of_another_motion(case: mutations.Case) -> None:
+    """Stage 2's equations are driven harder than its own proof allows."""
+    case.about["stage2.policy.json"]["K"] = [
+        [[[-g for g in row] for row in k] for k in ks]
+        for ks in case.about["stage2.policy.json"]["K"]
+    ]
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(
+    "forge",
+    [start_narrower, multiplier_raised, multiplier_negative, stages_swapped, stage_repeated,
+     stage_of_another_motion],
+)  # fmt: skip
+def test_both_kernels_refuse_a_forged_composition(
+    forge: Callable[[mutations.Case], None], program: Path, tmp_path: Path
+) -> None:
+    (case,) = (case for case in mutations.corpus() if case.kind == "funnel_composition")
+    forged = case.copied()
+    forge(forged)
+    mutations.bind_again(forged)
+    for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
+        (tmp_path / name).write_bytes(saved.encode(document))
+    with pytest.raises(kernel.Rejected):
+        kernel.check(tmp_path / mutations.PROOF)
+    status, why = generator().decided(tmp_path / mutations.PROOF, checker=program.parent / "second")
+    assert (status, why) == (1, ""), "refused by the checker, not before"
 
 
 def rebound(document: Json, digests: dict[str, str]) -> Json:
@@ -444,10 +590,10 @@ def test_check_asks_the_second_kernel(program: Path, monkeypatch: pytest.MonkeyP
     told = CliRunner().invoke(app, ["check", "--second", str(proved)])
     assert told.exit_code == 0
     assert "second kernel: accepted by the checker that Coq proves right" in told.output
-    beyond = CORPUS / "tube" / "lasting_cascade" / "claim.proof.json"
+    beyond = CORPUS / "tube" / "lasting_implicit_box" / "claim.proof.json"
     told = CliRunner().invoke(app, ["check", "--second", str(beyond)])
     assert told.exit_code == 2
-    assert "no theorem (models of kind block_cascade are not covered)" in told.output
+    assert "increments are known on a box only" in told.output.replace("\n", " ")
     assert "PROVED" in told.output
 
 

@@ -1,0 +1,44 @@
+"""Bags of an oscillator whose spring stiffens: identified, checked, given a tube and monitored."""
+
+from pathlib import Path
+
+import numpy as np
+from typer.testing import CliRunner
+
+from bags.commands.cli import app
+from bags.designs import documents
+from tests.duffing import trials
+from tests.identified_bags import FUNNEL, write_bag, write_config
+
+RUNS = 10
+
+
+def test_feedback_goes_from_bags_to_a_monitor(tmp_path: Path) -> None:
+    for k, trial in enumerate(trials([0.15] * RUNS, samples=400, seed=4)):
+        write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
+    broken = trials([0.15], samples=400, seed=9).trajectories[0]
+    y = np.where(np.arange(400)[:, None] < 200, broken.y, 0.6 * broken.y)
+    write_bag(tmp_path / "bags", "broken", y, broken.u)
+    section = {"model": "feedback", "stages": 2, "imitated": 20}
+    config = write_config(tmp_path / "config.yaml", section, **FUNNEL)
+    bags = [str(tmp_path / "bags" / f"run_{k}") for k in range(RUNS)]
+    out = tmp_path / "out"
+
+    def done(*given: str) -> tuple[int, str]:
+        result = CliRunner().invoke(app, list(given))
+        return result.exit_code, result.output
+
+    code, said = done("identify", *bags, "--config", str(config), "--out", str(out))
+    assert code == 0, said
+    code, said = done(
+        "funnel", "--model", str(out / documents.MODEL), "--config", str(config), "--out", str(out)
+    )
+    assert code == 0, said
+    proofs = (str(out / name) for name in ("model.proof.json", documents.FUNNEL_PROOF))
+    code, said = done("check", *proofs)
+    assert (code, said.count("PROVED")) == (0, 2), said
+    held = ("monitor", "--funnel", str(out / documents.FUNNEL), "--replay")
+    code, said = done(*held, bags[5])
+    assert code == 0, said
+    code, said = done(*held, str(tmp_path / "bags" / "broken"))
+    assert code == 1, said
