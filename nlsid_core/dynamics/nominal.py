@@ -36,10 +36,6 @@ class Nominal:
         """(K,) knots in s."""
         return self.x.t
 
-    def halved(self) -> "Nominal":
-        """The same motion with a knot more in the middle of every interval."""
-        return Nominal(self.x.halved(), self.u.halved())
-
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
         """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""
         when, gaps = self._sampled(field)

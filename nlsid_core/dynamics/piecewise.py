@@ -78,17 +78,6 @@ class PiecewisePolynomial:
         h = np.diff(self.t).reshape(-1, *[1] * (self.control.ndim - 1))
         return PiecewisePolynomial(self.t, self.degree * np.diff(self.control, axis=1) / h)
 
-    def halved(self) -> "PiecewisePolynomial":
-        """The same function with a knot more in the middle of every piece."""
-        first, second, rest = [], [], self.control
-        while rest.shape[1]:  # de Casteljau
-            first.append(rest[:, 0])
-            second.insert(0, rest[:, -1])
-            rest = (rest[:, :-1] + rest[:, 1:]) / 2
-        halves = np.stack([np.stack(first, axis=1), np.stack(second, axis=1)], axis=1)
-        t = np.insert(self.t, range(1, len(self.t)), (self.t[:-1] + self.t[1:]) / 2)
-        return PiecewisePolynomial(t, halves.reshape(-1, *self.control.shape[1:]))
-
     def ends(self) -> FloatArray:
         """(K, *shape) values at the knots, exact; the last from the left."""
         return np.concatenate([self.control[:, 0], self.control[-1:, -1]])
