@@ -5,12 +5,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bags.designs import documents
-from bags.pictures.report import report_available
 from nlsid_core import files
-from nlsid_core.design import Goal
 from nlsid_core.documents import read
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import NlsidError
@@ -23,7 +19,7 @@ MOST_TERMS = 12  # of an equation that is printed
 
 
 def equations_chapter(folder: Path) -> str:
-    """Picture, half-widths, equations and limits; empty if the folder's funnel is another.
+    """Half-widths, equations and limits; empty if the folder's funnel is another.
 
     It reads the files and decides nothing: for folders whose proof holds.
     """
@@ -35,8 +31,9 @@ def equations_chapter(folder: Path) -> str:
         claim = files.load_document(folder / documents.FUNNEL_PROOF)["claim"]
     except (NlsidError, OSError):
         return ""
-    if not (isinstance(field, VectorField) and isinstance(funnel, ContinuousFunnel)):
+    if not isinstance(field, VectorField) or not isinstance(funnel, ContinuousFunnel):
         return ""
+    assert isinstance(policy, ContinuousPolicy), "the proof is about the three of them"
     lines = [
         "x are the states and u the inputs, counted from 0, in the order and in the units of the "
         "equations below; the files have no other names for them",
@@ -44,17 +41,7 @@ def equations_chapter(folder: Path) -> str:
         *_bounds(field, policy, Held.of_claim(claim)),
     ]
     said = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    return f"{_drawn(funnel, claim)}{_widths(funnel)}<ul>{said}</ul>"
-
-
-def _drawn(funnel: ContinuousFunnel, claim: Any) -> str:
-    if not report_available():
-        return ""
-    from bags.pictures import funnel_plots, plots
-
-    goal = claim["goal"]
-    figure = funnel_plots.tube_picture(funnel, Goal(np.array(goal["centre"]), np.array(goal["P"])))
-    return plots.svg(figure)
+    return f"{_widths(funnel)}<ul>{said}</ul>"
 
 
 def _widths(funnel: ContinuousFunnel) -> str:

@@ -32,12 +32,24 @@ def funnel_picture(design: FunnelDesign) -> Figure:
     funnel = design.funnel
     figure = Figure(figsize=(12, 7), layout="constrained")
     rows: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))
-    _tubes(rows[0], funnel, design.found.goal)
+    pairs = state_pairs(funnel.n)
+    over_time = range(min(funnel.n, PROJECTIONS - len(pairs)))
+    panels = np.atleast_1d(rows[0].subplots(1, len(pairs) + len(over_time)))
+    for axes, pair in zip(panels, pairs, strict=False):
+        _tube(axes, funnel, pair, design.found.goal)
+    for i, axes in zip(over_time, panels[len(pairs) :], strict=True):
+        _tube_over_time(axes, funnel, i)
+    panels[0].legend(frameon=False, fontsize=8)
     volume, widths, margin = rows[1].subplots(1, 3)
     _volume(volume, design)
     _widths(widths, funnel)
     _margin(margin, design)
-    _tidied(figure)
+    for axes in (*panels, volume, widths, margin):
+        axes.grid(alpha=0.25, lw=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=8)
+        axes.xaxis.label.set_size(9)
+        axes.yaxis.label.set_size(9)
     figure.suptitle(
         f"funnel proved from {funnel.t0:g} to {funnel.tf:g} s: "
         f"{len(design.found.proved.pieces)} pieces, "
@@ -47,36 +59,6 @@ def funnel_picture(design: FunnelDesign) -> Figure:
         ha="left",
     )
     return figure
-
-
-def tube_picture(funnel: ContinuousFunnel, goal: Goal) -> Figure:
-    """What a funnel's own files show: the tube with its nominal and the goal, and the widths."""
-    figure = Figure(figsize=(12, 7), layout="constrained")
-    rows: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1))
-    _tubes(rows[0], funnel, goal)
-    _widths(rows[1].subplots(1, 1), funnel)
-    _tidied(figure)
-    return figure
-
-
-def _tubes(row: Any, funnel: ContinuousFunnel, goal: Goal) -> None:
-    pairs = state_pairs(funnel.n)
-    over_time = range(min(funnel.n, PROJECTIONS - len(pairs)))
-    panels = np.atleast_1d(row.subplots(1, len(pairs) + len(over_time)))
-    for axes, pair in zip(panels, pairs, strict=False):
-        _tube(axes, funnel, pair, goal)
-    for i, axes in zip(over_time, panels[len(pairs) :], strict=True):
-        _tube_over_time(axes, funnel, i)
-    panels[0].legend(frameon=False, fontsize=8)
-
-
-def _tidied(figure: Figure) -> None:
-    for axes in figure.axes:
-        axes.grid(alpha=0.25, lw=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
-        axes.xaxis.label.set_size(9)
-        axes.yaxis.label.set_size(9)
 
 
 def state_pairs(n: int) -> list[tuple[int, int]]:
