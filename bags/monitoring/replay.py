@@ -83,14 +83,18 @@ class Replay:
 
     @property
     def said_wide(self) -> str:
-        """In how many samples the tube is wider than all that was measured here; empty if few."""
+        """In how many samples the tube is wider than all that was measured here; empty if few.
+
+        All that was measured: the range, or the largest value of a signal that hardly changes.
+        """
         judged = [r for r in self.judged if r.measured]
         widths = np.array(
             [list(r.half_widths) or [self.half_width] * len(r.measured) for r in judged]
         )
         if not widths.any():
             return ""
-        ranges = np.ptp(np.array([r.measured for r in judged]), axis=0)
+        measured = np.array([r.measured for r in judged])
+        ranges = np.maximum(np.ptp(measured, axis=0), np.abs(measured).max(axis=0))
         share = (widths > ranges).mean(axis=0)
         worst = int(np.argmax(share))
         if share[worst] <= MOST_WIDE:
@@ -98,7 +102,7 @@ class Replay:
         which = f" of output {worst}" if len(share) > 1 else ""
         return (
             f"in {100 * share[worst]:.0f} % of the samples judged the half-width{which} is more "
-            f"than the whole range measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
+            f"than all that was measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
             + ": the tube says nothing there"
         )
 
