@@ -18,15 +18,19 @@ Definition V (P : matrix) (x : list R) : R := dot x (image (map (map val) P) x).
    [Monotone e1 e2 e3 a shift]: 0 = e1 v + e2 v^2 + e3 v^3 + a'x + r_0, x+ = [v; shift x + r],
    y = v + d.
    [Cells maps into next out]: v_j = maps_j(into_j [v; x] + w_j), x+ = next [v; x] + r,
-   y = out [v; x] + d; a map is linear between its points (knot, value) and goes on beyond them.
+   y = out [v; x] + d; a map is linear between its points (knot, value), or a cubic spline on equal
+   intervals from its lowest knot on, and goes on beyond them as it ends.
    What depends on the inputs alone, d and r (and w of Cells), may be anything, another at each
    time: it is the same for two solutions. *)
+Inductive mapping :=
+| Broken (points : list (num * num))
+| Spline (low spacing : num) (coefficients : list num).
 Inductive model :=
 | Linear (a : list num)
 | Affine (p n : nat) (scale : list num) (range : list (num * num))
     (terms : list (list nat * matrix))
 | Monotone (e1 e2 e3 : num) (a : list num) (shift : matrix)
-| Cells (maps : list (list (num * num))) (into next out : matrix).
+| Cells (maps : list mapping) (into next out : matrix).
 
 Fixpoint through (a : num * num) (rest : list (num * num)) (s : R) : R :=
   match rest with
@@ -39,8 +43,29 @@ Fixpoint through (a : num * num) (rest : list (num * num)) (s : R) : R :=
       | _ => if Rle_dec s (val (fst b)) then line else through b rest' s
       end
   end.
-Definition mapped (f : list (num * num)) (s : R) : R :=
-  match f with [] => 0 | a :: rest => through a rest s end.
+(* On one interval: c_0 (1 - s)^3/6 + ... + c_3 s^3/6 where 0 <= s <= 1, straight on beyond. *)
+Definition cubic (a b c d s : R) : R :=
+  (a * (1 - s) ^ 3 + b * (3 * s ^ 3 - 6 * s ^ 2 + 4) + c * (- 3 * s ^ 3 + 3 * s ^ 2 + 3 * s + 1)
+    + d * s ^ 3) / 6.
+Definition cubic' (a b c d s : R) : R :=
+  ((b - a) * (1 - s) ^ 2 + (c - b) * (- 2 * s ^ 2 + 2 * s + 1) + (d - c) * s ^ 2) / 2.
+Definition piece (a b c d p : R) : R :=
+  let s := Rmax 0 (Rmin 1 p) in cubic a b c d s + (p - s) * cubic' a b c d s.
+Fixpoint spline (cs : list R) (p : R) : R :=
+  match cs with
+  | a :: ((b :: c :: d :: rest) as cs') =>
+      match rest with
+      | [] => piece a b c d p
+      | _ => if Rle_dec p 1 then piece a b c d p else spline cs' (p - 1)
+      end
+  | _ => 0
+  end.
+Definition mapped (f : mapping) (s : R) : R :=
+  match f with
+  | Broken [] => 0
+  | Broken (a :: rest) => through a rest s
+  | Spline low spacing cs => spline (map val cs) ((s - val low) / val spacing)
+  end.
 
 Fixpoint weighted (terms : list (list nat * matrix)) (w z : list R) (row : nat) : R :=
   match terms with

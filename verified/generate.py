@@ -172,8 +172,6 @@ class Increments:
         planned = type(about) is dict and "policy" in about and not stable
         roles = "model" if stable else "model policy funnel" if planned else "model funnel"
         (self.model, *others), digests = _bound(about, folder, roles, self.files)
-        if self.model.get("kind") == "block_cascade":
-            raise NotCovered("models of kind block_cascade are not covered")
         strict.held(self.files)
         if any(entry["model"] != digests["model"] for entry in others):
             raise Refused("a file names another model")
@@ -366,13 +364,18 @@ class Writer:
         if kind == "implicit":
             return self.implicit(model)
         if kind == "cell_network":
+            tables = (zip(f["knots"], f["values"], strict=True) for f in model["maps"])
             maps = to.listed(
-                to.listed(map(self.ends, zip(f["knots"], f["values"], strict=True)))
-                for f in model["maps"]
+                to.chosen("Broken", 0, to.listed(map(self.ends, table))) for table in tables
             )
             size = len(model["maps"]) + len(model["start"])
             known = ([row[:size] for row in model[key]] for key in ("into", "next", "output"))
             return to.chosen("Cells", 3, maps, *map(self.matrix, known))
+        if kind == "block_cascade":
+            f, parts = model["f"], printed.cascade(model, *printed.orders(model))
+            numbers = self.num(f["low"]), self.num(f["spacing"]), self.nums(f["coefficients"])
+            maps = to.listed([to.chosen("Spline", 1, *numbers)] * len(model["b1"]))
+            return to.chosen("Cells", 3, maps, *map(self.matrix, parts))
         raise NotCovered(f"models of kind {kind} are not covered")
 
     def affine(

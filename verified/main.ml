@@ -47,6 +47,10 @@ let witness () =
   let pushed = count () = 1 in
   { margin; basis; multiplier; sides; pieces; pushed; goal_multiplier = num () }
 
+let mapping () = match count () with
+  | 0 -> Broken (listed (pair num num))
+  | 1 -> let low = num () in let spacing = num () in Spline (low, spacing, nums ())
+  | _ -> failwith "a map"
 let model () = match count () with
   | 0 -> Linear (nums ())
   | 1 ->
@@ -57,7 +61,7 @@ let model () = match count () with
     let e1 = num () in let e2 = num () in let e3 = num () in let a = nums () in
     Monotone (e1, e2, e3, a, matrix ())
   | 3 ->
-    let maps = listed (fun () -> listed (pair num num)) in
+    let maps = listed mapping in
     let into = matrix () in let next = matrix () in Cells (maps, into, next, matrix ())
   | _ -> failwith "a model"
 let tube () =

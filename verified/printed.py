@@ -17,7 +17,7 @@ TOKEN = re.compile(r"-?\d+|[A-Za-z_][A-Za-z_0-9]*|%[a-z0-9]+|[\[\]();,]")
 SPACE = re.compile(r'("(?:[^"\\]|\\.)*")|\s+')
 # What comes before the terms of a constructor, for the extracted checker.
 TAGS = {"None": "0", "Some": "1", "Linear": "0", "Affine": "1", "Monotone": "2", "Leaf": "0"}
-TAGS |= {"Cells": "3", "Split": "1", "false": "0", "true": "1"}
+TAGS |= {"Cells": "3", "Broken": "0", "Spline": "1", "Split": "1", "false": "0", "true": "1"}
 TAGS |= {"Response": "0", "Peak": "1", "Energy": "2", "Fading": "3"}
 
 
@@ -359,13 +359,16 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
         table |= {_unit(1 + i, 1 + len(a)): [c] for i, c in enumerate(a)}
         return {"h": _table(table, like["h"], 1 + len(a)), **_shift(shift, len(a), like)}
     if term.name == "Cells":
-        maps, *known = terms
+        maps, known = term.terms[0], terms[1:]
+        if like["kind"] == "block_cascade":
+            return _cascade(maps, known, like)
         rows = {
             name: [row + [Fraction(c) for c in whole[len(row) :]]
                    for row, whole in zip(stated, like[name], strict=True)]
             for name, stated in zip(("into", "next", "output"), known, strict=True)
         }  # fmt: skip
-        points = [{"knots": [k for k, _ in f], "values": [v for _, v in f]} for f in maps]
+        tables = [number(f.terms[0]) for f in maps]
+        points = [{"knots": [k for k, _ in f], "values": [v for _, v in f]} for f in tables]
         return {"maps": points, **rows}
     p, n, scale, ends, rows = terms
     if like["kind"] == "implicit":
@@ -387,6 +390,78 @@ def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:
             raise Differs(f"two ranges of input {i}")
     kept = [ranges.get(i, list(map(Fraction, row))) for i, row in enumerate(like["u_range"])]
     return {"y_scale": scale, "G": G, "u_range": kept}
+
+
+def _cascade(maps: list[Made], known: list[Any], like: dict[str, Any]) -> dict[str, Any]:
+    """A spline between two filters; each row of b1 by its first entry, which the file has.
+
+    The states are v(t-1) ... v(t-n1), then the observer form of the second filter.
+    """
+    into, following, (out,) = known
+    M, n1, n2 = len(maps), *orders(like)
+    if any(f != maps[0] for f in maps) or len(following) != n1 + n2:
+        raise Differs("the model has other maps or another number of states")
+    low, spacing, coefficients = map(number, maps[0].terms)
+    a1 = following[0][M : M + n1] if n1 else []
+    a2 = [row[M + n1] for row in following[n1:]]
+    first = [Fraction(row[0]) for row in like["b1"]]
+    b1 = [
+        [b, *(c - b * a for c, a in zip(row[M : M + n1], a1, strict=True))]
+        for b, row in zip(first, into, strict=True)
+    ]
+    b2 = [
+        [out[j], *(row[j] - out[j] * a for row, a in zip(following[n1:], a2, strict=True))]
+        for j in range(M)
+    ]
+    made = {"a1": a1, "b1": b1, "a2": a2, "b2": b2}
+    if cascade(made | {"f": None}, n1, n2) != (into, following, [out]):
+        raise Differs("the model is no cascade")
+    return {
+        "f": {"low": low, "spacing": spacing, "coefficients": coefficients},
+        **{name: _cut(value, like[name], name) for name, value in made.items()},
+    }
+
+
+def _cut(rows: Any, like: Any, where: str) -> Any:
+    """Zeros behind what the file states are left out."""
+    if rows and type(rows[0]) is list:
+        return [_cut(row, other, where) for row, other in zip(rows, like, strict=True)]
+    if any(rows[len(like) :]):
+        raise Differs(f"{where} is longer in the theorem")
+    return rows[: len(like)]
+
+
+def orders(model: dict[str, Any]) -> tuple[int, int]:
+    """How many states the two filters of a cascade have."""
+    return tuple(max(len(model[a]), len(model[b][0]) - 1) for a, b in (("a1", "b1"), ("a2", "b2")))  # type: ignore[return-value]
+
+
+def cascade(model: dict[str, Any], n1: int, n2: int) -> tuple[Any, Any, Any]:
+    """Into, next and out of a cascade, by its members."""
+
+    def padded(row: list[Any], n: int) -> list[Fraction]:
+        return [Fraction(e) for e in row] + [Fraction(0)] * (n - len(row))
+
+    def unit(i: int, n: int) -> list[Fraction]:
+        return [Fraction(int(i == j)) for j in range(n)]
+
+    def through(rows: list[Any], a: list[Fraction], n: int) -> list[list[Fraction]]:
+        found = [padded(row, n + 1) for row in rows]
+        return [[b * c + e for c, e in zip(a, rest, strict=True)] for b, *rest in found]
+
+    M = len(model["b1"])
+    a1, a2 = padded(model["a1"], n1), padded(model["a2"], n2)
+    C, g = through(model["b1"], a1, n1), through(model["b2"], a2, n2)
+    zeros = [Fraction(0)] * M
+    into = [zeros + row + [Fraction(0)] * n2 for row in C]
+    following = [zeros + a1 + [Fraction(0)] * n2] if n1 else []
+    following += [unit(M + k, M + n1 + n2) for k in range(n1 - 1)]
+    for i in range(n2):
+        row = [g[j][i] for j in range(M)] + [Fraction(0)] * n1 + unit(i + 1, n2)
+        row[M + n1] += a2[i]
+        following.append(row)
+    out = [Fraction(row[0]) for row in model["b2"]] + [Fraction(0)] * n1 + unit(0, n2)
+    return into, following, [out]
 
 
 def _moved(n: int, p: int) -> list[list[Fraction]]:

@@ -171,6 +171,7 @@ def model(document: dict[str, Any]) -> Sizes:
     kinds = {
         "difference_equation": _difference, "state_affine": _affine,
         "monotone_equation": _monotone, "cell_network": _cells, "implicit": _implicit,
+        "block_cascade": _cascade,
     }  # fmt: skip
     head(document, "model", kinds)
     need(real(document.get("period"), "period") > 0, "the period should be > 0")
@@ -251,6 +252,24 @@ def _cells(model: dict[str, Any]) -> Sizes:
     matrix(model["next"], "next", n, m + n + inputs + 1)
     matrix(model["output"], "output", p, m + n + inputs + 1)
     return Sizes(n, m, p, inputs, 0)
+
+
+def _cascade(model: dict[str, Any]) -> Sizes:
+    _recorded(model, "a1 b1 f a2 b2", "equation")
+    for key in ("y", "u"):
+        signals([model[key]], key)
+    M, n = len(listed(model["b1"], "b1", 1, PHASES)), 0
+    for a, b in (("a1", "b1"), ("a2", "b2")):
+        rows = listed(model[b], b, M, M)
+        columns = len(listed(rows[0], b, 1, MOST))
+        matrix(rows, b, M, columns)
+        n += max(len(reals(model[a], a, 0, MOST)), columns - 1)
+    need(1 <= n <= STATES, f"{n} states")
+    f = members(model["f"], "f", "low spacing coefficients")
+    real(f["low"], "low")
+    need(real(f["spacing"], "spacing") > 0, "the spacing should be > 0")
+    reals(f["coefficients"], "coefficients", 4, MOST)
+    return Sizes(n, M, 1, 1, 0)
 
 
 def _implicit(model: dict[str, Any]) -> Sizes:

@@ -322,7 +322,9 @@ def push(
     out_file: Annotated[Path, typer.Option("--out", help="The problem to write, with its push.")],
     response: Annotated[list[str], typer.Option("--response", "-y", help="A state; repeat.")],
     command: Annotated[list[str], typer.Option("--command", "-u", help="An input; repeat.")],
-    period: PeriodOption = 0.0,
+    period: Annotated[
+        float, typer.Option(help="Seconds between samples; default: as they come.")
+    ] = 0.0,
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Over which a push is averaged; default one sample.")
     ] = 0.0,
@@ -414,11 +416,11 @@ def report(
     folder: Annotated[Path, typer.Argument(help="A design folder, of any kind.")],
     bags: Annotated[
         list[Path] | None,
-        typer.Argument(help="Bags whose losses are listed, and that are held against its funnel."),
+        typer.Argument(help="Their losses are listed; those that made no part of it are judged."),
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option(help="Takes `split.test` (which are held against it) and `monitor.nominal`."),
+        typer.Option(help="Takes `split.validation` (bags that are not judged) and `monitor`."),
     ] = None,
     page: Annotated[
         Path | None, typer.Option("--out", help="The page; default DIR/design.html.")
@@ -429,12 +431,13 @@ def report(
 ) -> None:
     """Make one page of a design folder: proofs, model, what it catches, pictures, recordings.
 
-    The proofs are decided again. The page needs nothing else, and prints.
+    The proofs are decided again. Of the bags, those are held against the funnel that it was not
+    made with. The page needs nothing else, and prints.
     """
     from bags.chain.config import load_config
     from bags.commands import show
     from bags.designs import documents
-    from bags.monitoring.replay import replay_bag
+    from bags.monitoring.replay import replay_bag, to_judge
     from bags.monitoring.watch import Watch
     from bags.pictures.folder_report import print_page, write_folder_report
     from bags.pictures.report import report_available
@@ -444,25 +447,32 @@ def report(
     settings = load_config(config) if config is not None else None
     target = page or folder / documents.DESIGN_REPORT
     recordings, replays, drawn = [], [], ""
+    used: list[str] = []
     if bags:
-        proved = documents.load_proved(folder / documents.FUNNEL)
+        proved = documents.load_proved(documents.funnel_of(folder))
         folders = expand_bags(bags)
         topics = Watch(proved.design, centre=show.centre_of(settings)).pairing.topics
         with progress_bar("reading") as progress:
             for done, bag in enumerate(folders):
                 progress(bag.name, done / len(folders))
                 recordings.append(bag_info(bag, topics=topics))
-        if settings is not None:
-            folders = [f for f in folders if f.name in settings.split.test] or folders
+        validation = settings.split.validation if settings is not None else ()
+        chosen = to_judge(proved.design, folders, validation=validation)
         with progress_bar("replaying") as progress:
-            for done, bag in enumerate(folders):
-                progress(bag.name, done / len(folders))
+            for done, bag in enumerate(chosen.judged):
+                progress(bag.name, done / len(chosen.judged))
                 replays.append(replay_bag(proved, bag, centre=show.centre_of(settings)))
+        used = chosen.said
+        out.print(show.replay_table(replays))
+        for line in used:
+            out.print(line, soft_wrap=True, markup=False, highlight=False)
         if report_available() and all(entry.half_width for entry in replays):
             from bags.pictures import plots
 
             drawn = plots.svg(plots.margins(replays))
-    write_folder_report(folder, target, recordings=recordings, replays=replays, drawn=drawn)
+    write_folder_report(
+        folder, target, recordings=recordings, replays=replays, used=used, drawn=drawn
+    )
     out.print(f"wrote {target}", soft_wrap=True)
     if pdf:
         print_page(target, target.with_suffix(".pdf"))
@@ -478,7 +488,7 @@ def monitor(
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(help="Takes `split.test` (which bags), `monitor.nominal`, `definitions`."),
+        typer.Option(help="Takes `monitor.nominal`, `definitions`; without it all are judged."),
     ] = None,
     definitions: Annotated[
         list[Path] | None, typer.Option(help=".msg files that the bags do not define.")
@@ -512,10 +522,10 @@ def monitor(
     from bags.designs.design import Wiring
     from bags.fleet.monitor import judged_of
     from bags.monitoring.falsify import falsified, refuse_unfalsifiable
-    from bags.monitoring.replay import replay_bag
+    from bags.monitoring.replay import replay_bag, to_judge
     from bags.pictures.report import report_available, write_margins
     from bags.recordings.definitions import read_definitions
-    from bags.recordings.folders import expand_bags, trial_name
+    from bags.recordings.folders import expand_bags
 
     if not replay:
         raise typer.BadParameter(
@@ -526,12 +536,12 @@ def monitor(
     proved = documents.load_proved(funnel, wiring=wiring)
     if falsify is not None:
         refuse_unfalsifiable(proved.design.model)
-    folders = every = expand_bags(bags)
+    folders = expand_bags(bags)
     if settings is not None:
-        folders = [f for f in every if trial_name(f) in settings.split.test] or every
-    if len(folders) < len(every):
-        said = f"{len(folders)} of {len(every)} bags: those in split.test of {config}"
-        err.print(f"{said}; without --config all are judged", soft_wrap=True)
+        chosen = to_judge(proved.design, folders, validation=settings.split.validation)
+        folders = list(chosen.judged)
+        for line in chosen.said:
+            err.print(f"{line}; without --config all are judged", soft_wrap=True, markup=False)
     types = read_definitions([*(definitions or []), *(settings.definitions if settings else ())])
     centre = show.centre_of(settings)
     with progress_bar("replaying") as progress:

@@ -45,7 +45,7 @@ ManifestOption = Annotated[
 ]
 WorkersOption = Annotated[
     int,
-    typer.Option("--workers", min=0, help="Processes that read, or share a sweep; 0: this one."),
+    typer.Option("--workers", min=0, help="Processes that share the work; 0: this one."),
 ]
 SchedulerOption = Annotated[
     str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")

@@ -148,6 +148,23 @@ class WiredDesign(Generic[M, P, F]):
         named: Any = self.funnel if self.funnel is not None else self.policy
         return self.composition or files.digest(named.document())
 
+    @property
+    def made_with(self) -> dict[str, str]:
+        """What recordings were used for (training, calibration or both), by their digests."""
+        trained: set[str] = set()
+        calibrated: set[str] = set()
+        for stage in self.stages:
+            model, funnel = stage.model, stage.funnel
+            trained |= {digest for _, digest in getattr(model, "bags", ())}
+            for tube in funnel.tubes if isinstance(funnel, TubeFunnel) else ():
+                trained |= {digest for _, digest in tube.designed_on}
+                calibrated |= {digest for _, digest in tube.measured_on}
+        parts = {"training": trained, "calibration": calibrated}
+        return {
+            digest: " and ".join(use for use, part in parts.items() if digest in part)
+            for digest in trained | calibrated
+        }
+
     def monitor(self, centre: Centre) -> Monitor:
         """A monitor for one run; centre: of a tube with a policy."""
         if self.later:

@@ -60,6 +60,12 @@ def load_model(path: Path | str) -> DifferenceEquation:
     return DifferenceEquation.from_document(files.load_document(path), source=str(path))
 
 
+def funnel_of(folder: Path) -> Path:
+    """What `load_proved` reads in a design folder: its composition if it has one, or its funnel."""
+    composition = folder / designs.COMPOSITION
+    return composition if composition.is_file() else folder / FUNNEL
+
+
 def load_proved(path: Path | str, *, wiring: Wiring | None = None) -> Proved[AnyDesign]:
     """Read a funnel with the model, policy and proof beside it, and check the proof.
 

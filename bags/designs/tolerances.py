@@ -26,6 +26,10 @@ CONTROLLER, VALIDATOR, TABLE = (
     "tolerances.txt",
 )
 POSITIONS, VELOCITIES = ("rad", "m"), ("rad/s", "m/s")
+SIMULATED = (
+    "these numbers are about the model's simulation, and a controller compares with its reference. "
+    "Add to each how far the simulation is from the reference (docs/tutorial-arm.md, step 4)."
+)
 NAMED = re.compile(r"\[name=([^\]]+)\]")  # an element of a message that is found by its name
 
 
@@ -60,11 +64,13 @@ class Tolerances:
     """What a proved funnel says of every signal.
 
     about: what the signals are compared with. verdict: the claim that each number comes from.
+    before_use: what has to be added to each number first; empty where nothing has.
     """
 
     entries: tuple[Tolerance, ...]
     about: str
     verdict: Verdict
+    before_use: str = ""
 
     def write(self, folder: Path) -> list[Path]:
         """The table, and the files that these signals have entries in."""
@@ -135,7 +141,8 @@ class Tolerances:
             f"{e.signal.name:{width}}  {e.path:>10}  {e.goal:>10}  {e.signal.unit}".rstrip()
             for e in self.entries
         ]
-        return "\n".join([*lines, "", *self._claim()])
+        last = ["", f"BEFORE USE: {self.before_use}"] if self.before_use else []
+        return "\n".join([*lines, "", *self._claim(), *last])
 
     def _of(self, units: Sequence[str]) -> list[Tolerance]:
         return [entry for entry in self.entries if entry.signal.unit in units]
@@ -148,8 +155,9 @@ class Tolerances:
         ]
 
     def _source(self) -> list[str]:
-        said = ["Every number is a bound of this claim, rounded up:", *self._claim()]
-        return [f"# {line}" for line in said]
+        first = [f"BEFORE USE: {self.before_use}", ""] if self.before_use else []
+        said = [*first, "Every number is a bound of this claim, rounded up:", *self._claim()]
+        return [f"# {line}".rstrip() for line in said]
 
 
 def tolerances(folder: Path | str) -> Tolerances:
@@ -159,6 +167,7 @@ def tolerances(folder: Path | str) -> Tolerances:
     """
     design = designs.load_design(folder)
     funnel: Any = design.funnel
+    before_use = ""
     if isinstance(funnel, ContinuousFunnel):
         raise DataError(
             f"{folder}: a funnel of given equations has sets of states and no signals; tolerances "
@@ -181,11 +190,12 @@ def tolerances(folder: Path | str) -> Tolerances:
             )
         path = goal = funnel.half_widths
         about = "what the model simulates from the commands that were sent, not with the commands"
+        before_use = SIMULATED
         if design.policy is not None:
             about += "; or with the plan in policy.json where the policy drives"
     rows = zip(signals, path.tolist(), goal.tolist(), strict=True)
     entries = (Tolerance(s, text.above(Fraction(p)), text.above(Fraction(g))) for s, p, g in rows)
-    return Tolerances(tuple(entries), about, design.verdict)
+    return Tolerances(tuple(entries), about, design.verdict, before_use)
 
 
 def _float(number: str) -> str:

@@ -247,13 +247,8 @@ def monitor_fleet(
             for answer in ask(task, bags, workers, kept, progress=progress)
         ]
     design: Any = proved.design
-    made_of: set[str] = set()
-    if isinstance(design.funnel, TubeFunnel):
-        for tube in design.funnel.tubes:
-            made_of |= {digest for _, digest in (*tube.designed_on, *tube.measured_on)}
-    return FleetVerdict(
-        tuple(counted_once(rows)), calibration_spent(funnel, design), frozenset(made_of)
-    )
+    made_of = frozenset(design.made_with)
+    return FleetVerdict(tuple(counted_once(rows)), calibration_spent(funnel, design), made_of)
 
 
 def counted_once(rows: Sequence[Judged]) -> list[Judged]:

@@ -1,7 +1,7 @@
 """Offline monitoring: a bag's messages through the same sampling and monitor as the live node."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,8 +14,10 @@ from bags.monitoring.announcement import Run
 from bags.monitoring.watch import Forecasted, Stamped, Watch
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
 from bags.recordings.message_types import decode
 from bags.recordings.remote import place
+from bags.signals.reader import bag_digest
 from bags.signals.sampling import FILLED, LOST, MOST_FILLED, Sample, Sampler, said_filled
 from nlsid_core import files
 from nlsid_core.errors import BagError
@@ -81,14 +83,18 @@ class Replay:
 
     @property
     def said_wide(self) -> str:
-        """In how many samples the tube is wider than all that was measured here; empty if few."""
+        """In how many samples the tube is wider than all that was measured here; empty if few.
+
+        All that was measured: the range, or the largest value of a signal that hardly changes.
+        """
         judged = [r for r in self.judged if r.measured]
         widths = np.array(
             [list(r.half_widths) or [self.half_width] * len(r.measured) for r in judged]
         )
         if not widths.any():
             return ""
-        ranges = np.ptp(np.array([r.measured for r in judged]), axis=0)
+        measured = np.array([r.measured for r in judged])
+        ranges = np.maximum(np.ptp(measured, axis=0), np.abs(measured).max(axis=0))
         share = (widths > ranges).mean(axis=0)
         worst = int(np.argmax(share))
         if share[worst] <= MOST_WIDE:
@@ -96,7 +102,7 @@ class Replay:
         which = f" of output {worst}" if len(share) > 1 else ""
         return (
             f"in {100 * share[worst]:.0f} % of the samples judged the half-width{which} is more "
-            f"than the whole range measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
+            f"than all that was measured here, {ranges[worst]:.3g} {self.unit}".rstrip()
             + ": the tube says nothing there"
         )
 
@@ -188,6 +194,42 @@ def _filled(reading: Reading) -> bool:
 
 def _unjudged(reading: Reading) -> bool:
     return reading.status is Status.UNKNOWN and not reading.starts and not _filled(reading)
+
+
+@dataclass(frozen=True)
+class ToJudge:
+    """Bags to hold against a design, and those that it was made with, each with its use.
+
+    One that it was made with is judged only if all of them are such.
+    """
+
+    judged: tuple[Path, ...]
+    used: Mapping[Path, str]
+
+    @property
+    def said(self) -> list[str]:
+        """A line for each use, with the names of its bags; empty if there is none."""
+        uses: dict[str, list[str]] = {}
+        for path, use in self.used.items():
+            uses.setdefault(use, []).append(trial_name(path))
+        what = "judged all the same" if set(self.judged) & set(self.used) else "not judged"
+        return [f"{what}: {', '.join(names)} (used for {use})" for use, names in uses.items()]
+
+
+def to_judge(design: AnyDesign, bags: Sequence[Path], *, validation: Sequence[str] = ()) -> ToJudge:
+    """The bags that the design was not made with, by their content, else all of them.
+
+    A verdict on a recording that made a design says little. validation: names of bags that orders
+    and bases were chosen by.
+    """
+    made_with = design.made_with
+    used: dict[Path, str] = {}
+    for bag in bags:
+        if use := made_with.get(bag_digest(bag)):
+            used[bag] = use
+        elif trial_name(bag) in validation:
+            used[bag] = "validation"
+    return ToJudge(tuple(bag for bag in bags if bag not in used) or tuple(bags), used)
 
 
 def replay_bag(

@@ -5,22 +5,27 @@ it is made. What `nlsid identify` and `nlsid funnel` have drawn into the folder'
 """
 
 import base64
+import hashlib
 import math
 import os
+import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
+from importlib.metadata import version
 from pathlib import Path
 
 from bags.designs import documents
+from bags.designs.design import is_tube
 from bags.monitoring.replay import Replay
-from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE
+from bags.pictures.equations_report import equations_chapter
+from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, report_available
 from bags.tools.info import GAP, BagInfo, TopicInfo
 from nlsid_core import files, kernel
-from nlsid_core.errors import DataError, DocumentError
+from nlsid_core.errors import DataError, DocumentError, NlsidError
 
 # Nothing but what stands in the page itself is shown or run, whatever a folder's files say.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -38,12 +43,14 @@ td code { white-space: nowrap } .digests td code { white-space: normal }
   th, td:first-child, td[colspan] { white-space: normal }
   body { max-width: none; margin: 0; font-size: 11pt } }
 """
+ROBOT = re.compile(r"<h1>([^<]*): identified model</h1>")
+FUNNEL_CAPTION = "The funnel: the tube around the motion"
 PICTURES = {
     documents.SELECTION_PLOT: "Orders and bases, chosen by validation",
     documents.COMPARISON_PLOT: "Classes and methods on the same test trials",
     documents.FREE_RUN_PLOT: "The model in free run",
     documents.MOTION_PLOT: "The motion that the policy tracks",
-    documents.FUNNEL_PLOT: "The funnel",
+    documents.FUNNEL_PLOT: FUNNEL_CAPTION,
     documents.CATCHING_PLOT: "What the funnel can catch",
     documents.MARGIN_PLOT: "Recordings held against the funnel, when they were last replayed",
 }
@@ -59,15 +66,17 @@ def write_folder_report(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> None:
     """Write the page of a design folder.
 
     recordings: bags whose losses are listed, with the topics to list. replays: bags held against
-    its funnel, `drawn` their picture as <svg> or empty. Raises DocumentError if the folder has
+    its funnel, `drawn` their picture as <svg> or empty; used: lines about bags that the design was
+    made with. Raises DocumentError if the folder has
     neither a proof nor a report.
     """
-    page = folder_page(folder, recordings=recordings, replays=replays, drawn=drawn)
+    page = folder_page(folder, recordings=recordings, replays=replays, used=used, drawn=drawn)
     files.write_atomically(out, page.encode())
 
 
@@ -102,24 +111,27 @@ def folder_page(
     *,
     recordings: Sequence[BagInfo] = (),
     replays: Sequence[Replay] = (),
+    used: Sequence[str] = (),
     drawn: str = "",
 ) -> str:
     """The whole page as text."""
-    proofs = sorted(folder.glob("*.proof.json"))
-    decided = "".join(_proof(path) for path in proofs)
+    proofs = {path.name: _decided(path) for path in sorted(folder.glob("*.proof.json"))}
+    decided = "".join(_proof(name, found) for name, found in proofs.items())
     model = _model_chapter(folder / documents.REPORT)
     if model and REJECTED in decided:
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     if not proofs and not model:
         raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
+    funnel = "" if REJECTED in decided else equations_chapter(folder)
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     chapters = {
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
+        "funnel": ("The funnel of these equations", funnel),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
+        "replays": ("Recordings held against the funnel", _replays(replays, used, drawn)),
         "recordings": ("Recordings and their losses", _recordings(recordings)),
-        "replays": ("Recordings held against the funnel", _replays(replays, drawn)),
-        "files": ("Files", _files(folder)),
+        "files": ("Files", _files(folder, proofs)),
     }
     present = {key: found for key, found in chapters.items() if found[1]}
     links = "".join(f'<a href="#{key}">{title}</a>' for key, (title, _) in present.items())
@@ -128,36 +140,43 @@ def folder_page(
         for key, (title, text) in present.items()
     )
     name = escape(folder.resolve().name)
+    robot = _robot(folder / documents.REPORT) or name
     return f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{name}: design</title>
+<html lang="en"><meta charset="utf-8"><title>{robot}: design</title>
 <meta http-equiv="Content-Security-Policy" content="{POLICY}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>{STYLE}{PRINT}</style>
-<h1>{name}</h1>
+<h1>{robot}</h1>
+<p class="note">Folder {name}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC, nlsid {version("nlsid")}</p>
 <nav>{links}</nav>
 {body}
-<p class="note">Made {datetime.now(UTC):%Y-%m-%d %H:%M} UTC by nlsid.</p>
 </html>
 """
 
 
-def _proof(path: Path) -> str:
-    """A certificate, decided now."""
-    name = escape(path.name)
+def _robot(report: Path) -> str:
+    """What the configuration calls the robot, as the model's own page has it; or nothing."""
+    if not report.is_file():
+        return ""
+    found = ROBOT.search(report.read_text(encoding="utf-8", errors="replace"))
+    return found[1] if found else ""
+
+
+def _decided(path: Path) -> kernel.Verdict | str:
+    """A certificate, decided now: the verdict, or why it is none."""
     try:
-        verdict = kernel.check(path)
+        return kernel.check(path)
     except (kernel.Rejected, OSError) as refusal:
-        return f'<h3>{name}</h3><p class="not">{REJECTED}: {escape(str(refusal))}</p>'
-    said, *assuming = str(verdict).split("\n")
+        return str(refusal)
+
+
+def _proof(name: str, found: kernel.Verdict | str) -> str:
+    """What was decided of it, in words."""
+    if isinstance(found, str):
+        return f'<h3>{escape(name)}</h3><p class="not">{REJECTED}: {escape(found)}</p>'
+    said, *assuming = str(found).split("\n")
     assumptions = "".join(f"<li>{escape(line.strip())}</li>" for line in assuming)
-    digests = "".join(
-        f"<tr><td>{escape(role)}</td><td><code>{escape(digest)}</code></td></tr>"
-        for role, digest in verdict.digests.items()
-    )
-    return (
-        f'<h3>{name}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
-        f'<table class="left digests"><tbody>{digests}</tbody></table>'
-    )
+    return f'<h3>{escape(name)}</h3><p class="proved">{escape(said)}</p><ul>{assumptions}</ul>'
 
 
 def _model_chapter(report: Path) -> str:
@@ -186,39 +205,82 @@ def _pictures(folder: Path, *, without: set[str]) -> str:
                 f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
                 f"<figcaption>{caption}</figcaption></figure>"
             )
+    if not (folder / documents.FUNNEL_PLOT).is_file() and (drawn := _drawn_funnel(folder)):
+        figures.append(f"<figure>{drawn}<figcaption>{FUNNEL_CAPTION}</figcaption></figure>")
     return "".join(figures)
 
 
+def _drawn_funnel(folder: Path) -> str:
+    """A proved funnel around a motion, from its files, as <svg>; empty where there is none."""
+    path = documents.funnel_of(folder)
+    if not path.is_file() or not report_available():
+        return ""
+    try:
+        design = documents.load_proved(path).design
+    except (NlsidError, OSError):
+        return ""  # the chapter on the proofs says why
+    if is_tube(design):
+        return ""  # as wide always, or as the commands move it: `catching.png` has it
+    from bags.pictures import plots, tracking_plots
+
+    return plots.svg(tracking_plots.draw_tube(design))
+
+
 def _recordings(recordings: Sequence[BagInfo]) -> str:
-    """A row for each topic of each bag: how much came, how regularly, and what was lost."""
+    """A row for each topic of each bag: how much came, how regularly, and what was lost.
+
+    Bags with nothing to say of a topic share one row.
+    """
     if not recordings:
         return ""
     names = ("bag", "topic", "messages", "rate", "gaps", "longest interval", "lost", "remarks")
     head = "".join(f"<th>{name}</th>" for name in names)
-    rows = "".join(_recorded(info, topic) for info in recordings for topic in info.topics)
+    listed = [(info, topic) for info in recordings for topic in info.topics]
+    quiet: dict[str, list[tuple[BagInfo, TopicInfo]]] = {}
+    for info, topic in listed:
+        if not (topic.gaps or info.lost(topic) or _remarks(info, topic)):
+            quiet.setdefault(topic.topic, []).append((info, topic))
+    together = {id(topic) for alike in quiet.values() for _, topic in alike}
+    apart = [pair for pair in listed if id(pair[1]) not in together]
+    rows = "".join(map(_recorded, [*([pair] for pair in apart), *quiet.values()]))
     return f"""<table class="left"><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
 <p class="note">Gap: an interval of more than {GAP:g} times the median one. Lost: by
 the recorder's count or by the sequence numbers in the file; "not counted" where neither
 counts.</p>"""
 
 
-def _recorded(info: BagInfo, topic: TopicInfo) -> str:
-    lost = info.lost(topic)
-    remarks = [*([f"unfinished: {info.ending}"] if info.ending else []), *topic.odd]
+def _remarks(info: BagInfo, topic: TopicInfo) -> list[str]:
+    return [*([f"unfinished: {info.ending}"] if info.ending else []), *topic.odd]
+
+
+def _recorded(alike: Sequence[tuple[BagInfo, TopicInfo]]) -> str:
+    """One topic of a bag, or of several with nothing to say of it."""
+    (info, topic), *others = alike
+    topics = [topic for _, topic in alike]
+    lost = [of.lost(each) for of, each in alike]
     cells = [
-        info.path.name,
+        f"{info.path.name} and {len(others)} more" if others else info.path.name,
         topic.topic,
-        str(topic.count),
-        "-" if math.isnan(topic.rate) else f"{topic.rate:.4g} Hz",
+        _between([each.count for each in topics]),
+        _between([each.rate for each in topics], " Hz"),
         str(topic.gaps),
-        "-" if math.isnan(topic.longest) else f"{topic.longest:.3g} s",
-        "not counted" if lost is None else str(lost),
-        "; ".join(remarks) or "none",
+        _between([max(each.longest for each in topics)], " s"),
+        "not counted" if None in lost else _between([of for of in lost if of is not None]),
+        "; ".join(_remarks(info, topic)) or "none",
     ]
     return "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
 
 
-def _replays(replays: Sequence[Replay], drawn: str) -> str:
+def _between(values: Sequence[float], unit: str = "") -> str:
+    """One number, or from the least to the largest; - where there is none."""
+    known = [value for value in values if not math.isnan(value)]
+    if not known:
+        return "-"
+    ends = dict.fromkeys(f"{value:.4g}" for value in (min(known), max(known)))
+    return f"{' to '.join(ends)}{unit}"
+
+
+def _replays(replays: Sequence[Replay], used: Sequence[str], drawn: str) -> str:
     if not replays:
         return ""
     rows = "".join(_replay(replay) for replay in replays)
@@ -226,9 +288,15 @@ def _replays(replays: Sequence[Replay], drawn: str) -> str:
         f"<th>{name}</th>"
         for name in ("bag", "verdict", "least margin", "at", "assumption used", "judged")
     )
-    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>
+    wide = "".join(
+        f'<p class="not">{escape(f"{replay.name}: {replay.said_wide}")}</p>'
+        for replay in replays
+        if replay.said_wide
+    )
+    lines = "".join(f"<p>{escape(line[0].upper() + line[1:])}.</p>" for line in used)
+    return f"""<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>{lines}
 <p class="note">Margin: 1 on the nominal, 0 on the boundary of the tube. Used: the
-most of what is assumed that any judged sample used.</p>{drawn}"""
+most of what is assumed that any judged sample used.</p>{wide}{drawn}"""
 
 
 def _replay(replay: Replay) -> str:
@@ -246,10 +314,26 @@ def _replay(replay: Replay) -> str:
     )
 
 
-def _files(folder: Path) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(path.name)}</td><td>{path.stat().st_size} B</td></tr>"
-        for path in sorted(folder.iterdir())
-        if path.is_file()
+def _files(folder: Path, proofs: Mapping[str, kernel.Verdict | str]) -> str:
+    """Every file with its digest, and of which proofs it is a part, byte for byte."""
+    parts: dict[str, list[str]] = {}
+    for name, found in proofs.items():
+        for role, digest in {} if isinstance(found, str) else found.digests.items():
+            part = "decided" if role == "proof" else f"{role} of {name}"
+            parts.setdefault(digest, []).append(part)
+    rows = []
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and path.stem != Path(documents.DESIGN_REPORT).stem:
+            with path.open("rb") as stream:
+                digest = f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
+            size = f"{path.stat().st_size / 1e3:,.1f}\N{NO-BREAK SPACE}kB"
+            rows.append((path.name, size, digest, parts.get(digest, [])))
+    here = {digest for _, _, digest, _ in rows}
+    rows += [("not in this folder", "-", digest, parts[digest]) for digest in parts.keys() - here]
+    body = "".join(
+        f"<tr><td>{escape(name)}</td><td>{length}</td><td>{escape('; '.join(part)) or '-'}</td>"
+        f"<td><code>{escape(digest)}</code></td></tr>"
+        for name, length, digest, part in rows
     )
-    return f"<table><tbody>{rows}</tbody></table>"
+    head = "<tr><th>file</th><th>size</th><th>part of a proof</th><th>digest</th></tr>"
+    return f'<table class="left digests"><thead>{head}</thead><tbody>{body}</tbody></table>'

@@ -1,5 +1,6 @@
 """Pictures of an identified model (extra `report`: matplotlib). Each function returns a Figure."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,8 @@ MOST_TRIALS = 12  # drawn; with more trials those with the largest errors
 LONGEST = 400  # samples drawn of a trial: around its largest error
 DRAWN = 800  # points of a residual over time
 COLUMNS = 4
+BARS = 12  # steps of a search that are drawn as bars with their names, at most
+ITERATE = re.compile(r"(certified )?iterate \d+")
 LOGARITHMIC = 30.0  # largest over smallest value from which on an axis is logarithmic
 
 
@@ -104,14 +107,14 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
 def search_history(history: History) -> Figure:
     """The value each step of the search reached; choices by name, iterates as a line."""
     values = [step.value for step in history.steps]
-    if all(step.what.rpartition(" ")[2].isdigit() for step in history.steps):
+    if len(values) > BARS or all(ITERATE.fullmatch(step.what) for step in history.steps):
         figure = Figure(figsize=(4.6, 3.0), layout="constrained")
         axes = figure.subplots()
         axes.plot(np.arange(1, len(values) + 1), values, ".-", color=BLUE, lw=LINE, ms=5)
         if min(values) > 0 and max(values) > LOGARITHMIC * min(values):
             axes.set_yscale("log")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_xlabel("iterate", fontsize=8)
+        axes.set_xlabel(f"{history.steps[0].what} to {history.steps[-1].what}", fontsize=8)
     else:
         figure = Figure(figsize=(6.2, 0.25 * len(values) + 0.8), layout="constrained")
         axes = figure.subplots()

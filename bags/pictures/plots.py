@@ -75,8 +75,9 @@ def margins(replays: Sequence[Replay]) -> Figure:
         handles += found[0]
         labels += found[1]
     figure.legend(
-        handles, labels, loc="outside upper left", ncols=len(labels), fontsize=8, frameon=False
-    )
+        handles, labels, loc="outside upper left", ncols=min(len(labels), 2 * columns),
+        fontsize=8, frameon=False,
+    )  # fmt: skip
     return figure
 
 

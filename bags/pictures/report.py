@@ -279,7 +279,7 @@ def _residuals(chosen: Candidate[Model], test: Dataset) -> str:
 <p class="note">Shaded: where 99 % of the values would lie if the one-step residual were white, or
 independent of the input. White noise on the measurement leaves the simulation residual white, white
 noise in the equation the one-step residual; if neither is white, the model leaves dynamics
-unexplained or the noise is coloured.</p>"""
+unexplained, the noise is coloured, or there is noise of both kinds.</p>"""
 
 
 def _inside(fit: Fit[Model]) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of `nlsid track` (extra `report`: matplotlib): free run, motion, funnel, runs."""
+"""Pictures of funnels around motions (extra `report`): free run, motion, funnel, tube, runs."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -8,9 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bags.designs.design import AnyDesign
 from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset
+from nlsid_core.dynamics import VectorField
+from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.funnels.sampled import SampledFunnel
 from nlsid_core.identification.states import free_run_error, stretches_in_box
 from nlsid_core.models import Signal
@@ -20,6 +23,7 @@ from nlsid_core.running.assumption import disturbance_of
 from nlsid_core.running.reading import Reading, Status
 
 TUBE = "#c9deef"
+TIMES = 200  # at which a continuous tube is drawn
 NOISE_BAND = 2.0  # standard deviations of the sensors
 COLOURS = {Status.INSIDE: BLUE, Status.ASSUMPTION_VIOLATED: ORANGE, Status.OUTSIDE: RED}
 MANY_BOUNDS = 3.0  # from which on the logarithm of a disturbance over its bound is drawn ...
@@ -118,6 +122,40 @@ def draw_funnel(
     )
     _legend(figure, panels[:1])
     return figure
+
+
+def draw_tube(design: AnyDesign) -> Figure:
+    """Each state's tube around the motion, over time; of a composition, stage after stage."""
+    model = design.model
+    names = [f"x{i}" for i in range(model.n)] if isinstance(model, VectorField) else [
+        _name(signal) for signal in design.signals[0]
+    ]  # fmt: skip
+    figure, panels = _grid(len(names))
+    for number, stage in enumerate(design.stages, 1):
+        t, x, widths = _band(stage)
+        for i, axes in enumerate(panels):
+            axes.fill_between(
+                t, x[:, i] - widths[:, i], x[:, i] + widths[:, i], color=TUBE, lw=0,
+                label="tube" if number == 1 else None,
+            )  # fmt: skip
+            axes.plot(t, x[:, i], color=INK, lw=LINE, label="motion" if number == 1 else None)
+            if number > 1:
+                axes.axvline(t[0], color=GREY, lw=LINE, ls=":")
+    for axes, name in zip(panels, names, strict=True):
+        axes.set_title(name, fontsize=9, loc="left")
+    _legend(figure, panels[:1])
+    return figure
+
+
+def _band(design: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of one stage: times in s, the motion (N, n) and the half-widths (N, n) at them."""
+    policy, funnel = design.policy, design.funnel
+    if isinstance(funnel, ContinuousFunnel):
+        t = np.linspace(funnel.t0, funnel.tf, TIMES)
+        return t, funnel.x(t), np.array([funnel.widths(float(when)) for when in t])
+    assert isinstance(policy, SampledPolicy), "a tube around a simulation has no motion"
+    assert isinstance(funnel, SampledFunnel), "with such a policy"
+    return _times(policy), policy.x, funnel.half_widths
 
 
 def feedback_reach(policy: SampledPolicy, funnel: SampledFunnel) -> FloatArray:

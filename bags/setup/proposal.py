@@ -76,6 +76,7 @@ class Proposal:
     walls: list[str] = field(default_factory=list)
     error: float = math.inf  # %, of the best model that was tried, in simulation
     tried_on: str = "trials held back"
+    varies: str = ""  # by how much the response does in these
 
     @property
     def expectation(self) -> str:
@@ -83,7 +84,8 @@ class Proposal:
         if math.isinf(self.error):
             return "no model that was tried is stable: expect identification to refuse"
         grade = next((word for most, word in GRADES if self.error <= most), "poor: it says little")
-        return f"expect {self.error:.3g} % error in simulation (of {self.tried_on}): {grade}"
+        of = self.tried_on + self.varies
+        return f"expect {self.error:.3g} % error in simulation (of {of}): {grade}"
 
     def config(self, definitions: Sequence[Path] = ()) -> Config:
         """As the later steps read it."""
@@ -570,6 +572,7 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
         )
         return
     best = proposal.error = min(known.values())
+    proposal.varies = _varies(train.select(held_back))
     good = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
     others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
     for lags in (good, *others):
@@ -622,6 +625,7 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
     if not known:
         return
     best = proposal.error = min(known.values())
+    proposal.varies = _varies(train.select(held_back))
     good = min((c for c, error in known.items() if error * LAGS_BETTER <= best),
                key=lambda c: c.lags + _terms(c))  # fmt: skip
     section |= {"lags": good.lags, "right_degree": good.right_degree}
@@ -640,6 +644,16 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
         proposal.walls.append(_poor(best, "trials held back"))
 
 
+def _varies(trials: Dataset) -> str:
+    """What a percentage of these trials is of: calmer trials have a larger one."""
+    first = trials.trajectories[0]
+    if len(first.y_names) != 1:
+        return ""
+    spread = float(np.std(np.concatenate([trial.y for trial in trials])))
+    of = f"{first.y_names[0]} varies by {spread:.3g} {first.y_units[0]}".rstrip()
+    return f", in which {of}, rms; of calmer test trials it is more"
+
+
 def _terms(tried: StateAffineClass) -> int:
     """Of the polynomial in the inputs."""
     window = len(tried.window(len(tried.input_range or ())))
@@ -649,7 +663,9 @@ def _terms(tried: StateAffineClass) -> int:
 def _poor(best: float, where: str) -> str:
     return (
         f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
-        "will be wide; another pair of signals, or more of them, may say more"
+        "will be wide; another pair of signals, or more of them, may say more. Not tried here: "
+        "`model: feedback` for what swings on a spring that stiffens, `cells` for dry friction and "
+        "for levels that flow over, `block_cascade` for what saturates"
     )
 
 

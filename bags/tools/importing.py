@@ -1,6 +1,7 @@
 """Tables (CSV, MAT, HDF5) to a bag of standard messages."""
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -266,10 +267,14 @@ def _stamps(rows: int, period: float | None, time: FloatArray | None, start_ns: 
         raise DataError(f"no time in row {unknown[0]} ({len(unknown)} such rows)")
     seconds = start_ns / 1e9 + time[:rows]
     if len(wrong := np.flatnonzero((seconds < 0) | (seconds >= STAMP_SECONDS))):
+        first = seconds[wrong[0]]
+        remedy = "give the column in seconds, or another --start"
+        if first < 0:
+            later = start_ns / 1e9 + math.ceil(-float(np.min(seconds)))
+            remedy = f"--start {later:.0f} moves all times to after 0"
         raise DataError(
-            f"the time of row {wrong[0]} is {seconds[wrong[0]]:.15g} s since 1970 ({len(wrong)} "
-            f"such rows); stamps go from 0 to {STAMP_SECONDS} s: give the column in seconds, or "
-            "another --start"
+            f"the time of row {wrong[0]} is {first:.15g} s since 1970 ({len(wrong)} such rows); "
+            f"stamps go from 0 to {STAMP_SECONDS} s: {remedy}"
         )
     stamps: IntArray = start_ns + np.rint(time[:rows] * 1e9).astype(np.int64)
     if len(back := np.flatnonzero(np.diff(stamps) <= 0)):

@@ -16,6 +16,7 @@ ROOMS = (
 ARRAY = re.compile(
     r"(?:numpy\.)?ndarray\[tuple\[Any, \.\.\.\], (?:numpy\.)?dtype\[[\w.\[\]]*?\]+\]"
 )
+FUNCTION = re.compile(r"<function (\w+)(?: at 0x[0-9a-f]+)?>")
 INDEX = """# API
 
 Made from the docstrings. Nouns are frozen dataclasses and arrays, verbs are functions.
@@ -27,7 +28,7 @@ Made from the docstrings. Nouns are frozen dataclasses and arrays, verbs are fun
 
 
 def modules(package: ModuleType) -> Iterator[ModuleType]:
-    """The package and all public modules in it, first those whose names it offers itself."""
+    """The package and all public modules in it: first a verb's, then what else it offers."""
     yield package
     offered = {
         getattr(package, name).__module__
@@ -39,7 +40,8 @@ def modules(package: ModuleType) -> Iterator[ModuleType]:
         for found in pkgutil.walk_packages(getattr(package, "__path__", []), f"{package.__name__}.")
         if not any(part.startswith("_") for part in found.name.split("."))
     ]
-    for name in sorted(names, key=lambda name: (name not in offered, name)):
+    verbs = {f"{package.__name__}.{name}" for name in getattr(package, "__all__", ())}
+    for name in sorted(names, key=lambda name: (name not in verbs, name not in offered, name)):
         yield importlib.import_module(name)
 
 
@@ -88,8 +90,8 @@ def write(folder: Path) -> set[str]:
 
 
 def short(signature: str) -> str:
-    """A signature with arrays named as they are in the source."""
-    return ARRAY.sub("Array", signature)
+    """A signature with arrays, and functions as defaults, named as they are in the source."""
+    return FUNCTION.sub(r"\1", ARRAY.sub("Array", signature))
 
 
 def literal(lines: list[str]) -> list[str]:

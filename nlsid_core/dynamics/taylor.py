@@ -220,9 +220,11 @@ class Cubic:
         )
 
     def __call__(self, t: float, X: FloatArray, U: FloatArray, w: FloatArray) -> FloatArray:
-        """ẋ (N, n) of the cubics at X (N, n) and U (N, m), with w (n_w + remainders,)."""
+        """ẋ (N, n) of the cubics at X (N, n), U (N, m) and w (..., n_w + remainders)."""
         rates, given = self.rates, len(self.rates.uncertain)
-        z = np.hstack([np.full((len(X), 1), t), X, U, np.broadcast_to(w[:given], (len(X), given))])
+        z = np.hstack(
+            [np.full((len(X), 1), t), X, U, np.broadcast_to(w[..., :given], (len(X), given))]
+        )
         result = np.empty((len(X), rates.n))
         for i, p in enumerate(rates.exact):
             if p is not None:
@@ -235,7 +237,7 @@ class Cubic:
             products = stack[:, row.places[:, 0]]
             for j in (1, 2):
                 products = products * stack[:, row.places[:, j]]
-            result[:, i] = products @ row.coefficients + row.bound * w[given + place]
+            result[:, i] = products @ row.coefficients + row.bound * w[..., given + place]
         return result
 
     def pushes(self) -> FloatArray:

@@ -180,7 +180,7 @@ def state_affine(
         unknowns or there is no other start.
         """
         at_hand = [c.model for c in trail.candidates if c.proof is not None]
-        starts = [_least_error(at_hand, train)] if at_hand else []
+        starts = [_least_error(at_hand, train, problem.weights)] if at_hand else []
         if problem.is_bounded_by_leading or not starts:
             starts.append(_certified(problem, trail, method))
         proofs = [(start, prove_stability(start)) for start in starts]
@@ -191,7 +191,7 @@ def state_affine(
         ]
         if not reached:
             raise Infeasible("no proof for the last certified iterate, where the last step starts")
-        return _least_error(reached, train)
+        return _least_error(reached, train, problem.weights)
 
     trail.add(CertifiedSem, last_step)
     return trail
@@ -342,11 +342,14 @@ def _tried(start: Callable[[], S], minimised: Callable[[S], R | None]) -> R | No
         return None
 
 
-def _least_error(models: Sequence[T], train: Dataset) -> T:
-    """The model that simulates the training data best; Infeasible if there is none."""
+def _least_error(models: Sequence[T], train: Dataset, weights: FloatArray | None = None) -> T:
+    """The model that simulates the training data best; Infeasible if there is none.
+
+    weights: (n_y,), as of `simulation_percent`.
+    """
     if not models:
         raise Infeasible("no start of the search leads to a model that can be used")
-    return min(models, key=lambda model: simulation_percent(model, train))
+    return min(models, key=lambda model: simulation_percent(model, train, weights=weights))
 
 
 def _best_minimum(

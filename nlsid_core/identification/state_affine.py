@@ -19,7 +19,13 @@ from nlsid_core.models import StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import signals_of
 from nlsid_core.models.state_affine import OutOfRange
-from nlsid_core.options import require_delays, require_one_of, require_ranges, require_whole
+from nlsid_core.options import (
+    require_delays,
+    require_one_of,
+    require_ranges,
+    require_weights,
+    require_whole,
+)
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 
@@ -35,6 +41,7 @@ class StateAffineClass:
     leading_degree: of G_0 in w, lagged_degree: of G_1 … G_n, right_degree: of p, each 0 to 5.
     input_range: (low, high) of each input in its unit, where the model is proved (None: the range
     in the data). on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
+    weights: of the squared error of each output in units of its spread, above 0 (None: all equal).
     """
 
     lags: int
@@ -44,6 +51,7 @@ class StateAffineClass:
     right_degree: int = 1
     input_range: tuple[tuple[float, float], ...] | None = None
     on_out_of_range: OutOfRange = "clip"
+    weights: tuple[float, ...] | None = None
     kind: ClassVar[type[StateAffineModel]] = StateAffineModel
 
     def __post_init__(self) -> None:
@@ -53,6 +61,7 @@ class StateAffineClass:
             require_whole(self, key, 0, HIGHEST_DEGREE)
         require_ranges(self, "input_range")
         require_one_of(self, "on_out_of_range", get_args(OutOfRange))
+        require_weights(self, "weights")
 
     def window(self, inputs: int) -> tuple[tuple[int, int], ...]:
         """(input, delay) of each entry of w."""
@@ -64,6 +73,8 @@ class StateAffineClass:
 class StateAffineRows:
     """The rows of a dataset, their windows w (N, n_w), and the way back to a model.
 
+    y_scale: (mean, unit) of the outputs, a unit being the spread over the root of the output's
+    weight, so that W in Σ |y - ŷ|²_W is the identity. weights: (n_y,).
     slowest: rate a sample that searches for models that are stable for every input keep.
     """
 
@@ -77,6 +88,7 @@ class StateAffineRows:
     y_scale: tuple[FloatArray, FloatArray]
     u_scale: tuple[FloatArray, FloatArray]
     u_range: FloatArray
+    weights: FloatArray
     on_out_of_range: OutOfRange = "clip"
     slowest: float = 1.0
 
@@ -91,11 +103,14 @@ class StateAffineRows:
         return np.asarray(box[[i for i, _ in self.window]])
 
     def embedded(self, theta: FloatArray) -> FloatArray:
-        """Left parameters of the linear model with constant ones θ ((n+1) n_y²,)."""
-        n_y = len(self.y_scale[0])
+        """Left parameters of the linear model with constant ones θ ((n+1) n_y²,), of outputs in
+        units of their spread.
+        """
+        n_y, root = len(self.y_scale[0]), np.sqrt(self.weights)
         blocks = [np.zeros((len(exponents), n_y**2)) for exponents in self.left]
+        units = np.outer(root, 1.0 / root).ravel()
         for block, constant in zip(blocks, theta.reshape(len(blocks), -1), strict=True):
-            block[0] = constant  # the monomials begin with 1
+            block[0] = constant * units  # the monomials begin with 1
         return np.concatenate([block.ravel() for block in blocks])
 
     def model(self, theta: FloatArray, p: FloatArray) -> StateAffineModel:
@@ -138,7 +153,11 @@ def build_state_affine_rows(
     short = [trial for trial in dataset if len(trial) <= n]
     if short:
         raise DataError(f"{short[0].name}: {len(short[0])} samples, {n} lags need more")
-    y_scale = signal_scale(np.concatenate([trial.y for trial in dataset]), "response")
+    mean, spread = signal_scale(np.concatenate([trial.y for trial in dataset]), "response")
+    W = np.ones(len(spread)) if model_class.weights is None else np.array(model_class.weights)
+    if len(W) != len(spread):
+        raise DataError(f"weights has {len(W)} outputs, the data {len(spread)}")
+    y_scale = mean, spread / np.sqrt(W)
     u_all = np.concatenate([trial.u for trial in dataset])
     u_scale = signal_scale(u_all, "excitation")
     n_y, n_u = len(y_scale[0]), len(u_scale[0])
@@ -178,7 +197,7 @@ def build_state_affine_rows(
         identity=identity,
     )
     return StateAffineRows(
-        rows, w, dataset, left, right, R, window, y_scale, u_scale, declared,
+        rows, w, dataset, left, right, R, window, y_scale, u_scale, declared, W,
         model_class.on_out_of_range, slowest,
     )  # fmt: skip
 

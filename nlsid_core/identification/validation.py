@@ -50,7 +50,8 @@ class Residual:
     independent: bool
 
     def __str__(self) -> str:
-        white = "white" if self.white else "NOT white (99 %): dynamics or coloured noise are left"
+        left = "dynamics are left, or noise that is coloured or of both kinds"
+        white = "white" if self.white else f"NOT white (99 %): {left}"
         if self.independent:
             return f"{white}, independent of the input"
         return f"{white}, NOT independent of the input (99 %): it explains more than the model uses"
@@ -101,8 +102,12 @@ class Validation:
             f"one-step residual is {self.one_step}",
             f"simulation residual is {self.simulation}",
         ]
-        rms = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in self.output_rms]
-        lines.insert(1, f"rms error of the simulation: {', '.join(rms)}")
+        rms = []
+        for (name, value, unit), part in zip(self.output_rms, self.output_percent, strict=True):
+            varies = f" of the {100.0 * value / part:.3g}" if 0.0 < part < np.inf else ""
+            rms.append(f"{name} {value:.3g}{varies} {unit}".rstrip())
+        said = " by which it varies in these trials" if len(rms) == 1 else ""
+        lines.insert(1, f"rms error of the simulation: {', '.join(rms)}{said}")
         if self.clipped_percent:
             lines.insert(
                 2,
@@ -196,11 +201,15 @@ def residual_tests(
     )
 
 
-def simulation_percent(model: Model, dataset: Dataset, *, transient: int = 0) -> float:
+def simulation_percent(
+    model: Model, dataset: Dataset, *, transient: int = 0, weights: FloatArray | None = None
+) -> float:
     """100·‖y - ŷ‖/‖y - mean(y)‖ over all samples after the first n of every trial, outputs in units
     of their spread; ŷ is simulated from the model's history, n is that or `transient` if longer.
+
+    weights: (n_y,) of the squares of each output (None: all equal).
     """
-    return _percent(_simulated(model, dataset, max(history(model), transient)))
+    return _percent(_simulated(model, dataset, max(history(model), transient)), weights)
 
 
 def prediction_percent(
@@ -265,10 +274,14 @@ def _clipped_percent(model: Model, dataset: Dataset) -> float:
     return float(100.0 * np.mean(((u < low) | (u > high)).any(axis=1)))
 
 
-def _percent(pairs: list[tuple[FloatArray, FloatArray]]) -> float:
+def _percent(
+    pairs: list[tuple[FloatArray, FloatArray]], weights: FloatArray | None = None
+) -> float:
     measured, simulated = (np.concatenate([pair[i] for pair in pairs]) for i in (0, 1))
     centred = measured - measured.mean(axis=0)
     spread = np.maximum(centred.std(axis=0), np.finfo(float).tiny)
+    if weights is not None:
+        spread = spread / np.sqrt(weights)
     with np.errstate(over="ignore", invalid="ignore"):
         ratio = np.linalg.norm((measured - simulated) / spread) / np.linalg.norm(centred / spread)
     return float(100.0 * ratio) if np.isfinite(ratio) else np.inf

@@ -312,14 +312,18 @@ def test_an_alarm_before_the_fault_is_a_false_one_and_catches_nothing(
 
 
 def test_a_tube_wider_than_what_was_measured_is_said_with_its_share_of_the_samples() -> None:
-    def replay(widths: list[float]) -> Replay:
+    def replay(widths: list[float], low: float = 0.0) -> Replay:
         readings = tuple(
-            Reading(0.1 * k, Status.INSIDE, 0.9, measured=(float(k % 2),), half_widths=(width,))
+            Reading(
+                0.1 * k, Status.INSIDE, 0.9, measured=([low, 1.0][k % 2],), half_widths=(width,)
+            )
             for k, width in enumerate(widths)
         )
         return Replay("drive", readings, tuple(range(len(widths))), "speed", "m/s", 0.0, 0.1)
 
     said = replay([0.5] * 6 + [1.5] * 4).said_wide
-    assert said.startswith("in 40 % of the samples judged the half-width is more than the whole")
-    assert "range measured here, 1 m/s: the tube says nothing there" in said
+    assert said.startswith("in 40 % of the samples judged the half-width is more than all that")
+    assert "was measured here, 1 m/s: the tube says nothing there" in said
+    assert replay([0.1] * 10, low=0.95).said_wide == "", "a tenth of a speed that hardly changes"
+    assert "than all that was measured here, 3 m/s" in replay([4.0] * 10, low=-2.0).said_wide
     assert replay([0.5] * 10).said_wide == replay([]).said_wide == ""

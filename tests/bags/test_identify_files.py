@@ -385,6 +385,7 @@ def examples() -> list[dict[str, Any]]:
     return [content for block in blocks if "identification" in (content := yaml.safe_load(block))]
 
 
+@pytest.mark.slow  # the classes are identified above; here the page's own words for them are
 @pytest.mark.parametrize("example", examples(), ids=lambda e: "-".join(e) + str(len(str(e))))
 def test_every_example_of_the_how_to_runs(
     example: dict[str, Any], folder: Path, tmp_path: Path

@@ -85,6 +85,9 @@ def test_a_speed_has_thresholds_for_validators_and_no_joint(
     table = (tmp_path / "out" / TABLE).read_text()
     assert table.splitlines()[1].split() == ["speed", f"{width:g}", f"{width:g}", "m/s"]
     assert "what the model simulates from the commands" in table
+    assert "BEFORE USE: these numbers are about the model's simulation" in table
+    first = (tmp_path / "out" / VALIDATOR).read_text().splitlines()[0]
+    assert first.startswith("# BEFORE USE: these numbers are about the model's simulation")
 
 
 def test_what_is_not_proved_has_no_tolerances(design: OutputTubeDesign, tmp_path: Path) -> None:

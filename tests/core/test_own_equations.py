@@ -19,6 +19,7 @@ from nlsid_core.design import (
     integrate_nominal,
     plan_motion,
 )
+from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
 from nlsid_core.dynamics import Nominal, Rates
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.proofs import check
@@ -159,6 +160,8 @@ def blown(x: Any, u: Any, w: Any) -> Any:
 
 def test_a_disturbance_that_is_too_strong_is_named() -> None:
     text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
+    assert "The diagonal of Q is (2e+04, 3.2e+03) and of R is (50)." in text
+    assert "No funnel of this policy can be proved: a simulated solution starts on" in text
     assert re.search(r"Because of the disturbance w: take a larger goal", text)
     assert re.search(r"the disturbance w takes .* 1/s \(\d+ %\)", text)
 
@@ -170,6 +173,16 @@ def test_a_refusal_tells_of_the_place_that_was_not_passed_however_often_it_was_t
     found = re.search(r"lets V fall by (\S+) 1/s, and the disturbance w takes (\S+) 1/s", text)
     assert found
     assert float(found[1]) < float(found[2]), "else nothing was in the way"
+
+
+def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:
+    taken = dict.fromkeys(TERMS, 0.0) | {"disturbance": 386.0}
+    fast = Diagnosis(11.0, 7990.0, taken, (0.1, 0.2))
+    assert fast.dominant == "knots"
+    assert "V falls by 7.6e+03 1/s at this instant" in str(fast)
+    assert "take more knots, or feedback that acts slower (a larger R)" in str(fast)
+    assert "disturbance" not in str(fast)
+    assert Diagnosis(11.0, 380.0, taken, (0.1, 0.2)).dominant == "disturbance"
 
 
 def test_a_shape_that_cannot_be_found_keeps_what_is_proved(

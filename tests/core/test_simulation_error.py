@@ -402,6 +402,9 @@ def test_clipped_samples_and_the_error_in_the_signals_unit_are_said() -> None:
         for trial in stacked.dataset
     ]
     assert rms == pytest.approx(np.sqrt(np.mean(np.square(np.concatenate(left)))))
+    spread = np.std(np.concatenate([trial.y[len(model) :] for trial in stacked.dataset]))
+    assert f" of the {spread:.3g} " in str(scores)
+    assert scores.simulation_percent == pytest.approx(100 * rms / spread)
 
 
 def test_a_start_whose_simulation_overflows_leaves_the_other_starts_to_be_tried() -> None:

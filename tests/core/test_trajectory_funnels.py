@@ -281,7 +281,8 @@ def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> N
     runner = CliRunner()
     made = runner.invoke(app, ["funnel", "--problem", str(problem_file), "--out", str(tmp_path)])
     assert made.exit_code == 0, made.output
-    assert "pieces proved" in made.output
+    assert "pieces of time decided" in made.output
+    assert "found and proved in" in made.output
     assert ContinuousFunnel.load(tmp_path / "funnel.json").tf == 2.0
     assert (tmp_path / "funnel.png").is_file()
     checked = runner.invoke(app, ["check", str(tmp_path / "funnel.proof.json")])

@@ -85,16 +85,22 @@ def batches(field: VectorField, funnel: ContinuousFunnel, pieces: Pieces) -> Ite
 
 
 def closed_loop_polynomial(
-    field: VectorField, policy: ContinuousPolicy, funnel: ContinuousFunnel, pieces: Pieces
+    field: VectorField,
+    policy: ContinuousPolicy,
+    funnel: ContinuousFunnel,
+    pieces: Pieces,
+    end: int | None = None,
 ) -> Graded:
     """c(s, z) of every piece, in Bernstein form times the binomials; all in one time span.
+
+    end: 0 or 1 for the value at that end alone, of degree 0 in s.
 
     c = dρ/ds - 2x̄'P(hf - dx₀/ds) - x̄'(dP/ds)x̄ + μ(ρ - x̄'Px̄) - Στq, x̄ = Tz, s in [0, 1] on the
     piece; derivatives are with respect to s on the whole interval, of length h. Where inputs are
     limited, f is that of the piece's mode, and what holds in the mode is taken off.
     """
     n, k = field.n, pieces.interval
-    loop = _Loop(field, policy, funnel, pieces)
+    loop = _Loop(field, policy, funnel, pieces, end=end)
     P = _linear(funnel.P)[k]
     rho = _linear(funnel.rho)[k]
     x_bar: list[Graded] = [{1: pieces.T[:, i][:, None]} for i in range(n)]
@@ -110,7 +116,7 @@ def closed_loop_polynomial(
     PdotT = _product((P[:, 1] - P[:, 0])[:, None], pieces.T)
     for i in range(n):
         c = add(c, multiply({1: -PdotT[:, :, i]}, x_bar[i], n))
-    c = add(c, multiply(_multiplier(pieces), loop.gap(), n))
+    c = add(c, multiply(loop.multiplier(), loop.gap(), n))
     for term in loop.held():
         c = add(c, negative(term))
     return c
@@ -126,13 +132,14 @@ def rate_polynomial(
     room: FloatArray,
     entry: IntArray,
     sign: IntArray,
+    end: int | None = None,
 ) -> Graded:
     """h room - sign dũ_i/ds - τ(ρ - x̄'Px̄) of every piece, as `closed_loop_polynomial` writes c.
 
     w: (B, n_w). room: (B,) in input units per s. entry: (B,) i. τ: the first of the piece's.
     """
     n, k = field.n, pieces.interval
-    loop = _Loop(field, policy, funnel, pieces, w)
+    loop = _Loop(field, policy, funnel, pieces, w, end)
     every = np.arange(len(k))
     gains = policy.K.control[k][every, :, entry]
     turned = _product(loop.restricted(_slope(gains))[:, :, None], pieces.T)[:, :, 0]
@@ -144,7 +151,7 @@ def rate_polynomial(
         change = add(change, multiply({0: -along[:, :, j][:, :, None]}, error, n))
     c: Graded = {q: -sign[:, None, None] * part for q, part in change.items()}
     c = add(c, {0: (np.diff(funnel.t)[k] * room)[:, None, None]})
-    return add(c, negative(multiply(_squares(pieces.tau[:, :, 0]), loop.gap(), n)))
+    return add(c, negative(multiply(loop.squares(0), loop.gap(), n)))
 
 
 def error_at_end(
@@ -158,31 +165,25 @@ def error_at_end(
 
     M: monomials in z of degree 0 up to the largest that occurs.
     """
-    loop = _Loop(field, policy, funnel, pieces)
+    loop = _Loop(field, policy, funnel, pieces, end=end)
     x_rate = loop.nominal_rate()
     h = np.diff(funnel.t)[pieces.interval]
     rows = []
     for i, rate in enumerate(loop.field_times_h()):
         error = add(rate, {0: -x_rate[:, :, i][:, :, None]})
         parts = [
-            error[q][:, -end] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
+            error[q][:, 0] if q in error else np.zeros((len(h), len(monomials_of(field.n, q))))
             for q in range(field.degree + 1)
         ]
         rows.append(np.concatenate(parts, axis=1) / h[:, None])
     return np.stack(rows, axis=1)
 
 
-def _multiplier(pieces: Pieces) -> Graded:
-    n, start, result = pieces.basis.shape[1], 0, {}
-    for q in pieces.multiplier_degrees(pieces.basis):
-        size = len(monomials_of(n, q))
-        result[q] = pieces.mu[:, :, start : start + size]
-        start += size
-    return result
-
-
 class _Loop:
-    """The variables t, x, u, w of the field in z and s, one batch entry per piece."""
+    """The variables t, x, u, w of the field in z and s, one batch entry per piece.
+
+    end: 0 or 1 if only what they are at that end of the pieces is asked for.
+    """
 
     def __init__(
         self,
@@ -191,8 +192,9 @@ class _Loop:
         funnel: ContinuousFunnel,
         pieces: Pieces,
         w: FloatArray | None = None,
+        end: int | None = None,
     ) -> None:
-        self.field, self.pieces = field, pieces
+        self.field, self.pieces, self.end = field, pieces, end
         vertices = field.vertices()
         if w is None and pieces.kappa is None:
             w = vertices[pieces.vertex % len(vertices)]
@@ -207,7 +209,21 @@ class _Loop:
 
     def restricted(self, control: FloatArray) -> FloatArray:
         """Bernstein control points (B, d+1, ...) as polynomials in s on each piece."""
-        return restrict(weighted(control), self.pieces.level, self.pieces.index)
+        return self._at_end(restrict(weighted(control), self.pieces.level, self.pieces.index))
+
+    def multiplier(self) -> Graded:
+        """μ."""
+        n, start, result = self.field.n, 0, {}
+        mu = self._at_end(self.pieces.mu)
+        for q in self.pieces.multiplier_degrees(self.pieces.basis):
+            size = len(monomials_of(n, q))
+            result[q] = mu[:, :, start : start + size]
+            start += size
+        return result
+
+    def squares(self, place: int) -> Graded:
+        """τ of this place."""
+        return _squares(self._at_end(self.pieces.tau[:, :, place]))
 
     def nominal_rate(self) -> FloatArray:
         """dx₀/ds (B, d, n)."""
@@ -265,8 +281,12 @@ class _Loop:
                 (negative(below), mode > 0),
             ):
                 q = add(q, {degree: chosen * factor for degree, factor in part.items()})
-            terms.append(multiply(_squares(self.pieces.tau[:, :, place]), q, n))
+            terms.append(multiply(self.squares(place), q, n))
         return terms
+
+    def _at_end(self, part: FloatArray) -> FloatArray:
+        """(B, S+1, ...) on each piece; (B, 1, ...) at the end, where only that is asked for."""
+        return part if self.end is None else part[:, [-self.end]]
 
     def _monomial(self, exponent: tuple[int, ...]) -> Graded:
         if exponent not in self._known:

@@ -12,6 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.counterexample import try_to_miss
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
@@ -52,7 +53,7 @@ class ContinuousSearch:
 
     def __str__(self) -> str:
         return (
-            f"{len(self.proved.pieces)} pieces proved, volume integral {self.history[-1][1]:.4g}, "
+            f"volume integral {self.history[-1][1]:.4g}, found and proved in "
             f"{sum(self.seconds.values()):.2f} s"
         )
 
@@ -95,7 +96,10 @@ def design_funnel(
             raise DataError("V-steps search without hold or error: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
-    setting, funnel, proved, margin = _found(setting, progress)
+    try:
+        setting, funnel, proved, margin = _found(setting, progress)
+    except Infeasible as refusal:
+        raise Infeasible(f"{refusal}. {_in_use(setting)}{_simulated(setting)}") from refusal
     history = [("rho", funnel.volume_integral())]
     seconds["rho"] = time.perf_counter() - started
     if shape == "P":
@@ -141,6 +145,26 @@ def decided(
         raise Infeasible(f"the kernel refuses what was found: {refusal}") from refusal
     seconds["proof"] = time.perf_counter() - started
     return design
+
+
+def _in_use(setting: Setting) -> str:
+    """The weights of a policy, which the advice of a refusal compares with."""
+    named = zip("QR", setting.weights, strict=True)
+    rows = [
+        f"{name} is ({', '.join(f'{entry:.3g}' for entry in np.diag(M).tolist())})"
+        for name, M in named
+        if len(M)
+    ]
+    return f"The diagonal of {' and of '.join(rows)}"
+
+
+def _simulated(setting: Setting) -> str:
+    """What simulated solutions say of a claim that was not proved, where they can be computed."""
+    try:
+        with np.errstate(all="ignore"):
+            return f". {try_to_miss(setting)}"
+    except (ArithmeticError, ValueError, RuntimeError):  # the equations may end away from a motion
+        return ""
 
 
 def _found(setting: Setting, progress: Progress) -> _Found:

@@ -33,6 +33,7 @@ ADVICE = {
     "hold": "take a shorter hold, smaller measurement errors, or a larger goal",
     "curvature": "take a smaller goal, a slower motion, or other Q and R",
     "motion": "give a motion with more knots, or one that obeys the dynamics more exactly",
+    "knots": "take more knots, or feedback that acts slower (a larger R)",
     "linear": "the linear closed loop itself lets V grow there: take other Q and R, a policy that "
     "stabilises it, more knots, or a goal that is wider in the states that no input reaches",
 }
@@ -51,8 +52,15 @@ class Diagnosis:
     widths: tuple[float, ...]
 
     @property
+    def left(self) -> float:
+        """What V falls by at this instant, in 1/s."""
+        return self.linear - sum(self.taken.values())
+
+    @property
     def dominant(self) -> str:
-        """The term to act on."""
+        """The term to act on; "knots" if V falls at this instant, and not all the way to it."""
+        if self.left > 0:
+            return "knots"
         largest = max(TERMS, key=lambda name: self.taken[name])
         return "linear" if self.taken[largest] <= -self.linear else largest
 
@@ -63,6 +71,12 @@ class Diagnosis:
         taking = "; ".join(f"{NAMES[n]} takes {p:.3g} 1/s ({100 * p / total:.0f} %)"
                            for p, n in shares if p >= least)  # fmt: skip
         sizes = ", ".join(f"{width:.3g}" for width in self.widths)
+        if self.dominant == "knots":
+            return (
+                f"no funnel at t = {self.t:.6g} s: around the motion within ({sizes}) V falls by "
+                f"{self.left:.3g} 1/s at this instant, but it is not shown to fall in the whole "
+                f"interval between the knots: {ADVICE['knots']}"
+            )
         cause = "that" if self.dominant == "linear" else NAMES[self.dominant].rstrip(",")
         return (
             f"no funnel at t = {self.t:.6g} s: around the motion within ({sizes}) the linear "
@@ -143,7 +157,7 @@ def _terms(
     parts["disturbance"] = pushed[:, :own].sum(axis=1)
     parts["remainder"] = pushed[:, own:].sum(axis=1)
     linear = falls(slope) - turning
-    rest = steps.values(section, rho, case) - linear - sum(parts.values())
+    rest = steps.values(section, rho, [case])[0] - linear - sum(parts.values())
     cause = "saturation" if len(steps.limits) else "hold" if steps.widths is not None else "motion"
     parts[cause] = parts.get(cause, 0.0) + np.asarray(rest)
     return linear, parts

@@ -104,8 +104,17 @@ def product_table(n: int, a: int, b: int) -> IntArray:
 
 def positions(rows: IntArray, among: IntArray) -> IntArray:
     """The row of `among` that equals each row; every one has to occur."""
-    places = {row.tobytes(): k for k, row in enumerate(np.ascontiguousarray(among))}
-    return np.array([places[row.tobytes()] for row in np.ascontiguousarray(rows)], dtype=np.int64)
+    first, second = (np.asarray(part, dtype=np.int64).tobytes() for part in (rows, among))
+    return _positions(first, second, 8 * rows.shape[1])
+
+
+@lru_cache(maxsize=1024)
+def _positions(rows: bytes, among: bytes, size: int) -> IntArray:
+    places = {among[k : k + size]: k // size for k in range(0, len(among), size)}
+    found = [places[rows[k : k + size]] for k in range(0, len(rows), size)]
+    result = np.array(found, dtype=np.int64)
+    result.setflags(write=False)  # everyone who asks is given the same
+    return result
 
 
 @lru_cache(maxsize=4096)

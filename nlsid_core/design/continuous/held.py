@@ -34,8 +34,7 @@ MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
 ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
 QUARTICS = (0.03, 0.1, 0.3, 1.0, 3.0)  # λ₁ over the cubic part's size
 LEAST_QUARTIC = 1e-3  # of the linear part's size
-GOLDEN = (5**0.5 - 1) / 2
-SEARCHES = 40  # of a golden section: to 1e-8 of its bracket
+NEWTONS = 6  # for a multiplier: any will do, and six are at the best one
 FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
 SETTLED = 1.005  # of the rates before: ROOM holds what is left
@@ -126,13 +125,18 @@ class _Rates:
     taken: FloatArray
 
     def polynomial(
-        self, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, rates: FloatArray
+        self,
+        steps: LSteps,
+        policy: ContinuousPolicy,
+        funnel: ContinuousFunnel,
+        rates: FloatArray,
+        end: int | None = None,
     ) -> Graded:
-        """What has to be positive for rates (intervals, m)."""
+        """What has to be positive for rates (intervals, m); end: only its value at 0 or at 1."""
         room = rates[self.pieces.interval, self.entry] - self.taken
         return rate_polynomial(
             steps.field, policy, funnel, self.pieces, self.w, room=room, entry=self.entry,
-            sign=self.sign,
+            sign=self.sign, end=end,
         )  # fmt: skip
 
 
@@ -286,9 +290,9 @@ def _shown(
     framed = replace(batch, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)),
                      taken=np.zeros_like(batch.taken))  # fmt: skip
     nothing = np.zeros((len(policy.t) - 1, steps.field.m))
-    c = framed.polynomial(steps, policy, funnel, nothing)
+    c = framed.polynomial(steps, policy, funnel, nothing, end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
-    parts = [c[q][:, -end] if q in c else np.zeros((len(T), size)) for q, size in enumerate(sizes)]
+    parts = [c[q][:, 0] if q in c else np.zeros((len(T), size)) for q, size in enumerate(sizes)]
     return _least(pieces.basis, [-part for part in parts]), T
 
 
@@ -310,18 +314,16 @@ def _least(basis: IntArray, p: list[FloatArray]) -> _Shown:
     N = C / D @ C.swapaxes(1, 2) / 4
     size = np.linalg.norm(linear, axis=1) + np.abs(p[0][:, 0]) + np.linalg.norm(Q, axis=(1, 2))
     size = np.maximum(size, np.finfo(float).tiny)
-    best = np.full(count, np.inf)
-    found = np.zeros((count, 2))
-    for scale in QUARTICS:
-        quartic = scale * np.sqrt(np.linalg.norm(N, axis=(1, 2))) + LEAST_QUARTIC * size
-        G = Q + quartic[:, None, None] * np.eye(n) + N / quartic[:, None, None]
-        values, vectors = np.linalg.eigh(G)
-        turned = np.einsum("bij,bi->bj", vectors, linear)
-        constant = _smallest(values, turned, LEAST_QUARTIC * size)
-        rate = p[0][:, 0] + constant + (turned**2 / (constant[:, None] - values)).sum(axis=1) / 4
-        better = rate < best
-        best = np.where(better, rate, best)
-        found[better] = np.stack([constant, quartic], axis=1)[better]
+    root = np.sqrt(np.linalg.norm(N, axis=(1, 2)))
+    quartic = np.multiply.outer(QUARTICS, root) + LEAST_QUARTIC * size  # (scales, B)
+    values, vectors = np.linalg.eigh(
+        Q + quartic[..., None, None] * np.eye(n) + N / quartic[..., None, None]
+    )
+    turned = np.einsum("sbij,bi->sbj", vectors, linear)
+    constant = _smallest(values, turned, LEAST_QUARTIC * size)
+    rate = p[0][:, 0] + constant + (turned**2 / (constant[..., None] - values)).sum(axis=-1) / 4
+    chosen = np.argmin(rate, axis=0), np.arange(count)
+    best, found = rate[chosen], np.stack([constant[chosen], quartic[chosen]], axis=1)
     gram = np.zeros((count, len(basis), len(basis)))
     one = int(np.flatnonzero(~basis.any(axis=1))[0])
     first, second = positions(np.eye(n, dtype=np.int64), basis), positions(quadratic, basis)
@@ -335,18 +337,20 @@ def _least(basis: IntArray, p: list[FloatArray]) -> _Shown:
 
 
 def _smallest(values: FloatArray, b: FloatArray, least: FloatArray) -> FloatArray:
-    """(B,) μ > max(values, 0) that makes μ + Σ b²/(μ - values)/4 least, by golden section."""
-    low = np.maximum(values[:, -1], 0.0) + least
-    high = low + np.linalg.norm(b, axis=1) / 2
+    """μ ≥ max(values, 0) + least that makes μ + Σ b²/(μ - values)/4 least, nearly; (..., B, n).
 
-    def cost(mu: FloatArray) -> FloatArray:
-        return np.asarray(mu + (b**2 / (mu[:, None] - values)).sum(axis=1) / 4)
-
-    for _ in range(SEARCHES):
-        a, c = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        left = cost(a) < cost(c)
-        low, high = np.where(left, low, a), np.where(left, c, high)
-    return np.asarray((low + high) / 2)
+    Where it is inside, r(μ) = |b/(μ - values)|/2 = 1. Newton on 1/r, which is nearly affine.
+    Source: Moré and Sorensen, "Computing a trust region step", 1983, (3.11).
+    """
+    low = np.maximum(values[..., -1], 0.0) + least
+    mu = low
+    for _ in range(NEWTONS):
+        apart = mu[..., None] - values
+        square = (b**2 / apart**2).sum(axis=-1) / 4
+        cube = (b**2 / apart**3).sum(axis=-1) / 4
+        step = square / np.maximum(cube, np.finfo(float).tiny) * (np.sqrt(square) - 1)
+        mu = np.maximum(mu + step, low)
+    return mu
 
 
 def _witnessed(

@@ -4,6 +4,7 @@ In coordinates x̄ = √ρ L⁻ᵀz, P = LL', the boundary is |z| = 1 at every t
 depend on ρ̇. Source: thesis (6.4), in the sphere form.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -125,6 +126,7 @@ class LSteps:
         taken = field.curved_states if self.pushed else field.nonlinear_states
         self.nonlinear = taken if nonlinear is None else nonlinear
         self.local: dict[int, Cubic] = {}
+        self._pushes: dict[int, FloatArray] = {}
         self.tolerance = tolerance
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
@@ -145,9 +147,11 @@ class LSteps:
         """(n, n_w) what each w adds to ẋ there; only where w does nothing else."""
         if section.interval in self.local:
             return self.local[section.interval].pushes()
-        found = self.field.pushes(section.span)
-        assert found is not None  # asked only where `is_pushed`
-        return found
+        if section.span not in self._pushes:
+            found = self.field.pushes(section.span)
+            assert found is not None  # asked only where `is_pushed`
+            self._pushes[section.span] = found
+        return self._pushes[section.span]
 
     def bound_pushes(self, section: Section, rho: float) -> None:
         """If w only pushes: κ of the section's interval, for what w does where W = ρ.
@@ -178,19 +182,24 @@ class LSteps:
         mode, corner = divmod(rest, len(self.corners))
         return vertex, corner, self.modes[mode]
 
-    def values(self, section: Section, rho: float, case: int) -> FloatArray:
-        """-Ẇ/ρ at the program's points, straight from the vector field in the case's mode."""
+    def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
+        """(cases, N) -Ẇ/ρ at the program's points, straight from the vector field in each mode."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
-        vertex, corner, mode = self.split(case)
-        u = section.u - x_bar @ section.K.T
-        for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
-            if side:
-                u[:, int(i)] = low if side < 0 else high
-        if self.widths is not None:
-            u = u + self.corners[corner] * self.widths[section.interval]
-        w = self.vertices[vertex]
-        rate = self.rate(section, section.x + x_bar, u, w) - section.x_rate
-        W_rate = 2 * np.einsum("ij,ij->i", x_bar @ section.P, rate)
+        u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
+        w = np.empty((*u.shape[:2], self.vertices.shape[1]))
+        for place, case in enumerate(cases):
+            vertex, corner, mode = self.split(case)
+            w[place] = self.vertices[vertex]
+            for (i, low, high), side in zip(self.limits.tolist(), mode.tolist(), strict=True):
+                if side:
+                    u[place, :, int(i)] = low if side < 0 else high
+            if self.widths is not None:
+                u[place] += self.corners[corner] * self.widths[section.interval]
+        X = np.tile(section.x + x_bar, (len(cases), 1))
+        W = w.reshape(len(X), w.shape[2])
+        rate = self.rate(section, X, u.reshape(len(X), u.shape[2]), W) - section.x_rate
+        along = x_bar @ section.P
+        W_rate = 2 * np.einsum("ni,cni->cn", along, rate.reshape(len(cases), *x_bar.shape))
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
         if self.kappa is not None:
             W_rate += self.from_pushes(section, x_bar).sum(axis=1)
@@ -233,8 +242,7 @@ class LSteps:
     ) -> list[SphereSolution]:
         """φ for every case."""
         found = []
-        for case in range(self.cases):
-            g = self.values(section, rho, case)
+        for case, g in enumerate(self.values(section, rho, range(self.cases))):
             warm = None if start is None else start[case]
             tau: FloatArray = np.zeros((0, 0, 0))
             if len(self.limits):
@@ -258,16 +266,15 @@ class LSteps:
         With limits it is an estimate: the multipliers of the mode stay what they are. saturated:
         False leaves out the modes at a limit, for which that estimate may be far too low.
         """
+        free = not saturated and len(self.limits) > 0
+        cases = [c for c in range(len(duals)) if not (free and self.split(c)[-1].any())]
         bounds = []
-        y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
-        for case, d in enumerate(duals):
-            g = self.values(section, rho, case)
+        for case, g in zip(cases, self.values(section, rho, cases), strict=True):
             if len(self.limits):
+                y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
                 q = self.in_mode(section, rho, case)
-                if not saturated and self.split(case)[-1].any():
-                    continue
-                g = g - np.einsum("ln,na,lab,nb->n", q, y, d.tau, y)
-            bounds.append(float(g @ d.y))
+                g = g - np.einsum("ln,na,lab,nb->n", q, y, duals[case].tau, y)
+            bounds.append(float(g @ duals[case].y))
         return min(bounds)
 
 

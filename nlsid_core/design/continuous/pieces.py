@@ -50,7 +50,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Proved:
-    """pieces and each one's margin in 1/s; unproved: the parts on which no proof was found."""
+    """pieces, each one's margin in 1/s; unproved: parts that ended the search without a proof."""
 
     pieces: Pieces
     margins: FloatArray
@@ -63,7 +63,7 @@ def prove_pieces(
     funnel: ContinuousFunnel,
     ends: list[Ends] | None = None,
 ) -> Proved:
-    """A proof for all time, or the parts on which there is none.
+    """A proof for all time, or parts on which there is none.
 
     ends: L-steps at the ends of the intervals, where they are at hand.
     """
@@ -74,23 +74,24 @@ def prove_pieces(
     done: list[tuple[Pieces, FloatArray]] = []
     unproved: list[Part] = []
     while waiting:
-        solvable = [part for part in waiting if _solved(steps, policy, funnel, part, known)]
-        unproved += [part for part in waiting if part not in solvable]
-        if not solvable:
+        refused = next((p for p in waiting if not _solved(steps, policy, funnel, p, known)), None)
+        if refused is not None:
+            unproved.append(refused)
+        if unproved:  # the rest is not worth a program
             break
-        solvable.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
-        alike = groupby(solvable, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
+        waiting.sort(key=lambda part: steps.field.span(float(funnel.t[part.interval])))
+        alike = groupby(waiting, key=lambda p: steps.field.span(float(funnel.t[p.interval])))
         pieces = stacked([_pieces(steps, policy, funnel, list(parts), known) for _, parts in alike])
         pieces = rounded(pieces)
         margins = np.full(len(pieces), np.nan)
         for chosen in batches(steps.field, funnel, pieces):
             margins[chosen] = piece_margins(steps.field, policy, funnel, pieces.select(chosen))
-        by_part = np.asarray(np.isfinite(margins).reshape(len(solvable), -1).all(axis=1))
+        by_part = np.asarray(np.isfinite(margins).reshape(len(waiting), -1).all(axis=1))
         keep = np.repeat(by_part, steps.cases)
         if keep.any():
             chosen = np.flatnonzero(keep)
             done.append((pieces.select(chosen), margins[chosen]))
-        failed = [part for part, good in zip(solvable, by_part.tolist(), strict=True) if not good]
+        failed = [part for part, good in zip(waiting, by_part.tolist(), strict=True) if not good]
         unproved += [part for part in failed if part.level == MAX_LEVEL]
         waiting = [half for part in failed if part.level < MAX_LEVEL for half in part.halves()]
     return Proved(*_joined(steps, done), unproved=tuple(unproved))
@@ -149,8 +150,8 @@ def _pieces(
         tau = np.array([s * solution.tau for s, solution in zip(scale, rows, strict=True)])
         tau = tau.reshape(len(rows), -1, n + 1, n + 1)
         blank = replace(blank, tau=np.stack([tau, tau], axis=1))
-        c = closed_loop_polynomial(steps.field, policy, funnel, blank)
-        at_end = {q: part[:, -end] for q, part in c.items()}
+        c = closed_loop_polynomial(steps.field, policy, funnel, blank, end)
+        at_end = {q: part[:, 0] for q, part in c.items()}
         mu, gram = [], []
         for b, solution in enumerate(rows):
             i = int(blank.interval[b])

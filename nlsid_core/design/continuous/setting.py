@@ -59,7 +59,8 @@ class Setting:
 
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not. rates:
-    (K-1, m) what |dũ/dt| stays below in every funnel that is looked for.
+    (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
+    (m, m) of the feedback.
     """
 
     steps: LSteps
@@ -67,6 +68,7 @@ class Setting:
     P: FloatArray
     rho_final: float
     goal: Goal
+    weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
     rates: FloatArray | None = None
@@ -98,7 +100,7 @@ class Setting:
             cubic = self.expansion.around(self.policy, self.P, last, (rho, rho))
             self.steps.local[last] = cubic
         self.steps.bound_pushes(end, rho)
-        return MARGIN * float(np.abs(self.steps.values(end, rho, 0)).mean())
+        return MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
 
 
 def prepare(
@@ -139,7 +141,7 @@ def prepare(
     if held is not None:
         held.refuse(field, policy)
     rho_final, target = _final(steps, policy, S, wanted, expansion)
-    return Setting(steps, policy, S, rho_final, target, expansion, held)
+    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held)
 
 
 def default_weights(
