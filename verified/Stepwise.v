@@ -506,26 +506,25 @@ Theorem stays_within radii x d : a_chain radii -> motion m p x d ->
   size s k (off p k (x k)) <= radius radii k + widened s.
 Proof.
   intros Hc Hm H0 k Hk Ha. pose proof (off_length x d k Hm Hk) as Lo.
-  pose proof (off_length x d O Hm ltac:(lia)) as L0. unfold assumed, widened in *.
-  destruct (assumed_form s) eqn:Hf.
+  pose proof (off_length x d O Hm ltac:(lia)) as L0.
+  assert (Faded : assumed_form s = Energy \/ assumed_form s = Fading ->
+    (forall j, (j <= k)%nat -> sqrt (energy s d j) <= val (bound s)) ->
+    size s k (off p k (x k)) <= radius radii k + val (bound s)).
+  { intros Hf Hd. destruct (stays_energy radii x d Hc Hf Hm H0 k Hk Hd) as [A B].
+    set (y := alone _ k) in *. assert (Ly : length y = n) by (apply alone_length; auto).
+    rewrite <- (plus_minus (off p k (x k)) y) by congruence.
+    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
+    apply Rplus_le_compat; auto. apply Rle_trans with (sqrt (energy s d k)); [|apply Hd; lia].
+    rewrite <- (sqrt_square (size _ _ _)) by apply size_nonneg. now apply sqrt_le_1_alt. }
+  unfold assumed, widened in *. destruct (assumed_form s) eqn:Hf.
   - pose proof (stays_response radii x d Hc Hf Hm H0 k Hk Ha) as H. pose proof (Ha k ltac:(lia)) as Hr.
     assert (Lr : length (response m s d k) = n).
     { apply response_length; auto. intros j Hj. now destruct (off_next x d j Hm ltac:(lia)). }
     rewrite <- (plus_minus (off p k (x k)) (response m s d k)) by congruence.
     eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. } lra.
   - pose proof (stays_peak radii x d Hc Hf Hm H0 k Hk Ha). lra.
-  - destruct (stays_energy radii x d Hc (or_introl Hf) Hm H0 k Hk Ha) as [A B].
-    set (y := alone _ k) in *. assert (Ly : length y = n) by (apply alone_length; auto).
-    rewrite <- (plus_minus (off p k (x k)) y) by congruence.
-    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
-    apply Rplus_le_compat; auto. apply Rle_trans with (sqrt (energy s d k)); [|apply Ha; lia].
-    rewrite <- (sqrt_square (size _ _ _)) by apply size_nonneg. now apply sqrt_le_1_alt.
-  - destruct (stays_energy radii x d Hc (or_intror Hf) Hm H0 k Hk Ha) as [A B].
-    set (y := alone _ k) in *. assert (Ly : length y = n) by (apply alone_length; auto).
-    rewrite <- (plus_minus (off p k (x k)) y) by congruence.
-    eapply Rle_trans. { apply size_plus. rewrite minus_length; congruence. }
-    apply Rplus_le_compat; auto. apply Rle_trans with (sqrt (energy s d k)); [|apply Ha; lia].
-    rewrite <- (sqrt_square (size _ _ _)) by apply size_nonneg. now apply sqrt_le_1_alt.
+  - exact (Faded (or_introl eq_refl) Ha).
+  - exact (Faded (or_intror eq_refl) Ha).
 Qed.
 
 (* The box of the data, and the half-widths. *)

@@ -21,6 +21,7 @@ from pathlib import Path
 from bags.designs import documents
 from bags.designs.design import is_tube
 from bags.monitoring.replay import Replay
+from bags.pictures.equations_report import equations_chapter
 from bags.pictures.report import MODEL_BEGINS, MODEL_ENDS, STYLE, report_available
 from bags.tools.info import GAP, BagInfo, TopicInfo
 from nlsid_core import files, kernel
@@ -121,10 +122,12 @@ def folder_page(
         model = f'<p class="not">A proof of this folder does not hold now.</p>{model}'
     if not proofs and not model:
         raise DocumentError(f"{folder}: no proof and no {documents.REPORT} to make a report of")
+    funnel = "" if REJECTED in decided else equations_chapter(folder)
     in_model = {documents.CATCHING_PLOT} if "what it can catch" in model else set()
     chapters = {
         "proofs": ("What is proved", decided),
         "model": ("The model", model),
+        "funnel": ("The funnel of these equations", funnel),
         "pictures": ("Pictures", _pictures(folder, without=in_model)),
         "replays": ("Recordings held against the funnel", _replays(replays, used, drawn)),
         "recordings": ("Recordings and their losses", _recordings(recordings)),

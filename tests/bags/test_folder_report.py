@@ -7,6 +7,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -17,9 +18,10 @@ from bags.designs import documents
 from bags.pictures.folder_report import BROWSERS, folder_page, print_page
 from bags.samples import f1tenth
 from bags.tools.info import bag_info
-from nlsid_core import kernel
+from nlsid_core import designs, kernel
 from nlsid_core.errors import DataError, DocumentError
 from tests.continuous_stage import composed
+from tests.core.kernel.mutations import CORPUS
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "f1tenth.yaml"
 
@@ -140,6 +142,24 @@ def test_a_forged_proof_is_rejected_on_the_page(design: Path) -> None:
         proof.write_text(content)
     assert "REJECTED" in page
     assert "A proof of this folder does not hold now." in page
+
+
+@pytest.mark.pictures
+def test_a_funnel_of_equations_shows_picture_widths_equations_and_limits(tmp_path: Path) -> None:
+    for file in (CORPUS / "continuous_funnel" / "held").iterdir():
+        name = designs.PROOF if file.name == "claim.proof.json" else file.name
+        shutil.copy(file, tmp_path / name)
+    design = designs.load_design(tmp_path)
+    page = Page(folder_page(tmp_path))
+    assert page.tags.count("svg") == 1
+    shown = [float(number) for number in re.findall(r"± ([\d.e-]+)", page.text)]
+    for knot in (0, -1):
+        half = np.linalg.inv(design.funnel.P[knot] / design.funnel.rho[knot])[0, 0] ** 0.5
+        assert any(half <= number <= half * 1.002 for number in shown)
+    for i, equation in enumerate(design.model.pieces[0]):
+        (line,) = re.findall(rf"dx{i}/dt = (.*?)(?:dx|inputs are)", page.text)
+        assert len(re.split(" [+-] ", line)) == len(list(equation.terms()))
+    assert f"an input is at most {design.claim['hold']:g} s old" in page.text
 
 
 def test_a_picture_that_is_none_is_left_out(design: Path) -> None:
