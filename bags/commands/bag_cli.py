@@ -364,7 +364,7 @@ def import_command(
     ] = None,
 ) -> None:
     """Write columns of tables as a bag of standard messages."""
-    from bags.tools.importing import import_tables
+    from bags.tools.importing import import_tables, said_units
 
     counts = import_tables(
         tables,
@@ -379,6 +379,12 @@ def import_command(
     )
     listed = ", ".join(f"{count} on {topic}" for topic, count in counts.items())
     out.print(f"wrote {bag_out}: {listed}", soft_wrap=True, markup=False)
+    if units := said_units(assignments, _pairs(types, "--type")):
+        out.print(
+            f"units by the message types, not by the table: {units}; where a column is in another, "
+            "write it behind the signal, as |unit(V), or as its `unit` in the configuration",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
 
 
 def _definitions(paths: list[Path] | None) -> "dict[str, Definition]":

@@ -3,7 +3,7 @@
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
@@ -17,7 +17,7 @@ from bags.fleet.run import ask
 from bags.fleet.workers import Workers
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions, texts_of
-from bags.tools.fitness import Level, check_fitness
+from bags.tools.fitness import Finding, Level, check_fitness
 from bags.tools.info import LOST
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.files import canonical, write_atomically
@@ -48,7 +48,10 @@ class Checked:
 
 @dataclass(frozen=True)
 class CheckBag:
-    """Is this bag fit to identify the configured robot from?"""
+    """Is this bag fit to identify the configured robot from, with others?
+
+    A command that one bag holds throughout is no reason against it: other bags have other commands.
+    """
 
     config: Config
 
@@ -69,6 +72,7 @@ class CheckBag:
             clock=self.config.clock,
             definitions=definitions,
         )
+        fitness = replace(fitness, findings=tuple(map(_of_one_bag, fitness.findings)))
         start_ns, custom = 0, {}
         try:
             with Bag(bag, unfinished=True, definitions=definitions) as source:
@@ -93,6 +97,13 @@ class CheckBag:
             ),
         )
         return canonical(asdict(checked))
+
+
+def _of_one_bag(finding: Finding) -> Finding:
+    """The finding, of one bag among others."""
+    if finding.check != "excitation" or finding.level is not Level.BAD:
+        return finding
+    return Finding(Level.LOOK, finding.check, f"{finding.what} in this bag alone")
 
 
 def check_fleet(

@@ -16,6 +16,7 @@ from scipy.io import loadmat
 from bags.recordings.message_types import fields_of, is_stamped, standard_types
 from bags.recordings.names import did_you_mean, listed
 from bags.recordings.writer import BagWriter
+from bags.signals.expressions import Expression
 from bags.signals.reader import stamp_text
 from bags.signals.signal import SignalPath, Step
 from nlsid_core.arrays import FloatArray, IntArray
@@ -222,6 +223,17 @@ def import_tables(
                 publish_time_ns=stamp,
             )
         return dict(writer.counts)
+
+
+def said_units(assignments: Sequence[str], types: Mapping[str, str]) -> str:
+    """The unit that the message type gives to each signal of `import_tables`, in words.
+
+    Empty if none of them has one.
+    """
+    store = standard_types()
+    paths = [Assignment.parse(text).path for text in assignments]
+    units = [(path, Expression(path).unit(types[path.topic], store)) for path in paths]
+    return ", ".join(f"{path} {unit}" for path, unit in units if unit)
 
 
 class _Stream:

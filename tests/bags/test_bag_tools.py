@@ -453,12 +453,13 @@ def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     table = rng.standard_normal((50, 2))
     np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="cmd,speed", comments="")
-    run(
+    said = run(
         "import", tmp_path / "log.csv", "--out", tmp_path / "bag", "--period", "0.02",
         "-s", f"{CMD}:twist.linear.x=cmd", "-s", f"{ODOM}:twist.twist.linear.x=speed",
         "--type", f"{CMD}=geometry_msgs/msg/TwistStamped", "--type", f"{ODOM}={ODOM_TYPE}",
         "--start", "1000", "--custom", "robot=car",
     )  # fmt: skip
+    assert f"by the message types, not by the table: {COMMAND} m/s, {SPEED} m/s; where" in said
     read = read_signals(tmp_path / "bag", [COMMAND, SPEED])
     written = np.loadtxt(tmp_path / "log.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(read[COMMAND].values, written[:, 0])
