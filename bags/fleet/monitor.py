@@ -260,7 +260,7 @@ def counted_once(rows: Sequence[Judged]) -> list[Judged]:
         marks = [mark for mark in (row.digest, numbers) if mark]
         if known := [first[mark] for mark in marks if mark in first]:
             row = Judged(row.bag, row.robot, COPY, f"the same recording as {known[0]}")
-        first |= dict.fromkeys(marks, row.bag)
+        first = dict.fromkeys(marks, row.bag) | first
         counted.append(row)
     return counted
 

@@ -13,6 +13,7 @@ from nlsid_core.identification import (
     CellClass,
     CertifiedRse,
     CertifiedSem,
+    FeedbackClass,
     ImplicitClass,
     LinearClass,
     LinearStateClass,
@@ -25,7 +26,8 @@ from nlsid_core.identification.methods import alike
 
 LEAST_OPTIONS: dict[type, dict[str, Any]] = {
     LinearClass: {"lags": 1}, StateAffineClass: {"lags": 2}, MonotoneClass: {"lags": 1},
-    BlockCascadeClass: {}, CellClass: {}, ImplicitClass: {}, LinearStateClass: {},
+    BlockCascadeClass: {}, CellClass: {}, FeedbackClass: {}, ImplicitClass: {},
+    LinearStateClass: {},
 }  # fmt: skip
 # class, option -> its smallest and largest allowed values, and the nearest that are refused
 LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
@@ -37,6 +39,7 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (StateAffineClass, "right_degree"): ((0, 5), (-1, 6)),
     (StateAffineClass, "input_range"): ((((0.0, 1.0),), None), (((1.0, 1.0),), ())),
     (StateAffineClass, "on_out_of_range"): (("clip", "refuse"), ("warn",)),
+    (StateAffineClass, "weights"): ((None, (1.0, 2.5)), ((), (0.0, 1.0), (float("nan"),))),
     (MonotoneClass, "lags"): ((1, 100), (0, 101)),
     (MonotoneClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
     (MonotoneClass, "degree"): ((1, 3), (2,)),
@@ -53,6 +56,12 @@ LIMITS: dict[tuple[type, str], tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     (CellClass, "start_samples"): ((1, 10_000), (0, 10_001)),
     (CellClass, "limit"): (("top", "friction", "none"), ("saturation",)),
     (CellClass, "smoothing"): ((0.0, 1.0), (-1e-9, float("nan"), float("inf"))),
+    (FeedbackClass, "lags"): ((1, 8), (0, 9)),
+    (FeedbackClass, "intervals"): ((1, 30), (0, 31)),
+    (FeedbackClass, "stages"): ((1, 8), (0, 9)),
+    (FeedbackClass, "imitated"): ((0, 10_000), (-1, 10_001)),
+    (FeedbackClass, "start_samples"): ((3, 10_000), (0, 2, 10_001)),
+    (FeedbackClass, "seed"): ((0,), (-1, 0.5)),
     (ImplicitClass, "lags"): ((1, 100), (0, 101)),
     (ImplicitClass, "delays"): (((0,), (100,)), ((-1,), (101,))),
     (ImplicitClass, "set"): (("2.10", "2.11", "2.12", "2.13"), ("2.9",)),
