@@ -203,9 +203,7 @@ SETS = (
     PublicSet("EMPS", "emps", emps, "mm", {"lowest read": 2.64}, integrated=True, factor=1e3),
     PublicSet("KUKA, joint 1", "kuka_kr300", kuka_first, "rad/s", {}),
     PublicSet("Schunk, joint 1", "schunk_arm", schunk_first, "rad/s", {}),
-    PublicSet("F1TENTH speed", "f1tenth", f1tenth, PERCENT, {
-        "first measured, least squares": 11.7, "simulation error": 8.5,
-    }),
+    PublicSet("F1TENTH speed", "f1tenth", f1tenth, PERCENT, {}),
     PublicSet("DART yaw rate", "dart", dart, "rad/s", {}),
 )  # fmt: skip
 
