@@ -99,6 +99,9 @@ class Sampled:
 
 
 def _load(content: bytes, name: str) -> Any:
+    if len(content) > strict.BYTES:
+        raise Refused(f"{name} has more than {strict.BYTES} bytes")
+
     def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len({key for key, _ in pairs}) != len(pairs):
             raise Refused(f"{name}: a member occurs twice")
@@ -114,7 +117,8 @@ def _load(content: bytes, name: str) -> Any:
         )
     except (ValueError, RecursionError) as error:
         raise Refused(f"{name} is not JSON: {error}") from error
-    if type(document) is not dict or document.get("version") != 2:
+    version = document.get("version") if type(document) is dict else None
+    if type(version) is not int or version != 2:
         raise Refused(f"{name} is not of version 2")
     return document
 
@@ -122,6 +126,8 @@ def _load(content: bytes, name: str) -> Any:
 def _integer(text: str) -> int:
     if len(text) > DIGITS:
         raise Refused(f"a number of more than {DIGITS} characters")
+    if abs(int(text)) > strict.MOST:
+        raise Refused(f"{text} is a whole number beyond 2^53")
     return int(text)
 
 
@@ -155,6 +161,8 @@ def _bound(
             raise Refused(f"{name} is not the file that the proof is about")
         files.append(_load(content, name))
         texts[role] = content.decode(), files[-1]
+        if sum(len(text.encode()) for text, _ in texts.values()) > strict.TOGETHER:
+            raise Refused(f"the files have more than {strict.TOGETHER} bytes together")
     return files, digests
 
 
@@ -789,13 +797,20 @@ def decided(file: Path, out: Path | None = None, checker: Path | None = None) ->
     return (0 if checker is None else asked(checker, terms)), ""
 
 
+FAILED = 4  # status: nothing was decided
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--coq", type=Path)
     parser.add_argument("--ask", type=Path, metavar="CHECKER")
     given = parser.parse_args()
-    status, said = decided(given.file, given.coq, given.ask)
+    try:
+        status, said = decided(given.file, given.coq, given.ask)
+    except Exception as error:
+        print(f"failed: {type(error).__name__}: {error}", file=sys.stderr)
+        return FAILED
     if said:
         print(said, file=sys.stderr)
     elif given.ask is not None:

@@ -24,6 +24,7 @@ COUNT, PLAN, END, MOST = 10**9, 10**6, 10**12, 2**53
 RATIONAL = re.compile(r"-?[0-9]+(?:/[0-9]*[1-9][0-9]*)?\Z")
 WHOLE = re.compile(r"-?[0-9]+\Z")
 COMMON = 10_000  # bits
+BYTES, TOGETHER = 32 * 2**20, 48 * 2**20  # of a file, of all of a claim
 DIGITS, SHIFT, LEVEL, LIMITS, DEGREE = 4000, 400, 16, 3, 7
 BASIS, FACTORS_OF_SQUARES, ROWS = 200, 24, 800
 KNOTS, PIECES, UNCERTAIN, ENTRIES = 10_000, 100_000, 32, 16
@@ -213,6 +214,7 @@ def _affine(model: dict[str, Any]) -> Sizes:
         polynomials(G, "G", box, (p, p), POWER)
     need(sum(len(G["exponents"]) for G in model["G"]) <= MONOMIALS, "G: too many monomials")
     polynomials(model["p"], "p", box, (p,), POWER)
+    need(bool(model["p"]["exponents"]), "p has no monomials")
     for name, count in (("y_offset", p), ("y_scale", p), ("u_offset", inputs), ("u_scale", inputs)):
         entries = reals(model[name], name, count)
         need("scale" not in name or min(entries) > 0, f"{name} should be > 0")

@@ -6,6 +6,7 @@ import random
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -312,6 +313,10 @@ ASSUMED = "funnel.json tubes 0 assumption"
         ("fading", at("claim.proof.json proof steps 0 kappa", -1.0), "kappa >= 0"),
         ("peak", at("claim.proof.json proof steps 0 curvature", [-1.0]), "curvature >= 0"),
         ("peak", at("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
+        ("peak", at("claim.proof.json version", 2.0), "not of version 2"),
+        ("peak", at("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
+        ("lasting_split", at("model.json p", {"exponents": [], "coefficients": []}),
+         "p has no monomials"),
     ],
 )  # fmt: skip
 def test_a_file_that_the_pages_do_not_allow_is_refused(
@@ -595,6 +600,18 @@ def test_check_asks_the_second_kernel(program: Path, monkeypatch: pytest.MonkeyP
     assert told.exit_code == 2
     assert "increments are known on a box only" in told.output.replace("\n", " ")
     assert "PROVED" in told.output
+
+
+def test_a_second_kernel_that_breaks_down_refuses_nothing(tmp_path: Path) -> None:
+    """Its checker is not there: that is no verdict, and no disagreement."""
+    broken = tmp_path / "nlsid-second"
+    script = VERIFIED / "generate.py"
+    broken.write_text(f"#!/bin/sh\nexec {sys.executable} {script} $1 --ask {tmp_path}/none\n")
+    broken.chmod(0o755)
+    proved = CORPUS / "tube" / "lasting_linear" / "claim.proof.json"
+    told = second.opinion(proved, broken)
+    assert told.verdict == "failed"
+    assert "FileNotFoundError" in told.reason
 
 
 def test_without_the_second_kernel_check_says_so(
