@@ -213,6 +213,11 @@ def _say_verdicts(found: FleetVerdict) -> None:
     console.print(table)
     for line in found.ranks:
         console.print(line, soft_wrap=True, highlight=False)
+    if found.ranks and found.unrecognised:
+        console.print(
+            "none of these is known to be a bag that the design was made with. Those count above "
+            "if they are here, read from elsewhere than for the design", soft_wrap=True,
+        )  # fmt: skip
     drift = found.drift
     said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
     console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)

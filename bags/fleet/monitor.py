@@ -168,6 +168,11 @@ class FleetVerdict:
         return [r for r in self.rows if r.spent is not None and r.digest not in self.made_of]
 
     @property
+    def unrecognised(self) -> bool:
+        """Whether no bag here is known to be one that the design was made of."""
+        return bool(self.made_of) and not any(row.digest in self.made_of for row in self.rows)
+
+    @property
     def worst(self) -> list[Judged]:
         """Ten bags that spent the most."""
         measured = [row for row in self.rows if row.spent is not None]

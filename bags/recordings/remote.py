@@ -235,10 +235,13 @@ class RemotePath(PosixPath):
             self._hold(start, part)
 
     def identity(self) -> bytes:
-        """What tells the file from others without reading it: its entry, and its last bytes."""
+        """What tells the file from others without reading it: its entry, its last bytes and, but
+        for S3, whose tags are of the content, its URL: other tags tell versions of one URL apart.
+        """
         size = self.entry.size
         tail = self.read_range(max(0, size - TAIL_BYTES), size)
-        return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}\n".encode()
+        url = "" if str(self).startswith("s3://") else f" {self}"
+        return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}{url}\n".encode()
 
     def _held_range(self, start: int, end: int) -> bytes | None:
         found, at = [], start

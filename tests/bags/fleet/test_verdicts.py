@@ -1,6 +1,7 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
 import math
+import os
 import re
 import time
 from collections import Counter
@@ -22,6 +23,7 @@ from bags.fleet.check import Checked, check_fleet, write_parquet
 from bags.fleet.monitor import FleetVerdict, Judged, calibration_spent, monitor_fleet
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import replay_bag
+from bags.recordings.remote import TAIL_BYTES
 from bags.samples import f1tenth
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
@@ -170,6 +172,37 @@ def test_a_recording_that_two_bags_have_is_counted_once(design: Path, tmp_path: 
     assert [row.reason for row in found.rows][1:] == 2 * ["the same recording as a/drive"]
     assert [row.bag for row in found.others] == ["a/drive"]
     assert sum(found.histogram) == 1
+
+
+def test_bags_of_the_design_that_are_not_recognised_are_said() -> None:
+    rows = tuple(Judged(name, "-", "inside", "", spent=0.5, digest=name) for name in "ab")
+    assert FleetVerdict(rows, (), frozenset("xy")).unrecognised
+    assert not FleetVerdict(rows, (), frozenset("bx")).unrecognised
+    assert not FleetVerdict(rows, (), frozenset()).unrecognised
+
+
+def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
+    design: Path, tmp_path: Path
+) -> None:
+    """Size, time of change, tag and end of the file: a copy is what has the same samples."""
+    pytest.importorskip("aiohttp")
+    web = tmp_path / "web"
+    for name, seed in (("a", 1), ("b", 2), ("c", 1)):
+        os.utime(
+            drive(web / f"{name}.mcap", samples=400, seed=seed, chunk_size=2**12),
+            ns=(10**18, 10**18),
+        )
+    tails = {file.name: file.read_bytes()[-TAIL_BYTES:] for file in web.iterdir()}
+    assert tails["a.mcap"] == tails["b.mcap"]
+    with web_server(web) as url:
+        found = monitor_fleet(
+            named_bags([Path(f"{url}/{name}.mcap") for name in "abc"]), design,
+            documents.load_proved(design), centre=Centre.COMMAND, definitions={}, workers=Workers(),
+        )  # fmt: skip
+    rows = {row.bag: row for row in found.rows}
+    assert rows["b"].judged > 0
+    assert "copy" not in (rows["a"].verdict, rows["b"].verdict)
+    assert (rows["c"].verdict, rows["c"].reason) == ("copy", "the same recording as a")
 
 
 def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: Path) -> None:
