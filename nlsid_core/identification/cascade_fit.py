@@ -10,18 +10,14 @@ Source: Marquardt 1963; the sensitivities are those of linear filters, each a fi
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.identification.damped import descend
 from nlsid_core.models import Spline
 
-FIRST_DAMPING = 1e-1
-DAMPING_DOWN, DAMPING_UP = 0.2, 4.0
-GIVE_UP_DAMPING = 1e8
-PATIENCE = 3  # steps in a row that gain too little: the first ones may be damped, not done
+FIRST_DAMPING, PATIENCE = 1e-1, 3
 MAX_RADIUS = 1.0 - 1e-6  # of the poles: beyond it a step is refused
-RIDGE = 1e-10  # of the largest diagonal entry: a basis function without data has no curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,30 +86,32 @@ def minimise(
 
     radius: of the poles, at most; those of `start` are within it.
     """
-    D = _second_differences(start)
+    D, begin = _second_differences(start), start.vector()
     weight = smoothing / float(np.ptp(start.f.coefficients) ** 2 + np.finfo(float).tiny)
-    here, residual = start, _residual(trials, start)
-    cost = _cost(residual, here, D, weight)
-    damping, taken, small = FIRST_DAMPING, 0, 0
-    while taken < steps and small < PATIENCE and damping < GIVE_UP_DAMPING:
+
+    def at(theta: FloatArray) -> Parameters:
+        return start.moved(theta - begin)
+
+    def cost(theta: FloatArray) -> float:
+        here = at(theta)
+        if theta is not begin and here.radius >= radius:
+            return float("inf")
+        bend = D @ theta
+        return _mean_square(_residual(trials, here)) + weight * float(bend @ bend)
+
+    def normal(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        here = at(theta)
+        residual = _residual(trials, here)
         J = np.concatenate([sensitivities(trial, here) for trial in trials], axis=1)
-        gradient = J @ residual / len(residual) + weight * (D.T @ (D @ here.vector()))
-        H = J @ J.T / len(residual) + weight * (D.T @ D)
-        taken += 1
-        gain = 0.0
-        while damping < GIVE_UP_DAMPING:
-            candidate = _step(here, H, gradient, damping, radius)
-            if candidate is not None:
-                trial_residual = _residual(trials, candidate)
-                reached = _cost(trial_residual, candidate, D, weight)
-                if reached < cost:
-                    gain = (cost - reached) / cost
-                    here, residual, cost = candidate, trial_residual, reached
-                    damping *= DAMPING_DOWN
-                    break
-            damping *= DAMPING_UP
-        small = small + 1 if gain < tolerance else 0
-    return Minimum(here, float(residual @ residual) / len(residual), taken)
+        gradient = J @ residual / len(residual) + weight * (D.T @ (D @ theta))
+        return J @ J.T / len(residual) + weight * (D.T @ D), gradient
+
+    theta, _, taken = descend(
+        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        patience=PATIENCE,
+    )  # fmt: skip
+    found = at(theta)
+    return Minimum(found, _mean_square(_residual(trials, found)), taken)
 
 
 def simulate(parameters: Parameters, trial: Trial) -> FloatArray:
@@ -167,29 +165,12 @@ def basis_responses(parameters: Parameters, x: FloatArray, trial: Trial) -> Floa
 
 
 def _residual(trials: tuple[Trial, ...], parameters: Parameters) -> FloatArray:
-    with np.errstate(all="ignore"):  # a wild candidate may overflow: its cost is not less
-        parts = [simulate(parameters, t)[t.transient :] - t.y[t.transient :] for t in trials]
-        return np.concatenate(parts)
+    parts = [simulate(parameters, t)[t.transient :] - t.y[t.transient :] for t in trials]
+    return np.concatenate(parts)
 
 
-def _cost(residual: FloatArray, parameters: Parameters, D: FloatArray, weight: float) -> float:
-    with np.errstate(all="ignore"):
-        bend = D @ parameters.vector()
-        return float(residual @ residual) / len(residual) + weight * float(bend @ bend)
-
-
-def _step(
-    here: Parameters, H: FloatArray, gradient: FloatArray, damping: float, radius: float
-) -> Parameters | None:
-    """The damped step, None if it leaves the filters of this radius."""
-    diagonal = np.diag(H)
-    try:
-        damped = H + np.diag(damping * diagonal + RIDGE * np.max(diagonal))
-        step = cho_solve(cho_factor(damped), -gradient)
-    except (LinAlgError, ValueError):
-        return None
-    candidate = here.moved(step)
-    return candidate if candidate.radius < radius else None
+def _mean_square(residual: FloatArray) -> float:
+    return float(residual @ residual) / len(residual)
 
 
 def sensitivities(trial: Trial, parameters: Parameters) -> FloatArray:

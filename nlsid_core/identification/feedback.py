@@ -26,10 +26,12 @@ from nlsid_core.identification.feedback_fit import (
     Stage,
     Trial,
     lagged,
+    mean_square,
     minimise_loop,
     minimise_stages,
     simulate_loop,
     simulate_stages,
+    stage_errors,
 )
 from nlsid_core.identification.fit import Step
 from nlsid_core.identification.regressors import signal_scale
@@ -154,9 +156,9 @@ def identify_loop(
         theta = np.linalg.lstsq(np.concatenate(rows), np.concatenate(outputs), rcond=None)[0]
         a, b, c, e = np.split(theta, np.cumsum([n, (n + 1) * q, 1]))
         loop = Stage(a, b.reshape(n + 1, q), float(c[0]), np.concatenate([[0.0], e]), phi)
-        found.append((*minimise_loop(
-            loop, basis, scaled.trials, steps=LOOP_STEPS, tolerance=LOOP_TOLERANCE
-        ),))  # fmt: skip
+        found.append(
+            minimise_loop(loop, basis, scaled.trials, steps=LOOP_STEPS, tolerance=LOOP_TOLERANCE)
+        )
     error, loop, trials = min(found, key=lambda entry: entry[0])
     if not error < 1.0:
         raise Infeasible("no feedback through a map explains the data; give richer data or lags")
@@ -239,7 +241,7 @@ def identify_feedback(
         progress(history[-1].what, 0.2 + 0.6 * maps / model_class.stages)
         if reached < WORTH * best:
             best, chosen = reached, stages
-    error, stages = minimise_stages(
+    _, stages = minimise_stages(
         chosen, basis, _known(loop, basis, trials, model_class),
         radius=slowest, steps=steps, tolerance=TOLERANCE,
     )  # fmt: skip
@@ -272,11 +274,7 @@ def _linear(known: Sequence[Trial], lags: int, radius: float) -> list[Stage]:
 
 def _rms(stages: Sequence[Stage], basis: Basis, trials: Sequence[Trial]) -> float:
     """Of the simulation error over the scored samples, in spreads of y."""
-    errors = [
-        (simulate_stages(stages, basis, trial)[0][-1] - trial.y)[trial.skipped :]
-        for trial in trials
-    ]
-    return float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
+    return float(np.sqrt(mean_square(stage_errors(stages, basis, trials))))
 
 
 def network_of(

@@ -9,20 +9,19 @@ of the stages passes the same filters as y does. Source: Marquardt 1963; for the
 Picard's iteration, the truncated form of which is a Volterra series (Boyd and Chua 1985).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_banded
+from scipy.linalg import solve_banded
 from scipy.signal import lfilter
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.identification.damped import descend
 from nlsid_core.models import Spline
 
 KNOTS = 48  # intervals of the piecewise linear map, whatever the spline's
-FIRST_DAMPING, DAMPING_DOWN, DAMPING_UP, GIVE_UP_DAMPING = 1e-2, 0.2, 4.0, 1e8
-RIDGE = 1e-10  # of the largest curvature: what the data do not show has none
-PATIENCE = 2  # steps in a row that gain too little
+FIRST_DAMPING, PATIENCE = 1e-2, 2
 DIVERGED = 50.0  # spreads of y, at which the loop's simulation is held
 
 
@@ -226,9 +225,9 @@ def minimise_loop(
     def taken(theta: FloatArray) -> tuple[Stage, FloatArray]:
         return loop.moved(theta[:P] - loop.vector()), theta[P:].reshape(-1, n)
 
-    def residual(theta: FloatArray) -> FloatArray:
+    def cost(theta: FloatArray) -> float:
         here, starts = taken(theta)
-        return np.concatenate([
+        return mean_square([
             (simulate_loop(here, basis, trial.u, start) - trial.y)[trial.skipped :]
             for trial, start in zip(trials, starts, strict=True)
         ])  # fmt: skip
@@ -247,10 +246,13 @@ def minimise_loop(
         return H, gradient
 
     begin = np.concatenate([loop.vector(), *(trial.start for trial in trials)])
-    error, theta = descend(begin, residual, normal, steps=steps, tolerance=tolerance)
+    theta, reached, _ = descend(
+        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        patience=PATIENCE,
+    )  # fmt: skip
     found, starts = taken(theta)
     moved = [replace(trial, start=start) for trial, start in zip(trials, starts, strict=True)]
-    return error, found, moved
+    return reached**0.5, found, moved
 
 
 def minimise_stages(
@@ -269,14 +271,11 @@ def minimise_stages(
         parts = np.split(theta, ends)
         return [s.moved(part - s.vector()) for s, part in zip(stages, parts, strict=True)]
 
-    def residual(theta: FloatArray) -> FloatArray | None:
+    def cost(theta: FloatArray) -> float:
         here = taken(theta)
         if max(stage.radius for stage in here) > radius:
-            return None
-        return np.concatenate([
-            (simulate_stages(here, basis, trial)[0][-1] - trial.y)[trial.skipped :]
-            for trial in trials
-        ])  # fmt: skip
+            return float("inf")
+        return mean_square(stage_errors(here, basis, trials))
 
     def normal(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         here = taken(theta)
@@ -289,46 +288,24 @@ def minimise_stages(
         return H, gradient
 
     begin = np.concatenate([stage.vector() for stage in stages])
-    error, theta = descend(begin, residual, normal, steps=steps, tolerance=tolerance)
-    return error, taken(theta)
+    theta, reached, _ = descend(
+        begin, cost, normal, steps=steps, tolerance=tolerance, damping=FIRST_DAMPING,
+        patience=PATIENCE,
+    )  # fmt: skip
+    return reached**0.5, taken(theta)
 
 
-def descend(
-    theta: FloatArray,
-    residual: Callable[[FloatArray], FloatArray | None],
-    normal: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    *,
-    steps: int,
-    tolerance: float,
-) -> tuple[float, FloatArray]:
-    """(rms residual, θ) where Levenberg-Marquardt steps gain less than the tolerance.
+def stage_errors(
+    stages: Sequence[Stage], basis: Basis, trials: Sequence[Trial]
+) -> list[FloatArray]:
+    """What the last stage is off at the scored samples of each trial."""
+    return [
+        (simulate_stages(stages, basis, trial)[0][-1] - trial.y)[trial.skipped :]
+        for trial in trials
+    ]
 
-    residual: None where θ is not allowed. normal: J'J and J'r.
-    """
 
-    def cost_at(theta: FloatArray) -> float:
-        with np.errstate(all="ignore"):  # a wild candidate may overflow: its cost is not less
-            r = residual(theta)
-            return float("inf") if r is None else float(r @ r) / len(r)
-
-    cost, damping, small = cost_at(theta), FIRST_DAMPING, 0
-    for _ in range(steps):
-        H, gradient = normal(theta)
-        gain, diagonal = 0.0, np.diag(H)
-        while damping < GIVE_UP_DAMPING:
-            try:
-                damped = H + np.diag(damping * diagonal + RIDGE * diagonal.max())
-                candidate = theta - cho_solve(cho_factor(damped), gradient)
-                reached = cost_at(candidate)
-            except (LinAlgError, ValueError):
-                reached = float("inf")
-            if reached < cost:
-                gain = (cost - reached) / cost
-                theta, cost = candidate, reached
-                damping *= DAMPING_DOWN
-                break
-            damping *= DAMPING_UP
-        small = small + 1 if gain < tolerance else 0
-        if small == PATIENCE or damping >= GIVE_UP_DAMPING:
-            break
-    return cost**0.5, theta
+def mean_square(errors: Sequence[FloatArray]) -> float:
+    """Over all of them."""
+    every = np.concatenate(errors)
+    return float(every @ every) / len(every)
