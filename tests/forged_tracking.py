@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from nlsid_core.design.sampled.design import TrackingDesign
-from tests.tracked import STEPS, designed, resigned
+from tests.tracked import designed, resigned
 
 
 def forged(design: TrackingDesign, what: str) -> TrackingDesign:
@@ -31,7 +31,7 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         for entry in proof["steps"]:
             for chain in ("tube", "inlet"):
                 entry[chain]["reach"] *= 0.98
-        tube = funnel.tube * np.r_[1.0, np.full(STEPS, 0.98)]
+        tube = funnel.tube * np.r_[1.0, np.full(len(funnel.tube) - 1, 0.98)]
         return resigned(design, funnel=replace(funnel, tube=tube), proof=proof)
     if what == "assumption made smaller":
         smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)

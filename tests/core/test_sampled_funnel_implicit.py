@@ -17,6 +17,7 @@ from nlsid_core.models.trapezoidal import TrapezoidalModel
 from nlsid_core.proofs import check
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
+from tests import forged_tracking
 from tests.implicit_funnels import STEPS, designed
 from tests.implicit_pendulum import PERIOD, truth
 from tests.tracked import assumption, resigned, step, write
@@ -78,22 +79,8 @@ def forged(design: TrackingDesign, what: str) -> TrackingDesign:
         return resigned(design, funnel=replace(funnel, roots=None))
     if what == "a bound that lets spurious roots in":
         return resigned(design, funnel=replace(funnel, roots=1e4 * funnel.roots))
-    if what == "tube cut by 2 %":
-        tube = np.r_[funnel.tube[0], 0.98 * funnel.tube[1:]]
-        return resigned(design, funnel=replace(funnel, tube=tube))
-    if what == "levels and reaches cut by 2 %":
-        proof = copy.deepcopy(design.proof)
-        for entry in proof["steps"]:
-            for chain in ("tube", "inlet"):
-                entry[chain]["reach"] *= 0.98
-        tube = funnel.tube * np.r_[1.0, np.full(STEPS, 0.98)]
-        return resigned(design, funnel=replace(funnel, tube=tube), proof=proof)
-    if what == "assumption made smaller":
-        smaller = replace(funnel.assumption, bound=0.9 * funnel.assumption.bound)
-        return resigned(design, funnel=replace(funnel, assumption=smaller))
-    if what == "commissioning runs are the fitting bags":
-        borrowed = replace(funnel.assumption, measured_on=design.model.bags)
-        return resigned(design, funnel=replace(funnel, assumption=borrowed))
+    if what in OF_EVERY_MODEL:
+        return forged_tracking.forged(design, what)
     if what == "a form that is not for implicit models":
         other = replace(funnel.assumption, form="energy", gain=60.0)
         return resigned(design, funnel=replace(funnel, assumption=other))
@@ -136,13 +123,16 @@ def rows_of(entry: Json) -> list[list[int]]:
     return rows
 
 
-FORGERIES = [
-    "no bound on the roots",
-    "a bound that lets spurious roots in",
+OF_EVERY_MODEL = [
     "tube cut by 2 %",
     "levels and reaches cut by 2 %",
     "assumption made smaller",
     "commissioning runs are the fitting bags",
+]
+FORGERIES = [
+    *OF_EVERY_MODEL,
+    "no bound on the roots",
+    "a bound that lets spurious roots in",
     "a form that is not for implicit models",
     "another nominal",
     "another model",
