@@ -49,7 +49,6 @@ app.add_typer(bag_app)
 app.add_typer(config_app)
 app.add_typer(fleet_app)
 out = Console()
-UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 err = Console(stderr=True)
 
 BagsArgument = Annotated[
@@ -562,26 +561,9 @@ def monitor(
     else:
         out.print(show.replay_table(replays))
     for entry in [] if as_json else replays:
-        for line in show.forecasts(entry, proved.design) if forecast else ():
+        seen = show.forecasts(entry, proved.design) if forecast else ()
+        for line in (*seen, *show.replay_lines(entry)):
             out.print(line, soft_wrap=True, markup=False, highlight=False)
-        if entry.first_bad is not None:
-            out.print(f"{entry.name}: {entry.reason}", soft_wrap=True)
-        left = entry.first_outside
-        if left is not None and left is not entry.first_bad:
-            out.print(f"{entry.name}: outside at {left.t:.3f} s, the first time", soft_wrap=True)
-        if (alarm := entry.first_alarm) is not None:
-            said = f"{entry.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
-            out.print(said, soft_wrap=True)
-        for said in filter(None, (entry.said_filled, entry.said_wide)):
-            out.print(f"{entry.name}: {said}", soft_wrap=True)
-        for reading in entry.unjudged[:UNJUDGED_SAID]:
-            said = f"{entry.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
-            out.print(said, soft_wrap=True)
-        if more := entry.unjudged[UNJUDGED_SAID:]:
-            said = f"not judged later either: {len(more)} more, the last from {more[-1].t:.3f} s on"
-            out.print(f"{entry.name}: {said}", soft_wrap=True)
-        if not entry.judged:
-            out.print(f"{entry.name}: nothing was judged: {entry.reason}", soft_wrap=True)
     if falsify is not None:
         bad = [f for f, r in zip(folders, replays, strict=True) if r.first_bad is not None]
         for said in (line for f in bad for line in falsified(funnel, f, falsify, types)):

@@ -40,6 +40,7 @@ free run: simulated; +k: predicted k samples ahead. residual: coloured (not
 white), follows the input u, or both, at 99 %. rate: proved, a sample; forgets:
 its time constant. time: of the processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
+UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 STABILITY = "proved rate a sample (time constant)"
 
 
@@ -306,6 +307,28 @@ def forecasts(replay: Replay, design: AnyDesign) -> Iterator[str]:
     for i, name in enumerate(signal_names(design)):
         halves = [(entry.high[i] - entry.low[i]) / 2.0 for entry in whole]
         yield f"  {name}: {sum(halves) / len(halves):.3g} on average, at most {max(halves):.3g}"
+
+
+def replay_lines(replay: Replay) -> Iterator[str]:
+    """Why a bag is not inside, what else was seen, and what was not judged."""
+    left = replay.first_outside
+    if replay.first_bad is not None:
+        yield f"{replay.name}: {replay.reason}"
+    if left is not None and left is not replay.first_bad:
+        yield f"{replay.name}: outside at {left.t:.3f} s, the first time"
+    if (alarm := replay.first_alarm) is not None:
+        yield f"{replay.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
+    for said in filter(None, (replay.said_filled, replay.said_wide)):
+        yield f"{replay.name}: {said}"
+    for reading in replay.unjudged[:UNJUDGED_SAID]:
+        yield f"{replay.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
+    if more := replay.unjudged[UNJUDGED_SAID:]:
+        yield (
+            f"{replay.name}: not judged later either: {len(more)} more, the last from "
+            f"{more[-1].t:.3f} s on"
+        )
+    if not replay.judged:
+        yield f"{replay.name}: nothing was judged: {replay.reason}"
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from bags.chain.config import load_config
 from bags.chain.joint_bags import write_joint_bag
 from bags.chain.steps import design_funnel_files, identify_bags
-from bags.commands.cli import UNJUDGED_SAID, app
+from bags.commands.cli import app
+from bags.commands.show import UNJUDGED_SAID
 from bags.designs import documents
 from bags.designs.design import AnyDesign
 from bags.designs.documents import Proved
