@@ -18,6 +18,7 @@ STEPS = 200  # of Runge-Kutta of order four, at least
 MOST_SAMPLES = 2000  # of a held input: a shorter hold is simulated without one
 ASCENTS = 3  # of the distance at the end: two are usual
 SCALES = np.concatenate([[0.0], np.geomspace(2.0**-8, 1.0, 9)])
+MISSED = 1.01  # of the goal's size: nearer, the simulation's own error might decide
 LOST = 1e6  # of the goal's size: what is as far from the motion does not come back
 
 
@@ -40,7 +41,7 @@ class Tried:
     @property
     def impossible(self) -> bool:
         """True if a solution that starts on the motion itself misses the goal."""
-        return bool(self.farthest[0] > 1)
+        return bool(self.farthest[0] > MISSED)
 
     def __str__(self) -> str:
         held = f", with inputs held for {self.period:g} s," if self.period else ""
@@ -51,7 +52,7 @@ class Tried:
                 f"No funnel of this policy can be proved: a simulated solution{held} starts on the "
                 f"motion at {self.start:g} s and ends {far}{how if self.pushed else ''}"
             )
-        missed = np.flatnonzero(self.farthest > 1)
+        missed = np.flatnonzero(self.farthest > MISSED)
         said = "Of the solutions that were simulated none misses the goal"
         if len(missed):
             sizes = ", ".join(f"{width:.3g}" for width in SCALES[missed[0]] * self.widths)
