@@ -18,7 +18,7 @@ STEPS = 200  # of Runge-Kutta of order four, at least
 MOST_SAMPLES = 2000  # of a held input: a shorter hold is simulated without one
 ASCENTS = 3  # of the distance at the end: two are usual
 SCALES = np.concatenate([[0.0], np.geomspace(2.0**-8, 1.0, 9)])
-MISSED = 1.01  # of the goal's size: nearer, the simulation's own error might decide
+MISSED = 1.0001  # of the goal's size: nearer, the simulation's own error might decide
 LOST = 1e6  # of the goal's size: what is as far from the motion does not come back
 
 
