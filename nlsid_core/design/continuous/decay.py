@@ -7,6 +7,7 @@ X ⪰ 0, every τ = y'Sy with S ⪰ 0 and y = (1, z): one cone program. m become
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -82,14 +83,8 @@ def prove_decay(steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunne
 
 
 def _with_kappa(steps: LSteps, factor: float) -> LSteps:
-    if steps.kappa is None:
-        return steps
-    found = LSteps(
-        steps.field, nonlinear=steps.nonlinear, pushed=False, widths=steps.widths,
-        decay=steps.decay,
-    )  # fmt: skip
-    found.limits, found.modes, found.pushed = steps.limits, steps.modes, steps.pushed
-    found.vertices, found.kappa = steps.vertices, factor * steps.kappa
+    found = copy(steps)
+    found.kappa = None if steps.kappa is None else factor * steps.kappa
     return found
 
 
@@ -161,9 +156,7 @@ def _blank(steps: LSteps, parts: Sequence[Part], T: FloatArray, floor: float) ->
     )
 
 
-def _needed(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, k: int
-) -> float:
+def _needed(steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, k: int) -> float:
     """The least floor that points at both ends of an interval leave possible."""
     n, rng, needed = funnel.n, np.random.default_rng(0), 0.0
     z = rng.normal(size=(DIRECTIONS, n))
@@ -265,7 +258,8 @@ def _solved(end: _End, steps: LSteps, floor: float) -> tuple[FloatArray, FloatAr
 def _program(target: FloatArray, q: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """m, X (k, k) and S (len(q), n+1, n+1): target = m + v'Xv + Σ y'S y q, m as large as can be.
 
-    m is at most the target's size: a mode that does not occur has no bound. q: (Q, M₂). Raises SolverError if the solver finds nothing.
+    m is at most the target's size: a mode that does not occur has no bound. q: (Q, M₂).
+    Raises SolverError if the solver finds nothing.
     """
     n = next(n for n in range(1, 17) if len(_rows(n, 4)) == len(target))
     size = float(np.abs(target).max())
@@ -288,8 +282,12 @@ def _program(target: FloatArray, q: FloatArray) -> tuple[float, FloatArray, Floa
             q=cost,
             A=sp.vstack([A, _one(count).T, -sp.eye(count, format="csr")[1:]], "csc"),
             b=np.r_[target / size, 1.0, np.zeros(count - 1)],
-            cones=(Cone("zero", len(target)), Cone("nonnegative", 1), Cone("psd", k),
-                   *[Cone("psd", y)] * len(q)),
+            cones=(
+                Cone("zero", len(target)),
+                Cone("nonnegative", 1),
+                Cone("psd", k),
+                *[Cone("psd", y)] * len(q),
+            ),
         ),
         tolerance=TOLERANCE,
     ).x

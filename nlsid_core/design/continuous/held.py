@@ -24,7 +24,7 @@ from nlsid_core.design.continuous.pieces import (
     substitution,
     unsolved,
 )
-from nlsid_core.design.continuous.witnesses import stated_multipliers, rate_documents
+from nlsid_core.design.continuous.witnesses import rate_documents, stated_multipliers
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel

@@ -106,8 +106,9 @@ class LSteps:
     clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
     nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
-    field's `is_pushed`). decay: 1/s, what every margin is above this rate of V̇. kappa: (intervals, n_w), if it is. local: what the dynamics are on an
-    interval, where a search expands them anew; else they are the field.
+    field's `is_pushed`). decay: 1/s, the rate of V̇ that every margin is above. kappa: (intervals,
+    n_w), if it is bounded. local: what the dynamics are on an interval, where a search expands
+    them anew; else they are the field.
     """
 
     def __init__(
@@ -184,7 +185,7 @@ class LSteps:
         return vertex, corner, self.modes[mode]
 
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
-        """(cases, N) -Ẇ/ρ - decay at the program's points, straight from the vector field in each mode."""
+        """(cases, N) -Ẇ/ρ - decay at the program's points, in each mode, from the vector field."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
         w = np.empty((*u.shape[:2], self.vertices.shape[1]))

@@ -326,7 +326,7 @@ def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Piece
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
     keys = [f.name for f in fields(Pieces) if f.name not in SHARED]
-    whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+    whole: Json = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
     return replace(parts[0], **whole)
 
 

@@ -117,7 +117,7 @@ def stated_multipliers(pieces: Pieces) -> Pieces:
     """The pieces with τ of few bits, and how a proof states it; there is no μ."""
     n = pieces.basis.shape[1]
     sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
-    nothing = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
+    nothing: Json = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
     tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
     for b in range(len(pieces)):
         factors = []
