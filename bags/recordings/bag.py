@@ -122,7 +122,8 @@ class Bag:
         if not found:
             there = listed(f"{name} ({kind})" for name, kind in self.topics.items())
             near = did_you_mean(topic, self.topics)
-            raise BagError(f"{self.path} has no topic {topic}; it has: {there}{near}")
+            cut = "" if self.ending is None else f". It is truncated or unfinished: {self.ending}"
+            raise BagError(f"{self.path} has no topic {topic}; it has: {there}{near}{cut}")
         if len({c.msgtype for c in found}) > 1:
             raise BagError(
                 f"{self.path}: {topic} holds messages of {self.topics[topic]}; "
@@ -196,8 +197,9 @@ class Bag:
             )
         bytes_there = sum(file.stat().st_size for file in self.files)
         return (
-            f"{self.path} is truncated or unfinished: of {bytes_there} bytes, {self.ending}; "
-            f"copy it again, or recover its complete chunks with {RECOVER}"
+            f"{self.path} is truncated or unfinished, without the summary that ends a bag: of "
+            f"{bytes_there} bytes, {self.ending}; copy it again, or recover its complete chunks "
+            f"with {RECOVER}"
         )
 
 
