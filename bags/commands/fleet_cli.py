@@ -238,6 +238,7 @@ def _say_verdicts(found: FleetVerdict, manifest: Path | None, table: Path | None
         {r.bag: _since(r) for r in found.rows if r.verdict in BROKEN},
     )  # fmt: skip
     say_bags(console, "not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
+    say_bags(console, "clock", {r.bag: r.clock for r in found.rows if r.clock})
     alarms = {r.bag: r.alarm for r in found.rows if r.alarm and r.verdict not in BROKEN}
     say_bags(console, "only the second alarm", alarms)
     for verdict, title in ((UNREAD, UNREAD), (COPY, "copies")):

@@ -43,14 +43,13 @@ LEAST = 3  # bags of a month, and calibration trials, that are compared
 class Judged:
     """One bag: its verdict, and the numbers behind it.
 
-    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: which one
-    was broken first, in words. spent: the largest part of what is assumed that was used (None: not
-    measured), at spent_at, s of the run. margin: the least (None: nothing judged), margin_at: s.
-    start: of the bag, spent_when, and bad_from: of the first bad sample, all ISO 8601 in UTC;
-    bad_at: s of the run.
-    alarm: of the second alarm. unjudged: from where on it was not judged, and why, also of a bag
-    that is bad; its clock, gaps. judged, span: s. filled: samples nobody measured. digest: of the
-    recording.
+    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: what of it
+    was broken first, without numbers. spent: the largest part of what is assumed that was used
+    (None: not measured), at spent_at, s of the run. margin: the least (None: nothing judged),
+    margin_at: s. start: the bag's first log time, spent_when, and bad_from: of the first bad
+    sample, all ISO 8601 in UTC; bad_at: s of the run. alarm: of the second alarm. unjudged: from
+    where on it was not judged, and why, also of a bag that is bad. clock: where its stamps go back.
+    judged, span: s. filled: samples nobody measured. digest: of the recording.
     """
 
     bag: str
@@ -68,6 +67,7 @@ class Judged:
     bad_at: float = 0.0
     alarm: str = ""
     unjudged: str = ""
+    clock: str = ""
     judged: float = 0.0
     span: float = 0.0
     filled: int = 0
@@ -81,7 +81,7 @@ class Judged:
     @property
     def has_trouble(self) -> bool:
         """Whether there is something to look at; a copy is looked at where it counts."""
-        return bool(self.alarm) or self.verdict not in (Status.INSIDE.value, COPY)
+        return bool(self.alarm or self.clock) or self.verdict not in (Status.INSIDE.value, COPY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +122,12 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Judged:
         spent_when="" if most is None else iso(stamps[id(most)]),
         margin=None if worst is None else max(worst.margin, -1e300),
         margin_at=0.0 if worst is None else worst.t,
-        start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",
+        start=iso(replay.start_ns),
         bad_from="" if bad is None else iso(stamps[id(bad)]),
         bad_at=0.0 if bad is None else bad.t,
         alarm="" if alarm is None else alarm.alarm,
         unjudged=_unjudged(replay),
+        clock=replay.clock,
         judged=replay.judged_span,
         span=replay.span,
         filled=replay.filled,

@@ -73,7 +73,8 @@ class Bag:
         self._storage.channels = [
             defined(channel, definitions or {}) for channel in self._storage.channels
         ]
-        self.ending = self._storage.ending or self.ending
+        if self._storage.ending is not None:  # of a bag that is one file that is said already
+            self.ending = self._storage.ending.removeprefix(f"{self.path}: ")
         if self.ending is not None and not unfinished:
             self.close()
             raise BagError(self._unfinished())

@@ -109,7 +109,6 @@ class McapStorage:
         self.files: list[McapFile] = []
         self.ending: str | None = None
         self._keys: list[dict[int, int]] = []
-        self._alone = len(files) == 1
         try:
             for path in files:
                 with reading(path):
@@ -122,7 +121,7 @@ class McapStorage:
         self.files.append(file)
         found = file.contents
         if found.ending is not None:
-            self.ending = found.ending if self._alone else f"{file.path.name}: {found.ending}"
+            self.ending = f"{file.path}: {found.ending}"
         for record in found.metadata:
             if record.name == custom_record:
                 self.custom.update(record.metadata)
