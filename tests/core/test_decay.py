@@ -11,7 +11,7 @@ from nlsid_core import proofs
 from nlsid_core.design import ContinuousTracking, FunnelDesign, design, integrate_nominal
 from nlsid_core.dynamics import VectorField
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, OptionError
-from tests.core.test_held_funnels import tracking
+from tests.falling_pendulum import tracking
 from tests.funnel_files import FUNNEL, PROOF, Files, bind, copy_of, saved
 
 RATE = 2.0  # 1/s
