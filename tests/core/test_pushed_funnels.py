@@ -24,7 +24,7 @@ def lane_change() -> Nominal:
     def still(x: Any, u: Any) -> Any:
         return drifting(x, u, np.zeros(1))
 
-    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, m=1, knots=13)
+    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, m=1)
 
 
 def level(found: FunnelDesign, t: float, X: FloatArray) -> FloatArray:
