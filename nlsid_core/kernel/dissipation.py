@@ -26,7 +26,10 @@ MEMBERS = "kind about supply discount scales"
 
 @dataclass(frozen=True)
 class Dissipation:
-    """A decided claim: γ or ι as `number`, in units of the scales of inputs and outputs."""
+    """A decided claim: γ or ι as `number`, in units of the scales of inputs and outputs.
+
+    everywhere: for every input and output, none refused and no box.
+    """
 
     model: Model
     kind: str
@@ -34,6 +37,7 @@ class Dissipation:
     discount: Fraction
     u_scales: list[Fraction]
     y_scales: list[Fraction]
+    everywhere: bool
 
 
 def decide(claim: Node, proof: Node, read: Read) -> Decision:
@@ -92,7 +96,8 @@ def _read(parts: dict[str, Node], model: Model) -> Dissipation:
     u, y = scales["u"].array(len(model.u)), scales["y"].array(len(model.y))
     if min(u + y) <= 0:
         raise Rejected("scales should be positive")
-    return Dissipation(model, kind, number, discount, u, y)
+    everywhere = "box" not in parts and model.limits != "refuse"
+    return Dissipation(model, kind, number, discount, u, y, everywhere)
 
 
 def _supply(claim: Dissipation) -> Matrix:
@@ -141,6 +146,6 @@ def _statement(claim: Dissipation) -> str:
         bound = f"sum {fade}du'dy >= {excess}- V(0)/2".replace(">= - ", ">= -")
         bound += " up to every sample t >= 0"
     return (
-        f"{said}{bound}, dy the difference of {outputs}, du that of {inputs}, V(0) = 0 where "
-        f"both have one past, {model.inputs}"
+        f"{said}{bound}, dy the difference of {outputs}, du that of {inputs}, V(0) = x'Px of "
+        f"the difference of their states, 0 where both have one past, {model.inputs}"
     )

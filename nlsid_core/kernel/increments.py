@@ -498,7 +498,7 @@ def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
         given.period, y, u, [row[: p + n] for row in F], [_unit(i, p + n) for i in range(p)],
         "for every input" if bounds is None else "while signals stay in the box", box,
         vertices, ray=least is not None, effort=0 if only else _effort(E, box),
-        whole=split if p > 1 and box else 0, limits="box" if box else "",
+        whole=split if p > 1 and box else 0,
     )  # fmt: skip
     return _driven(model, window, [row[p + n :] for row in F]) if driven else model
 

@@ -46,7 +46,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
 def _refuse_partial(found: Dissipation) -> None:
     if found.kind != "gain" or found.discount != 1:
         raise Rejected("it should claim a gain, with the discount 1")
-    if found.model.limits in ("refuse", "box"):
+    if not found.everywhere:
         raise Rejected("its gain does not hold for every input and output")
 
 
