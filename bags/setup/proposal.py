@@ -22,6 +22,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, Pair, slope_window
+from bags.setup.curved import tried_classes
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
@@ -32,6 +33,7 @@ from bags.signals.timing import held
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import BagError, DataError, NlsidError
 from nlsid_core.identification import LeastSquares, LinearClass, Rse, StateAffineClass, identify
+from nlsid_core.identification.searches import hold_out
 from nlsid_core.progress import silent
 from nlsid_core.running.grid import TOLERANCE
 
@@ -49,7 +51,13 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
+GOOD: Final = 10.0  # % below which no further class is tried
+CLASS_BETTER: Final = 0.8  # of the linear model's error, that another class has to reach
+NOT_TRIED: Final = (
+    ". Of several responses these were not tried: `implicit` for forces that are not linear, and "
+    "each response alone, for which there are more classes"
+)
+GRADES: Final = ((GOOD, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
@@ -175,22 +183,27 @@ def propose(
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
     if linear:
-        _say_lags(proposal, trials.train, found)
+        _say_lags(proposal, trials.train)
     else:
         _say_degree(proposal, trials.train)
     _say_funnel(proposal)
     others = [pair.command.text for pair in _followed(proposal, found)]
-    if not (widen and proposal.error > POOR and others):
-        return proposal
-    wider = propose(
-        bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
-        definitions=definitions, types=types,
-    )  # fmt: skip
-    if not wider.error < proposal.error:
-        return proposal
-    without = f"; without it models are off by {proposal.error:.3g} %"
-    wider.why |= {text: wider.why[text] + without for text in others}
-    return wider
+    if widen and proposal.error > POOR and others:
+        wider = propose(
+            bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
+            definitions=definitions, types=types,
+        )  # fmt: skip
+        if wider.error < proposal.error:
+            without = f"; without it models are off by {proposal.error:.3g} %"
+            wider.why |= {text: wider.why[text] + without for text in others}
+            return wider
+    alone = len(responses) == 1
+    if alone and GOOD < proposal.error < math.inf:
+        _say_class(proposal, trials.train)
+    if POOR < proposal.error < math.inf:
+        also = _others(proposal, found) if linear else ""
+        proposal.walls.append(_poor(proposal) + (also if alone else also + NOT_TRIED))
+    return proposal
 
 
 @dataclass(frozen=True)
@@ -545,7 +558,7 @@ def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]
             proposal.why[key] = f"without it: {error}"[:120].rpartition(" ")[0]
 
 
-def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
+def _say_lags(proposal: Proposal, train: Dataset) -> None:
     """The fewest lags whose simulation of a part of the training trials is about as good as any."""
     names = train.names
     held_back = list(names[1::3]) or list(names[:1])
@@ -583,8 +596,6 @@ def _say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
     proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"
-    if best > POOR:
-        proposal.walls.append(_poor(best, proposal.tried_on) + _others(proposal, found))
 
 
 def _followed(proposal: Proposal, found: Found) -> list[Pair]:
@@ -640,8 +651,6 @@ def _say_degree(proposal: Proposal, train: Dataset) -> None:
     )
     proposal.why["lags"] = f"least squares on trials held back; lags, delays, right_degree: {said}"
     proposal.why["right_degree"] = "as the lags"
-    if best > POOR:
-        proposal.walls.append(_poor(best, "trials held back"))
 
 
 def _varies(trials: Dataset) -> str:
@@ -660,12 +669,29 @@ def _terms(tried: StateAffineClass) -> int:
     return math.comb(window + tried.right_degree, tried.right_degree)
 
 
-def _poor(best: float, where: str) -> str:
+def _say_class(proposal: Proposal, train: Dataset) -> None:
+    """Another class, where its proved model simulates trials held back far better."""
+    names = train.names[1::3]
+    fitted, held_back = (train.without(names), train.select(names)) if names else hold_out(train)
+    linear = proposal.content["identification"]["model"]
+    errors = [(linear, proposal.error)]
+    for section, error in tried_classes(fitted, held_back, proposal.error):
+        errors.append((section["model"], error))
+        if error <= CLASS_BETTER * errors[0][1] and error < proposal.error:
+            proposal.content["identification"] = dict(section)
+            proposal.error, proposal.tried_on = error, "trials held back"
+    said = ", ".join(f"{model}: {error:.3g} %" for model, error in errors)
+    proposal.why["model"] = f"proved models simulated on trials held back are off by {said}"
+    if proposal.content["identification"]["model"] != linear:
+        for key in ("lags", "delays", "right_degree", "input_range", "method"):
+            proposal.why.pop(key, None)
+
+
+def _poor(proposal: Proposal) -> str:
     return (
-        f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
-        "will be wide; another pair of signals, or more of them, may say more. Not tried here: "
-        "`model: feedback` for what swings on a spring that stiffens, `cells` for dry friction and "
-        "for levels that flow over, `block_cascade` for what saturates"
+        f"nothing that was tried simulates {proposal.tried_on} with less than "
+        f"{proposal.error:.3g} % error: the tube will be wide; another pair of signals, or more "
+        "of them, may say more"
     )
 
 

@@ -36,7 +36,7 @@ BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken 
 SMALL = 0.1  # eigenvalue of K relative to its size that may vanish at the minimum
 FEWEST, WIDEST, MAX_BASES = 2, 4, 8  # vectors that join U at once, and how often they do
 INVERSE_ITERATIONS = 4  # of a subspace: what matters is orders of magnitude apart
-SHORT_STEP, SHORT_STEPS = 2.0**-5, 3  # so many steps so short, and Newton alone has stalled
+SHORT_STEP, SHORT_STEPS = 2.0**-2, 2  # so many steps so short, and Newton alone has stalled
 GAP = 1e-7  # μ·(barrier parameter) relative to J at which the barrier path of K ends
 INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
 FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near by itself
@@ -160,14 +160,18 @@ def minimise(
     *,
     inequalities: Sequence[MatrixInequality] = (),
     extra: FloatArray | None = None,
+    steps: int | None = None,
 ) -> Minimum:
     """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
 
     extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
     of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
+    steps: without inequalities, only so many steps of Newton's method, without a barrier of K.
     """
     descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
+    if steps is not None:
+        return descent.to_minimum(z, limit=steps)
     found = descent.freely(z)
     if found.is_inside:
         return found
@@ -324,14 +328,19 @@ class Descent:
             mu *= MU_FALL if barrier is None else MU_FALL_K
 
     def to_minimum(
-        self, z: FloatArray, *, mu: float = 0.0, barrier: Repulsion | SchurBarrier | None = None
+        self,
+        z: FloatArray,
+        *,
+        mu: float = 0.0,
+        barrier: Repulsion | SchurBarrier | None = None,
+        limit: int = MAX_NEWTON,
     ) -> Minimum:
-        """Newton's method for one μ."""
+        """Newton's method for one μ, of `limit` steps at most."""
         value, point = self._value(z, mu, barrier)
         if point is None:
             raise SolverError("Newton's method was started where J is infinite")
-        short, limit = 0, MAX_NEWTON if barrier is None else MAX_CENTRING
-        for _ in range(limit):
+        short = 0
+        for _ in range(limit if barrier is None else MAX_CENTRING):
             gradient, hessian = self._derivatives(z, point, mu, barrier)
             if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
                 raise SolverError(

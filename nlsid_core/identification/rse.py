@@ -41,18 +41,23 @@ def robust_simulation_error(
     start: FloatArray | None = None,
     iterations: int = 40,
     tolerance: float = 1e-6,
+    steps: int | None = None,
+    exact_first: bool = False,
 ) -> Iterator[Iterate]:
     """Yield the minimiser of each bound, first to last.
 
     start: left parameters at which the first bound is exact (None: the first bound is that of
     G_m = I). Stops after `iterations` bounds or when J falls by less than `tolerance` of itself.
+    steps: of Newton's method for each bound, at most (None: to its minimum): J goes down all the
+    same, as each bound is exact where it begins. exact_first: the first one to its minimum.
     Raises SolverError if Newton's method cannot go on.
     """
     linearised_at = start
     previous = float("inf")
-    for _ in range(iterations):
+    for number in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at
-        found = minimise(Bound(rows, linearised_at), start)
+        limit = None if exact_first and number == 0 else steps
+        found = minimise(Bound(rows, linearised_at), start, steps=limit)
         point = found.point
         yield Iterate(point.theta, point.p, point.J, found.on_boundary)
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:

@@ -1,0 +1,89 @@
+"""Classes of models that are not linear, tried where the linear ones say little.
+
+Each is fitted to a part of the training trials and judged by trials held back from it, as the
+linear models were; a model without a proof counts for nothing.
+"""
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any, Final
+
+from pydantic import TypeAdapter
+
+from bags.chain.identification_config import Identification, IdentificationConfig
+from nlsid_core.data.trajectory import Dataset
+from nlsid_core.errors import NlsidError
+from nlsid_core.identification import Sem, identify
+
+SAMPLES: Final = 2000  # of the training trials, to which these classes are fitted
+SECONDS: Final = 30.0  # of processor time, after which no further class is begun
+LOOP_WORTH: Final = 0.6  # of the best error so far, that an unproved loop has to reach
+LAGS: Final = (2, 3)  # of such loops
+
+Section = Mapping[str, Any]
+
+
+def tried_classes(
+    train: Dataset, held_back: Dataset, best: float
+) -> Iterator[tuple[Section, float]]:
+    """Sections `identification` of one response with the errors [%] of their proved models.
+
+    best: the least error so far. A class that has no proved model is left out.
+    """
+    first, few = train.trajectories[0], _shortened(train)
+    started = time.process_time()
+    for section in _sections(len(first.u_names)):
+        if time.process_time() - started > SECONDS:
+            return
+        error = _error(section, few, held_back)
+        if math.isfinite(error):
+            best = min(best, error)
+            yield section, error
+    if time.process_time() - started > SECONDS:
+        return
+    loops = {
+        lags: _error({"model": "feedback", "lags": lags, "method": Sem.name}, few, held_back)
+        for lags in LAGS
+    }
+    lags = min(loops, key=loops.__getitem__)
+    if loops[lags] < LOOP_WORTH * best:
+        section = {"model": "feedback", "lags": lags}
+        error = _error(section, few, held_back)
+        if math.isfinite(error):
+            yield section, error
+
+
+def _sections(excitations: int) -> Iterator[Section]:
+    """The quick ones first."""
+    if excitations == 1:
+        yield {"model": "block_cascade", "orders": [2, 2], "phases": [1], "intervals": [8, 16]}
+    yield {"model": "cells", "cells": 1, "limit": "friction"}
+    yield {"model": "cells", "cells": 2, "limit": "top"}
+
+
+def _error(section: Section, fitted: Dataset, held_back: Dataset) -> float:
+    """Of the simulation of the trials held back, in %; infinite without a model to propose."""
+    adapter: TypeAdapter[IdentificationConfig] = TypeAdapter(Identification)
+    options = adapter.validate_python(dict(section))
+    method = options.method
+    with suppress(NlsidError):
+        fit = identify(
+            fitted, options.model_class, method=method, comparators=(), test=held_back,
+            allow_unproved=isinstance(method, Sem) and section["model"] == "feedback",
+        )  # fmt: skip
+        error = float(fit.errors["test"][method.name])
+        if math.isfinite(error):
+            return error
+    return math.inf
+
+
+def _shortened(train: Dataset) -> Dataset:
+    """The first trials that have `SAMPLES` together; the last of them may be a part."""
+    kept, left = [], SAMPLES
+    for trial in train:
+        if left > 0:
+            kept.append(trial.rows(slice(left)))
+        left -= len(trial)
+    return Dataset(tuple(kept))
