@@ -18,7 +18,9 @@ from nlsid_core.errors import NlsidError
 from nlsid_core.identification import Sem, identify
 
 SAMPLES: Final = 2000  # of the training trials, to which these classes are fitted
+START: Final = 20  # samples of each trial that are not scored: some classes read their start there
 SECONDS: Final = 30.0  # of processor time, after which no further class is begun
+ENOUGH: Final = 10.0  # % of error, below which no further class is tried
 LOOP_WORTH: Final = 0.6  # of the best error so far, that an unproved loop has to reach
 LAGS: Final = (2, 3)  # of such loops
 
@@ -26,23 +28,21 @@ Section = Mapping[str, Any]
 
 
 def tried_classes(
-    train: Dataset, held_back: Dataset, best: float
+    known: Section, train: Dataset, held_back: Dataset
 ) -> Iterator[tuple[Section, float]]:
     """Sections `identification` of one response with the errors [%] of their proved models.
 
-    best: the least error so far. A class that has no proved model is left out.
+    The known section comes first; the others do if it is not good enough. All are scored on the
+    same samples. Of the others those without a proved model are left out.
     """
-    first, few = train.trajectories[0], _shortened(train)
-    started = time.process_time()
-    for section in _sections(len(first.u_names)):
-        if time.process_time() - started > SECONDS:
-            return
+    few, started, best = _shortened(train), time.process_time(), math.inf
+    for section in (known, *_sections(len(train.trajectories[0].u_names))):
         error = _error(section, few, held_back)
-        if math.isfinite(error):
+        if math.isfinite(error) or section is known:
             best = min(best, error)
             yield section, error
-    if time.process_time() - started > SECONDS:
-        return
+        if best <= ENOUGH or time.process_time() - started > SECONDS:
+            return
     loops = {
         lags: _error({"model": "feedback", "lags": lags, "method": Sem.name}, few, held_back)
         for lags in LAGS
@@ -70,7 +70,7 @@ def _error(section: Section, fitted: Dataset, held_back: Dataset) -> float:
     method = options.method
     with suppress(NlsidError):
         fit = identify(
-            fitted, options.model_class, method=method, comparators=(), test=held_back,
+            fitted, options.model_class, method=method, comparators=(), test=held_back, transient=START,
             allow_unproved=isinstance(method, Sem) and section["model"] == "feedback",
         )  # fmt: skip
         error = float(fit.errors["test"][method.name])

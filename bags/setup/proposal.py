@@ -22,7 +22,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, Pair, slope_window
-from bags.setup.curved import tried_classes
+from bags.setup.curved import ENOUGH, SAMPLES, START, tried_classes
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
@@ -51,13 +51,12 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-GOOD: Final = 10.0  # % below which no further class is tried
 CLASS_BETTER: Final = 0.8  # of the linear model's error, that another class has to reach
 NOT_TRIED: Final = (
     ". Of several responses these were not tried: `implicit` for forces that are not linear, and "
     "each response alone, for which there are more classes"
 )
-GRADES: Final = ((GOOD, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
+GRADES: Final = ((ENOUGH, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
 SIMULATED: Final = "/clock"
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
@@ -198,7 +197,7 @@ def propose(
             wider.why |= {text: wider.why[text] + without for text in others}
             return wider
     alone = len(responses) == 1
-    if alone and GOOD < proposal.error < math.inf:
+    if alone and ENOUGH < proposal.error < math.inf:
         _say_class(proposal, trials.train)
     if POOR < proposal.error < math.inf:
         also = _others(proposal, found) if linear else ""
@@ -673,16 +672,19 @@ def _say_class(proposal: Proposal, train: Dataset) -> None:
     """Another class, where its proved model simulates trials held back far better."""
     names = train.names[1::3]
     fitted, held_back = (train.without(names), train.select(names)) if names else hold_out(train)
-    linear = proposal.content["identification"]["model"]
-    errors = [(linear, proposal.error)]
-    for section, error in tried_classes(fitted, held_back, proposal.error):
-        errors.append((section["model"], error))
-        if error <= CLASS_BETTER * errors[0][1] and error < proposal.error:
-            proposal.content["identification"] = dict(section)
-            proposal.error, proposal.tried_on = error, "trials held back"
-    said = ", ".join(f"{model}: {error:.3g} %" for model, error in errors)
-    proposal.why["model"] = f"proved models simulated on trials held back are off by {said}"
-    if proposal.content["identification"]["model"] != linear:
+    section = proposal.content["identification"]
+    (_, error), *others = tried_classes(section, fitted, held_back)
+    if not others:
+        return
+    best, least = min(others, key=lambda tried: tried[1])
+    said = ", ".join(f"{s['model']}: {e:.3g} %" for s, e in [(section, error), *others])
+    proposal.why["model"] = (
+        f"proved models of {SAMPLES} samples or fewer, simulated on trials held back without "
+        f"their first {START} samples, are off by {said}"
+    )
+    if least <= min(CLASS_BETTER * error, POOR):
+        proposal.content["identification"] = dict(best)
+        proposal.error, proposal.tried_on = least, "trials held back"
         for key in ("lags", "delays", "right_degree", "input_range", "method"):
             proposal.why.pop(key, None)
 

@@ -161,17 +161,19 @@ def minimise(
     inequalities: Sequence[MatrixInequality] = (),
     extra: FloatArray | None = None,
     steps: int | None = None,
+    gap: float = INEQUALITY_GAP,
 ) -> Minimum:
     """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
 
     extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
     of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
-    steps: without inequalities, only so many steps of Newton's method, without a barrier of K.
+    steps: only so many of Newton's method, without a barrier of K and with that of the inequalities
+    at the one μ whose minimiser is within `gap`·J of the minimum.
     """
     descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
     if steps is not None:
-        return descent.to_minimum(z, limit=steps)
+        return descent.to_minimum(z, mu=descent.weight(z, gap), limit=steps)
     found = descent.freely(z)
     if found.is_inside:
         return found
@@ -308,6 +310,11 @@ class Descent:
         self.parameters = parameters
         self.perfect = PERFECT_FIT * objective.rows.unit
         self.steps = 0
+
+    def weight(self, z: FloatArray, gap: float) -> float:
+        """μ of the inequalities at which the path is within gap·J, J that at z; 0 without any."""
+        size = sum(inequality.order for inequality in self.inequalities)
+        return gap * self.objective.at(z[: self.parameters]).J / size if size else 0.0
 
     def freely(self, z: FloatArray) -> Minimum:
         """Without a barrier of K."""

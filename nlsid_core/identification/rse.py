@@ -22,6 +22,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.banded import Factor, Rows, shift, sparse, symmetric_product
 from nlsid_core.identification.newton import Point, minimise, project
 
+WORK = 5e10  # rows times squared left parameters, of all Newton steps together: a minute
+
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
@@ -63,6 +65,11 @@ def robust_simulation_error(
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:
             return
         linearised_at, previous = point.theta, point.J
+
+
+def affordable_steps(rows: Rows) -> int:
+    """Newton steps that `WORK` is enough for."""
+    return int(WORK / (len(rows) * len(rows.offsets) ** 2))
 
 
 class Bound:

@@ -25,14 +25,13 @@ from nlsid_core.identification.fit import (
 from nlsid_core.identification.methods import FirstRse, Method, Rse
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rates import is_too_slow, searched_rate
-from nlsid_core.identification.rse import Iterate, robust_simulation_error
+from nlsid_core.identification.rse import Iterate, affordable_steps, robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.progress import Progress, silent
 
 T = TypeVar("T", bound=Model)
 W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
-WORK = 5e10  # rows times squared left parameters, of all Newton steps together: a minute
 STEPS_A_BOUND = 10  # of Newton's method, to its minimum, as a rule
 FEW_STEPS = 2  # towards it in a large problem: a new bound brings more than the end of the last
 FEWEST_BOUNDS = 6  # from every start, however large the problem is
@@ -109,15 +108,16 @@ class Trail(Generic[T]):
 
         starts: left parameters with their names, at which a first bound is made exact; from each
         it is iterated too, and the iterate of the least simulation error is kept. In a large
-        problem, by `WORK`, no bound but the first is taken to its minimum. within: the nearest
-        left parameters that are allowed, at which an iterate that is not is taken.
+        problem, by `affordable_steps`, no bound but the first is taken to its minimum.
+        within: the nearest left parameters that are allowed, at which an iterate that is not is
+        taken.
         """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
         if first is None and final is None:
             return
         begun = (("", None), *(() if final is None else starts))
         iterations = 1 if final is None else final.iterations
-        affordable = int(WORK / (len(rows) * len(rows.offsets) ** 2 * len(begun)))
+        affordable = affordable_steps(rows) // len(begun)
         steps = None
         if final is not None and iterations * STEPS_A_BOUND > affordable:
             steps = FEW_STEPS
