@@ -234,7 +234,7 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
         for lags in ORDERS:
             yield FeedbackClass(lags), CertifiedSem(STEPS)
     if one:
-        yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
+        yield BlockCascadeClass((3, 3), phases=(1, 2, 3), intervals=(12, 24, 48)), Sem()
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +260,7 @@ def best_of(
         def simulator(
             few: Dataset, model_class: Any = model_class, method: Method = method
         ) -> Simulator:
-            model = fitted(few, model_class, method, proved=proved).model
+            model = fitted(case, few, model_class, method, proved=proved).model
             return lambda trials: simulate_trials(model, trials.trajectories)
 
         error = crossed(case, simulator, both)
@@ -273,7 +273,7 @@ def best_of(
         )
     for error, model_class, method in sorted(found, key=lambda entry: entry[0]):
         try:
-            fit = fitted(both, model_class, method, proved=proved)
+            fit = fitted(case, both, model_class, method, proved=proved)
         except NlsidError:
             continue
         with np.errstate(over="ignore", invalid="ignore"):
@@ -318,7 +318,9 @@ def folds(data: Dataset) -> list[Dataset]:
     return [Dataset(tuple(part)) for part in parts]
 
 
-def fitted(train: Dataset, model_class: Any, method: Method, *, proved: bool) -> Fit[Any]:
+def fitted(
+    case: PublicSet, train: Dataset, model_class: Any, method: Method, *, proved: bool
+) -> Fit[Any]:
     """A fit; NlsidError if there is none, or none with a proof where one is asked for."""
     return identify(train, model_class, method=method, comparators=(), allow_unproved=not proved)
 

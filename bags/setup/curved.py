@@ -68,10 +68,11 @@ def _error(section: Section, fitted: Dataset, held_back: Dataset) -> float:
     adapter: TypeAdapter[IdentificationConfig] = TypeAdapter(Identification)
     options = adapter.validate_python(dict(section))
     method = options.method
+    is_proved = not (section["model"] == "feedback" and isinstance(method, Sem))
     with suppress(NlsidError):
         fit = identify(
-            fitted, options.model_class, method=method, comparators=(), test=held_back, transient=START,
-            allow_unproved=isinstance(method, Sem) and section["model"] == "feedback",
+            fitted, options.model_class, method=method, comparators=(), test=held_back,
+            transient=START, allow_unproved=not is_proved,
         )  # fmt: skip
         error = float(fit.errors["test"][method.name])
         if math.isfinite(error):
