@@ -322,7 +322,10 @@ def fitted(
     case: PublicSet, train: Dataset, model_class: Any, method: Method, *, proved: bool
 ) -> Fit[Any]:
     """A fit; NlsidError if there is none, or none with a proof where one is asked for."""
-    return identify(train, model_class, method=method, comparators=(), allow_unproved=not proved)
+    return identify(
+        train, model_class, method=method, comparators=(), transient=case.skipped,
+        allow_unproved=not proved,
+    )  # fmt: skip
 
 
 def shortened(data: Dataset) -> Dataset:

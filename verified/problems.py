@@ -28,7 +28,7 @@ class Funnel:
 
     def __init__(self, document: Any, content: str, folder: Path) -> None:
         self.claim, self.proof = document["claim"], document["proof"]
-        for member in ("hold", "error"):
+        for member in ("hold", "error", "decay"):
             if member in self.claim:
                 raise NotCovered(f"not covered by the second kernel: {member}")
         self.files: Files = {"proof": (content, document)}

@@ -13,18 +13,43 @@ from typing import Any, Final
 from pydantic import TypeAdapter
 
 from bags.chain.identification_config import Identification, IdentificationConfig
+from bags.setup.proposal import GOOD, POOR, Proposal
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import Sem, identify
+from nlsid_core.identification.searches import hold_out
 
 SAMPLES: Final = 2000  # of the training trials, to which these classes are fitted
 START: Final = 20  # samples of each trial that are not scored: some classes read their start there
 SECONDS: Final = 30.0  # of processor time, after which no further class is begun
-ENOUGH: Final = 10.0  # % of error, below which no further class is tried
+BETTER: Final = 0.8  # of the linear model's error, that another class has to reach
 LOOP_WORTH: Final = 0.6  # of the best error so far, that an unproved loop has to reach
 LAGS: Final = (2, 3)  # of such loops
 
 Section = Mapping[str, Any]
+
+
+def say_class(proposal: Proposal, train: Dataset) -> None:
+    """Propose another class where its proved model simulates trials held back far better."""
+    if not GOOD < proposal.error < math.inf:
+        return
+    names = train.names[1::3]
+    fitted, held_back = (train.without(names), train.select(names)) if names else hold_out(train)
+    section = proposal.content["identification"]
+    (_, error), *others = tried_classes(section, fitted, held_back)
+    if not others:
+        return
+    best, least = min(others, key=lambda tried: tried[1])
+    said = ", ".join(f"{s['model']}: {e:.3g} %" for s, e in [(section, error), *others])
+    proposal.why["model"] = (
+        f"proved models of {SAMPLES} samples or fewer, simulated on trials held back without "
+        f"their first {START} samples, are off by {said}"
+    )
+    if least <= min(BETTER * error, POOR):
+        proposal.content["identification"] = dict(best)
+        proposal.error, proposal.tried_on = least, "trials held back"
+        for key in ("lags", "delays", "right_degree", "input_range", "method"):
+            proposal.why.pop(key, None)
 
 
 def tried_classes(
@@ -41,7 +66,7 @@ def tried_classes(
         if math.isfinite(error) or section is known:
             best = min(best, error)
             yield section, error
-        if best <= ENOUGH or time.process_time() - started > SECONDS:
+        if best <= GOOD or time.process_time() - started > SECONDS:
             return
     loops = {
         lags: _error({"model": "feedback", "lags": lags, "method": Sem.name}, few, held_back)
