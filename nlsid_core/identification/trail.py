@@ -134,7 +134,7 @@ class Trail(Generic[T]):
                     rows, start=theta, iterations=iterations, steps=steps, exact_first=exact_first
                 ):
                     path.append(Step(f"iterate {len(path) + 1} {start}".rstrip(), last.J))
-                    if exact_first and len(path) == 1:
+                    if first is not None and exact_first and len(path) == 1:
                         seconds, found = time.process_time() - started, model(last)
                         self._keep(first, found, self.prove(found), seconds)
                     done = 0.2 + 0.4 * len(path) / iterations

@@ -20,9 +20,8 @@ def test_init_proposes_feedback_where_linear_models_say_little(tmp_path: Path) -
     for k, trial in enumerate(trials([0.1, 0.15, 0.2, 0.25] * 3, samples=400, damping=0.25)):
         write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
     config = tmp_path / "robot.yaml"
-    signals = ("-u", "/joint_commands:effort[name=joint_0]")
-    signals += ("-y", "/joint_states:position[name=joint_0]")
-    given = ["init", str(tmp_path / "bags"), "--yes", *signals, "--out", str(config)]
+    drive, answer = ("/joint_commands:effort[name=joint_0]", "/joint_states:position[name=joint_0]")
+    given = ["init", str(tmp_path / "bags"), "-u", drive, "-y", answer, "--out", str(config)]
     result = CliRunner().invoke(app, given)
     assert result.exit_code == 0, result.output
     assert load_config(config).identification.given["model"] == "feedback"
