@@ -144,6 +144,11 @@ def _number(value: Fraction, like: Any) -> Any:
     return copysign(0.0, like) if value == 0 else float(value)
 
 
+def _escaped(sign: str) -> str:
+    """A sign of a text as JSON may write it too; those outside ASCII are in texts only."""
+    return sign if sign.isascii() else json.dumps(sign)[1:-1]
+
+
 def differences(documents: dict[str, Any], files: dict[str, tuple[str, Any]]) -> None:
     """Raise Differs unless the files (text and content, by role) print as these documents."""
     for role, document in documents.items():
@@ -153,6 +158,8 @@ def differences(documents: dict[str, Any], files: dict[str, tuple[str, Any]]) ->
         except (OverflowError, ValueError) as error:
             raise Differs(f"{role}: {error}") from error
         theirs = SPACE.sub(r"\1", text)
+        if not theirs.isascii():
+            theirs = "".join(map(_escaped, theirs))
         if mine != theirs:
             at = next((i for i, (a, b) in enumerate(zip(mine, theirs, strict=False)) if a != b), -1)
             raise Differs(

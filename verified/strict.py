@@ -491,15 +491,20 @@ def increasing(values: list[Any], where: str) -> None:
     need(all(a < b for a, b in pairwise(values)), f"{where} should increase")
 
 
-def basis(value: Any, where: str, n: int) -> int:
-    """The number of its monomials, distinct."""
-    rows = listed(value, where, 1, BASIS)
+def monomials(value: Any, where: str, n: int, degree: int = DEGREES) -> list[list[int]]:
+    """Distinct ones of n variables."""
+    rows = listed(value, where, 0, MONOMIALS)
     for row in rows:
         for entry in listed(row, where, n, n):
-            whole(entry, where, 0, 31)
-        need(sum(row) <= 31, f"{where}: a degree above 31")
+            whole(entry, where, 0, degree)
+        need(sum(row) <= degree, f"{where}: a degree above {degree}")
     need(len({tuple(row) for row in rows}) == len(rows), f"{where}: a monomial twice")
-    return len(rows)
+    return rows
+
+
+def basis(value: Any, where: str, n: int) -> int:
+    """The number of its monomials."""
+    return len(monomials(listed(value, where, 1, BASIS), where, n, 31))
 
 
 def squares(entry: dict[str, Any], where: str, k: int) -> None:
@@ -596,7 +601,7 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     if "kappa" in proof:
         for row in matrix(proof["kappa"], "kappa", intervals, uncertain):
             need(min(row) > 0, "kappa > 0")
-    sizes = [basis(proof[name], name, n) for name in ("basis", "multiplier")]
+    sizes = [basis(proof["basis"], "basis", n), len(monomials(proof["multiplier"], "multiplier", n))]
     sides = basis(proof["sides"], "sides", n) if limits else 0
     modes = " mode tau" * (limits > 0)
     vertices = 1 if "kappa" in proof else 2**uncertain
