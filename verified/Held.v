@@ -1,8 +1,8 @@
 (* A policy that is held, late, or measures with an error: what inputs are off by at most is bounded
    by how fast the policy turns, and what starts in the funnel stays in it. *)
 From Coq Require Import ZArith Reals List Lra Lia.
-From Verified Require Import Integers Forms Claim Calculus Condition Definite Funnel Stays Goal Valid
-  Moving Turning.
+From Verified Require Import Integers Forms Claim Calculus Condition Definite Pushed Funnel Stays Goal Valid
+  Files Moving Turning.
 Import ListNotations.
 Open Scope R_scope.
 
@@ -24,7 +24,7 @@ Definition width_of (d : problem) (period : num) (all : list (segment * (list nu
   let s := seen period (fst e) all in
   map (fun i => nadd (nmul period (worst i (map (fun e => fst (snd e)) s)))
     (worst i (map (fun e => snd (snd e)) s))) (seq 0 (length (limits d))).
-Definition widths (d : problem) (period : num) (errors : list num) (rates : list (list num))
+Definition offs_of (d : problem) (period : num) (errors : list num) (rates : list (list num))
   : list (list num) :=
   let parts := combine (segments d) rates in
   map (width_of d period (prepared d errors parts)) parts.
@@ -49,7 +49,7 @@ Record rate_witness := Rates {
   rates : list (list num); pushing : list bool; turns : list (list rate_piece) }.
 Definition held_ok (d : problem) (period : num) (errors : list num) (w : witness) (r : rate_witness)
   : bool :=
-  let offs := widths d period errors (rates r) in
+  let offs := offs_of d period errors (rates r) in
   andb (andb (funnel_ok d offs w) (bounds_ok d offs))
   (andb (andb (andb (Nat.eqb (length (rates r)) (length (segments d)))
       (Nat.eqb (length errors) (first_size d)))
@@ -130,7 +130,7 @@ Definition plan (g : segment) (i : nat) (t : R) (y : list R) : R :=
 Section Problem.
 Variables (d : problem) (period : num) (errors : list num) (w : witness) (r : rate_witness).
 Hypothesis H : held_ok d period errors w r = true.
-Let offs := widths d period errors (rates r).
+Let offs := offs_of d period errors (rates r).
 Let n := first_size d.
 Let m := length (limits d).
 Let H_checked : check d offs w = true.
@@ -851,4 +851,27 @@ Proof.
     + apply S. lra.
 Qed.
 End Problem.
+
+(* The same of files. Entries of w that only push do so in all time spans. *)
+Definition pushing_of (f : field_file) : list bool :=
+  map (fun j => forallb (forallb (alone (1 + states f + inputs f + j))) (spans f))
+    (seq 0 (length (uncertain f))).
+Definition held_files_ok f p u g (period : num) (errors : list num) (w : witness)
+  (rs : list (list num)) (ts : list (list rate_piece)) : bool :=
+  andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
+    (andb (held_ok (stated f p u g) period errors w (Rates rs (pushing_of f) ts))
+      (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
+       else true)).
+
+Theorem held_theorem f p u g period errors w rs ts :
+  held_files_ok f p u g period errors w rs ts = true ->
+  forall since x act, held_solution (stated f p u g) period errors since x act ->
+  begin (stated f p u g) <= since <= finish (stated f p u g) -> inside (stated f p u g) x since ->
+  (forall t, since <= t <= finish (stated f p u g) ->
+    inside (stated f p u g) x t /\ held_in_bounds (stated f p u g) x act t) /\
+  in_goal (stated f p u g) x.
+Proof.
+  unfold held_files_ok. intros H since x act Hx Hr Hi. apply andb_prop in H as [_ H].
+  apply andb_prop in H as [H _]. now apply (held_proved _ period errors w (Rates rs (pushing_of f) ts)).
+Qed.
 End Held.
