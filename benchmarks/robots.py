@@ -34,7 +34,8 @@ from bags.designs import documents
 from bags.monitoring.replay import replay_bag
 from bags.samples import convert_dart, f1tenth
 from bags.setup.candidates import look
-from bags.setup.proposal import Proposal, choose, propose
+from bags.setup.proposal import Proposal
+from bags.setup.proposing import choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.expressions import Expression
 from bags.tools.edit import split

@@ -419,7 +419,9 @@ class Writer:
         """Pieces of each interval, in the order in which they begin."""
         to = self.to
         found: list[list[str]] = [[] for _ in range(problem.intervals)]
-        order = sorted(entries, key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"])))
+        order = sorted(
+            entries, key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"]))
+        )
         for i, piece in enumerate(order):
             k = integer(piece["interval"], 0, len(found) - 1)
             found[k].append(to.named(f"{name}_{i}", made(piece, k)))

@@ -26,7 +26,7 @@ from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
 MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "nominal", "goal",
-           "Q", "R", "limits", "hold", "error", "push")  # fmt: skip
+           "Q", "R", "limits", "hold", "error", "decay", "push")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +49,7 @@ class FunnelProblem:
     limits: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
     hold: float | Literal["largest"] | None = None
     error: FloatArray | None = None
+    decay: float | None = None
     push: MeasuredPush | None = None
 
     def document(self) -> Json:
@@ -72,6 +73,7 @@ class FunnelProblem:
             "limits": self.limits.tolist(),
             "hold": self.hold,
             "error": None if self.error is None else self.error.tolist(),
+            "decay": self.decay,
             "push": None if self.push is None else self.push.document(),
         }
 
@@ -99,6 +101,9 @@ class FunnelProblem:
         hold = document.get("hold")
         if hold is not None:
             hold = files.member(document, "hold", (int, float, str), source=source)
+        decay = document.get("decay")
+        if decay is not None:
+            decay = files.member(document, "decay", (int, float), source=source)
         words = {"shape": "rho", "gain": "constant", "objective": "volume"} | document
         return cls(
             field,
@@ -112,6 +117,7 @@ class FunnelProblem:
             _limits(document, source),
             hold,
             _array(document, "error", (field.n,), source),
+            decay,
             _push(document, field.n, source),
         )
 
@@ -131,6 +137,7 @@ class FunnelProblem:
             limits=self.limits if len(self.limits) else None,
             hold=self.hold,
             error=self.error,
+            decay=self.decay,
         )
         return design(problem, executor=executor, progress=progress)
 

@@ -16,6 +16,7 @@ from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
+from bags.recordings.names import listed
 from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
@@ -250,7 +251,7 @@ def split(
     chosen = _held_out(
         dataset, {"test": test, "validation": validation, "calibration": calibration}
     )
-    present = ", ".join(dataset.names)
+    present = listed(dataset.names)
     if not chosen["test"]:
         raise DataError(
             "none of the bags is a test trial, so no model can be scored; split.test names "

@@ -5,29 +5,30 @@ A command imports what it runs when it is called.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-
-from nlsid_core.progress import part
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from bags.chain.config import Config
-    from bags.fleet.monitor import FleetVerdict
+    from bags.fleet.check import Checked
+    from bags.fleet.monitor import FleetVerdict, Judged
     from bags.fleet.trials import FleetTrials
     from bags.fleet.workers import Workers
-    from nlsid_core.progress import Progress
 
-LISTED = 20  # bags that are left out, by name
+LISTED = 20  # bags of a kind, by name
 ROWS = 30  # of a table on the screen
+WHOLE = 34  # letters of a name that is not broken
 
 fleet_app = typer.Typer(
     name="fleet",
@@ -50,6 +51,13 @@ WorkersOption = Annotated[
 SchedulerOption = Annotated[
     str, typer.Option("--scheduler", help="Of a Dask cluster instead: tcp://HOST:PORT.")
 ]
+RobotOption = Annotated[
+    int | None,
+    typer.Option(
+        help="Which folder of a bag's name says whose it is, 1 the first, -1 the last; default: "
+        "the first that is no date and not the same for all."
+    ),
+]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="End at the first bag that cannot be used.")
 ]
@@ -69,45 +77,64 @@ def check(
         Path | None, typer.Option("--out", help="A .parquet file for all rows and findings.")
     ] = None,
     manifest: ManifestOption = None,
+    robot: RobotOption = None,
     workers: WorkersOption = 0,
     scheduler: SchedulerOption = "",
     patience: PatienceOption = 60.0,
 ) -> None:
     """Fitness, clock trouble and losses of every bag as one table.
 
-    Status 1 if a bag is bad, 2 if one cannot be read.
+    bad: `nlsid identify` leaves it out, or it is not fit; look: there is something to mend.
+    Status 1 if a bag is bad, 2 if none is and one was not read.
     """
     from bags.chain.config import load_config
     from bags.commands.progress import progress_bar
-    from bags.fleet.bags import named_bags
-    from bags.fleet.check import UNREAD, check_fleet, write_parquet
+    from bags.fleet.bags import UNREAD, named_bags
+    from bags.fleet.check import BAD, SERIOUS, check_fleet, write_parquet
     from bags.fleet.workers import Workers
 
     settings = load_config(config)
     named = named_bags(bags, patience=patience)
     with progress_bar("checking") as progress:
-        rows = check_fleet(
-            named, settings,
-            workers=Workers(workers, scheduler), manifest=manifest, progress=progress,
+        found = check_fleet(
+            named, settings, workers=Workers(workers, scheduler),
+            manifest=manifest, folder=robot, progress=progress,
         )  # fmt: skip
     if table is not None:
-        write_parquet(rows, table)
-    shown = Table(title=f"{len(rows)} bags", title_justify="left")
-    for column in ("bag", "verdict", "start (UTC)", "lost", "what to look at"):
-        shown.add_column(column, overflow="fold")
-    serious = {UNREAD: 0, "bad": 1, "look": 2, "good": 3}
-    for row in sorted(rows, key=lambda row: serious[row.verdict])[:ROWS]:
-        lost = "-" if row.lost is None else str(row.lost)
-        shown.add_row(_plain(row.bag), row.verdict, row.start[:19], lost, _plain(row.trouble))
-    console.print(shown)
-    if len(rows) > ROWS:
-        console.print(f"and {len(rows) - ROWS} more, none more serious; --out writes all of them")
-    counts = Counter(row.verdict for row in rows)
-    console.print(", ".join(f"{counts[verdict]} {verdict}" for verdict in serious))
+        write_parquet(found.rows, table)
+    counts = Counter(row.verdict for row in found.rows)
+    _say_counts(len(found.rows), found.known, manifest, [(counts[v], v) for v in SERIOUS])
+    wrong = [row for verdict in SERIOUS[:-1] for row in found.rows if row.verdict == verdict]
+    if wrong:
+        console.print(_checked_table(wrong[:ROWS]))
+    if more := wrong[ROWS:]:
+        left = Counter(row.verdict for row in more)
+        said = ", ".join(f"{count} {verdict}" for verdict, count in left.items())
+        console.print(f"and {len(more)} more ({said}); --out writes all of them")
+    if found.still:
+        console.print(
+            "no command moves in any bag that can be used: there is little to identify from",
+            soft_wrap=True,
+        )  # fmt: skip
     if table is not None:
         console.print(f"wrote {table}", soft_wrap=True)
-    if counts["bad"] or counts[UNREAD]:
-        raise typer.Exit(1 if counts["bad"] else 2)
+    if counts[BAD] or counts[UNREAD]:
+        raise typer.Exit(1 if counts[BAD] else 2)
+
+
+def _checked_table(rows: Sequence[Checked]) -> Table:
+    shown = _table(rows)
+    shown.add_column("verdict", no_wrap=True)
+    shown.add_column("start (UTC)", min_width=10)
+    if any(row.lost is not None for row in rows):
+        shown.add_column("lost", justify="right")
+    shown.add_column("what to look at", overflow="fold", ratio=1)
+    for row in rows:
+        cells = [_plain(row.bag), row.verdict, _when(row.start)]
+        if any(other.lost is not None for other in rows):
+            cells.append("-" if row.lost is None else str(row.lost))
+        shown.add_row(*cells, _plain(row.trouble))
+    return shown
 
 
 @fleet_app.command()
@@ -121,6 +148,7 @@ def monitor(
         Path | None, typer.Option("--out", help="A .parquet file with a row for every bag.")
     ] = None,
     manifest: ManifestOption = None,
+    robot: RobotOption = None,
     workers: WorkersOption = 0,
     scheduler: SchedulerOption = "",
     patience: PatienceOption = 60.0,
@@ -135,9 +163,9 @@ def monitor(
     from bags.commands import show
     from bags.commands.progress import progress_bar
     from bags.designs import documents
-    from bags.fleet.bags import named_bags
+    from bags.fleet.bags import COPY, named_bags
     from bags.fleet.check import write_parquet
-    from bags.fleet.monitor import COPY, monitor_fleet
+    from bags.fleet.monitor import monitor_fleet
     from bags.fleet.workers import Workers
     from bags.recordings.definitions import read_definitions
     from nlsid_core.running.reading import Status
@@ -150,11 +178,12 @@ def monitor(
             named, funnel, proved,
             centre=show.centre_of(settings),
             definitions=read_definitions(settings.definitions if settings else ()),
-            workers=Workers(workers, scheduler), manifest=manifest, progress=progress,
+            workers=Workers(workers, scheduler),
+            manifest=manifest, folder=robot, progress=progress,
         )  # fmt: skip
     if table is not None:
         write_parquet(found.rows, table)
-    _say_verdicts(found)
+    _say_verdicts(found, manifest, table)
     if found.worst:
         worst = named[found.worst[0].bag]
         centre = f" --config {config}" if config else ""
@@ -173,44 +202,27 @@ def monitor(
         raise typer.Exit(2)
 
 
-def _say_verdicts(found: FleetVerdict) -> None:
-    from bags.fleet.monitor import COPY, UNREAD
+def _say_verdicts(found: FleetVerdict, manifest: Path | None, table: Path | None) -> None:
+    from bags.fleet.bags import COPY, UNREAD
 
     counts = Counter(row.verdict for row in found.rows)
-    console.print(
-        f"{len(found.rows)} bags: " + ", ".join(f"{n} {what}" for what, n in counts.most_common())
-    )
+    words = [word for word in _VERDICTS if counts[word]]
+    _say_counts(len(found.rows), found.known, manifest, [(counts[word], word) for word in words])
+    if own := found.own:
+        console.print(
+            f"{own} of them made the design: a verdict on these says little", soft_wrap=True
+        )
     for key, title in (("robot", "robots"), ("day", "days")):
-        console.print(f"{title}, those with the most trouble first:")
-        table = Table()
-        for column in (key, "bags", *counts):
-            table.add_column(column, overflow="fold")
-        groups = found.by(key)
-        for name, own in list(groups.items())[:ROWS]:
-            table.add_row(
-                _plain(name) or "-", str(own.total()), *(str(own[what]) for what in counts)
-            )
-        console.print(table)
+        _say_groups(title, found.by(key), words, table)
     for what, count in Counter(r.assumption for r in found.rows if r.assumption).most_common():
-        console.print(f"broken in {count} bags: {what}", soft_wrap=True, markup=False)
-    if any(found.histogram):
-        console.print("of what is assumed, spent by so many bags:")
-    most = max(found.histogram)
-    for k, count in enumerate(found.histogram):
-        label = f"{10 * k:3d} to {10 * k + 10:3d} %" if k < 10 else "   over 100 %"
-        if most:
-            console.print(f"{label:>14} {count:6d} {'#' * round(40 * count / most)}")
-    console.print("the ten that spent the most, and when:")
-    table = Table()
-    for column in ("bag", "spent", "at", "time (UTC)", "verdict", "bad from", "margin"):
-        table.add_column(column, overflow="fold")
-    for row in found.worst:
-        table.add_row(
-            _plain(row.bag), f"{100 * (row.spent or 0.0):.1f} %", f"{row.spent_at:.3f} s",
-            row.spent_when[:19], row.verdict, row.bad_from[:19] or "-",
-            "-" if row.margin is None else f"{row.margin:.3f}",
-        )  # fmt: skip
-    console.print(table)
+        console.print(f"broken in {_bags(count)}: {what}", soft_wrap=True, markup=False)
+    if most := max(found.histogram):
+        console.print("bags by how much of what is assumed they spent:")
+        for k, count in enumerate(found.histogram):
+            label = f"{10 * k} to {10 * k + 10} %" if k < 10 else "over 100 %"
+            console.print(f"{label:>12} {count:6d} {'#' * math.ceil(40 * count / most)}".rstrip())
+    if found.worst:
+        _say_worst(found.worst)
     for line in found.ranks:
         console.print(line, soft_wrap=True, highlight=False)
     if found.ranks and found.unrecognised:
@@ -221,9 +233,110 @@ def _say_verdicts(found: FleetVerdict) -> None:
     drift = found.drift
     said = str(drift) if drift else "drift is not judged: no calibration trials beside the funnel, "
     console.print(said + ("" if drift else "or too few bags of the newest month"), soft_wrap=True)
-    say_left_out(
-        console, {row.bag: row.reason for row in found.rows if row.verdict in (UNREAD, COPY)}
-    )
+    say_bags(
+        console, "outside, or what is assumed broken",
+        {r.bag: _since(r) for r in found.rows if r.verdict in BROKEN},
+    )  # fmt: skip
+    say_bags(console, "not judged whole", {r.bag: r.unjudged for r in found.rows if r.unjudged})
+    say_bags(console, "clock", {r.bag: r.clock for r in found.rows if r.clock})
+    alarms = {r.bag: r.alarm for r in found.rows if r.alarm and r.verdict not in BROKEN}
+    say_bags(console, "only the second alarm", alarms)
+    for verdict, title in ((UNREAD, UNREAD), (COPY, "copies")):
+        said_of = {row.bag: row.reason for row in found.rows if row.verdict == verdict}
+        say_bags(console, title, said_of)
+
+
+BROKEN = ("outside", "assumption violated")
+_VERDICTS = {  # and the heads of their columns
+    "outside": "outside",
+    "assumption violated": "violated",
+    "unknown": "unknown",
+    "not read": "not read",
+    "copy": "copy",
+    "inside": "inside",
+}
+
+
+def _say_groups(
+    title: str, groups: Mapping[str, Sequence[Judged]], words: Sequence[str], table: Path | None
+) -> None:
+    """Those with trouble, as a table; how many have none, and how many are not shown."""
+    from bags.fleet.monitor import trouble_in
+
+    if list(groups) == ["-"]:
+        return  # the bags' names have no folders
+    troubled = {name: rows for name, rows in groups.items() if trouble_in(rows)}
+    console.print(f"{title} with trouble: {len(set(troubled) - {''})} of {len(set(groups) - {''})}")
+    if not troubled:
+        return
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    shown.add_column(title.removesuffix("s"), overflow="fold")
+    for head in ("bags", *(_VERDICTS[word] for word in words)):
+        shown.add_column(head, justify="right")
+    for name, rows in list(troubled.items())[:ROWS]:
+        counts = Counter(row.verdict for row in rows)
+        cells = (str(counts[word] or "") for word in words)
+        shown.add_row(_plain(name) or "unknown", str(len(rows)), *cells)
+    console.print(shown)
+    if (more := len(troubled) - ROWS) > 0:
+        rest = "--out writes every bag" if table is None else f"every bag is in {table}"
+        console.print(f"and {more} more {title} with trouble, none with more; {rest}")
+
+
+def _say_worst(worst: Sequence[Judged]) -> None:
+    from bags.fleet.monitor import in_percent
+
+    count = f"the {len(worst)} bags that" if len(worst) > 1 else "the bag that"
+    console.print(f"{count} spent the most, and when:")
+    shown = _table(worst)
+    for column, justify in (
+        ("spent", "right"), ("at", "right"), ("start (UTC)", "left"), ("verdict", "left"),
+        ("bad from", "right"), ("margin", "right"),
+    ):  # fmt: skip
+        shown.add_column(column, justify=justify, min_width=10 if "UTC" in column else None)  # type: ignore[arg-type]
+    for row in worst:
+        shown.add_row(
+            _plain(row.bag), in_percent(row.spent or 0.0), f"{row.spent_at:.3f} s",
+            _when(row.start), _VERDICTS[row.verdict],
+            f"{row.bad_at:.3f} s" if row.bad_from else "-",
+            "-" if row.margin is None else f"{row.margin:.3f}",
+        )  # fmt: skip
+    console.print(shown)
+
+
+def _table(rows: Sequence[Checked | Judged]) -> Table:
+    """A table that begins with the bags' names, whole ones if they are not long."""
+    shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=0)
+    longest = max(len(row.bag) for row in rows)
+    shown.add_column("bag", overflow="fold", no_wrap=longest <= WHOLE, max_width=WHOLE)
+    return shown
+
+
+def _when(moment: str) -> str:
+    """A time of ISO 8601 to the minute, as people write it."""
+    return moment[:16].replace("T", " ")
+
+
+def _since(row: Judged) -> str:
+    """Why a bag is bad, and from when on."""
+    return row.reason if " at t = " in row.reason else f"from {row.bad_at:.3f} s on: {row.reason}"
+
+
+def _bags(count: int) -> str:
+    return f"{count} bag" if count == 1 else f"{count} bags"
+
+
+def _say_counts(
+    count: int, known: int, manifest: Path | None, counts: Sequence[tuple[int, str]]
+) -> None:
+    """How many there are of each verdict, and how many were known from a run before."""
+    said = ", ".join(f"{n} {'copies' if word == 'copy' and n != 1 else word}" for n, word in counts)
+    console.print(f"{_bags(count)}: {said}", soft_wrap=True, highlight=False)
+    if manifest is not None:
+        console.print(
+            f"{known} of them known from {manifest}, {count - known} asked of now", soft_wrap=True,
+            markup=False, highlight=False,
+        )  # fmt: skip
 
 
 def identify(
@@ -234,11 +347,10 @@ def identify(
     from bags.commands import show
     from bags.commands.progress import progress_bar
 
+    found = _read(out, bags, config, out_dir, reading)
     with progress_bar("identifying") as progress:
-        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.5))
         identified = identify_trials(found.trials, config, out_dir, progress=progress)
     show.say_identified(out, identified)
-    _say_read(out, found)
 
 
 def select(
@@ -255,15 +367,13 @@ def select(
     from bags.commands.progress import progress_bar
 
     sections_to_try(config, options)
-    with progress_bar("selecting") as progress:
-        found = _read(bags, config, out_dir, reading, part(progress, 0.0, 0.3))
-        with reading.workers.sharing() as executor:
-            result = select_trials(
-                found.trials, config, out_dir,
-                options=options, executor=executor, progress=progress,
-            )  # fmt: skip
+    found = _read(out, bags, config, out_dir, reading)
+    with progress_bar("selecting") as progress, reading.workers.sharing() as executor:
+        result = select_trials(
+            found.trials, config, out_dir,
+            options=options, executor=executor, progress=progress,
+        )  # fmt: skip
     show.say_selected(out, result)
-    _say_read(out, found)
 
 
 @dataclass(frozen=True)
@@ -276,22 +386,36 @@ class Reading:
 
 
 def _read(
-    bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading, progress: Progress
+    out: Console, bags: Sequence[Path], config: Config, out_dir: Path, reading: Reading
 ) -> FleetTrials:
+    """Read, and said what was: before anything is made of it, which may fail."""
+    from bags.commands.progress import progress_bar
     from bags.fleet.bags import named_bags
-    from bags.fleet.trials import read_fleet
+    from bags.fleet.trials import MANIFEST, read_fleet
 
-    return read_fleet(
-        named_bags(bags, patience=reading.patience), config, out_dir,
-        workers=reading.workers, strict=reading.strict, progress=progress,
+    with progress_bar("reading") as progress:
+        found = read_fleet(
+            named_bags(bags, patience=reading.patience), config, out_dir,
+            workers=reading.workers, strict=reading.strict, progress=progress,
+        )  # fmt: skip
+    _say_read(out, found, out_dir / MANIFEST)
+    return found
+
+
+def _say_read(out: Console, found: FleetTrials, manifest: Path) -> None:
+    count, left_out = len(found.answers), len(found.left_out)
+    out.print(
+        f"{_bags(count)}: {count - left_out} used, {len(found.unread)} not read, "
+        f"{len(found.unusable)} not usable, {len(found.copies)} copies; "
+        f"{sum(answer.kept for answer in found.answers)} of them known from {manifest}",
+        soft_wrap=True, markup=False, highlight=False,
     )  # fmt: skip
-
-
-def _say_read(out: Console, found: FleetTrials) -> None:
-    count, kept = len(found.answers), sum(answer.kept for answer in found.answers)
-    read = sum(not answer.kept and not answer.reason for answer in found.answers)
-    out.print(f"{count} bags: {read} read, {kept} known from before", soft_wrap=True)
-    say_left_out(out, found.left_out)
+    for title, bags in (
+        ("left out, not read", found.unread),
+        ("left out, not usable as configured", found.unusable),
+        ("left out, copies", found.copies),
+    ):
+        say_bags(out, title, bags)
 
 
 def _plain(text: str) -> str:
@@ -301,11 +425,11 @@ def _plain(text: str) -> str:
     )
 
 
-def say_left_out(out: Console, left_out: dict[str, str]) -> None:
-    """Each bag that is left out, with the reason."""
-    if left_out:
-        out.print(f"left out: {len(left_out)} bags")
-    for name, reason in list(left_out.items())[:LISTED]:
+def say_bags(out: Console, title: str, said: Mapping[str, str]) -> None:
+    """Each of these bags, with what is said of it."""
+    if said:
+        out.print(f"{title}: {_bags(len(said))}")
+    for name, reason in list(said.items())[:LISTED]:
         out.print(f"  {_plain(name)}: {_plain(reason)}", soft_wrap=True, highlight=False)
-    if len(left_out) > LISTED:
-        out.print(f"  and {len(left_out) - LISTED} more")
+    if len(said) > LISTED:
+        out.print(f"  and {len(said) - LISTED} more")

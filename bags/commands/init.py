@@ -12,7 +12,8 @@ from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions
 from bags.recordings.folders import expand_bags
 from bags.setup.candidates import Candidate, Found, look
-from bags.setup.proposal import Proposal, choose, propose
+from bags.setup.proposal import Proposal
+from bags.setup.proposing import choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.expressions import parse_factors
 from bags.signals.reader import expanded

@@ -1,13 +1,20 @@
-"""The bags of a fleet by name: where they lie below the folder, or the pattern, that was given."""
+"""The bags of a fleet: their names, whose they are, and which of them are one recording."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
+from typing import Final
 
 from bags.recordings.folders import expand_bags
 from bags.recordings.remote import place
 from nlsid_core.errors import DataError
 
-WILD = frozenset("*?[")
+WILD: Final = frozenset("*?[")
+UNREAD: Final = "not read"  # nothing of the bag can be used: damaged, cut off, other topics, gone
+COPY: Final = "copy"  # of a recording that another bag has: it counts there
+_DATE: Final = re.compile(r"(19|20)\d\d([-_.T]?\d\d)*|(year|month|day|date|hour)=.*")
+_PART_OF_DATE: Final = re.compile(r"\d\d?")  # below a year or a month
 
 
 def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[str, Path]:
@@ -30,9 +37,55 @@ def named_bags(given: Sequence[Path], *, patience: float | None = None) -> dict[
     return dict(sorted(found.items()))
 
 
-def robot_of(name: str) -> str:
-    """Whose bag it is: the folders that it lies in; `-` if it lies in the one that was given."""
-    return name.rpartition("/")[0] or "-"
+def robots_of(names: Iterable[str], folder: int | None = None) -> dict[str, str]:
+    """Whose bag each is, by the folders in its name; `-` where there is no such folder.
+
+    folder: which of them, 1 the first, -1 the last. None: the first that is no date and not the
+    same for all bags, else the last that is no date. Raises DataError for folder 0.
+    """
+    if folder == 0:
+        raise DataError("folders of a bag's name are counted from 1, or from the last: -1; not 0")
+    parts = {name: name.split("/")[:-1] for name in names}
+    if folder is None:
+        named = [depth for depth, is_date in enumerate(_dates(parts)) if not is_date]
+        told = (d for d in named if len({_at(own, d) for own in parts.values()}) > 1)
+        at = next(told, named[-1] if named else None)
+    else:
+        at = folder - 1 if folder > 0 else folder
+    return {name: "-" if at is None else _at(own, at) for name, own in parts.items()}
+
+
+def _dates(parts: Mapping[str, Sequence[str]]) -> list[bool]:
+    """Whether the folders of a depth are dates, or the parts of dates that begin above them."""
+    found: list[bool] = []
+    for column in zip_longest(*parts.values()):
+        there = [text for text in column if text is not None]
+        kinds = (_DATE, _PART_OF_DATE) if found and found[-1] else (_DATE,)
+        found.append(any(all(kind.fullmatch(text) for text in there) for kind in kinds))
+    return found
+
+
+def _at(folders: Sequence[str], depth: int) -> str:
+    return folders[depth] if -len(folders) <= depth < len(folders) else "-"
+
+
+class Recordings:
+    """Which bag had a recording first. It is known by any of its marks, as its digest."""
+
+    def __init__(self) -> None:
+        self._first: dict[object, str] = {}
+
+    def first(self, name: str, marks: Sequence[object]) -> str:
+        """The bag that had it: `name` itself if none of these marks was there before."""
+        first = next((self._first[mark] for mark in marks if mark in self._first), name)
+        for mark in marks:
+            self._first.setdefault(mark, first)
+        return first
+
+
+def same_as(first: str) -> str:
+    """What is said of a copy."""
+    return f"the same recording as {first}"
 
 
 def _base(given: Path, bag: Path) -> int:

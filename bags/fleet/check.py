@@ -8,31 +8,37 @@ from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from bags.chain.config import Config
-from bags.fleet.bags import robot_of
+from bags.chain.steps import read_signals_of
+from bags.fleet.bags import COPY, UNREAD, Recordings, robots_of, same_as
 from bags.fleet.manifest import Manifest
-from bags.fleet.run import ask
+from bags.fleet.run import ask, is_of_content, without_name
+from bags.fleet.trials import samples_digest
 from bags.fleet.workers import Workers
 from bags.recordings.bag import Bag
 from bags.recordings.definitions import read_definitions, texts_of
+from bags.signals.reader import bag_origin
 from bags.tools.fitness import Finding, Level, check_fitness
 from bags.tools.info import LOST
-from nlsid_core.errors import BagError, DataError
+from nlsid_core.errors import DataError
 from nlsid_core.files import canonical, write_atomically
 from nlsid_core.progress import Progress, silent
 
-UNREAD = "not read"
+BAD, LOOK, GOOD = (level.name.lower() for level in (Level.BAD, Level.LOOK, Level.GOOD))
+SERIOUS: Final = (UNREAD, BAD, COPY, LOOK, GOOD)  # the most serious first
 
 
 @dataclass(frozen=True)
 class Checked:
-    """One bag: verdict `good`, `look`, `bad` or `not read`, and what is behind it.
+    """One bag: a verdict of SERIOUS, and what is behind it.
 
-    start: of the recording, ISO 8601 in UTC, empty if unknown. lost: messages that its recorder
-    counted as lost, None if it counted none of the topics. clock, gaps: what is wrong there, empty
-    if nothing. trouble: the most serious finding; findings: all of them.
+    bad: `nlsid identify` leaves it out, or it is not fit. start: of the recording, ISO 8601 in UTC,
+    empty if unknown. lost: messages that its recorder counted as lost, None if it counted none of
+    the topics. clock, gaps: what is wrong there, empty if nothing. trouble: why it is not good;
+    findings: all of them. excited: whether a command moves. digest,
+    samples: of the recording and of what is identified from; copies are known by either.
     """
 
     bag: str
@@ -44,6 +50,23 @@ class Checked:
     gaps: str = ""
     trouble: str = ""
     findings: tuple[str, ...] = ()
+    excited: bool = False
+    digest: str = ""
+    samples: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetCheck:
+    """Every bag's row, in order; known: how many were in the manifest before."""
+
+    rows: tuple[Checked, ...]
+    known: int
+
+    @property
+    def still(self) -> bool:
+        """Whether there are bags to identify from, and no command moves in any of them."""
+        usable = [row for row in self.rows if row.verdict in (LOOK, GOOD)]
+        return bool(usable) and not any(row.excited for row in usable)
 
 
 @dataclass(frozen=True)
@@ -57,14 +80,57 @@ class CheckBag:
 
     @cached_property
     def asked(self) -> str:
-        """The signals, their clock and the types' definitions."""
+        """The signals, grid, clock and the types' definitions."""
         types = texts_of(read_definitions(self.config.definitions))
-        said = self.config.model_dump_json(include={"signals", "clock"})
+        said = self.config.model_dump_json(include={"signals", "grid", "clock"})
         return f"check {version('nlsid')} {said} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
-        """A Checked, as JSON."""
+        """A Checked, as JSON. Raises BagError for a bag that no command can read."""
         definitions = read_definitions(self.config.definitions)
+        with Bag(bag, definitions=definitions) as source:
+            start_ns, custom, digest = (
+                source.start_ns, source.custom, bag_origin(source)["digest"],
+            )  # fmt: skip
+        refused, samples, excited = "", "", False
+        try:
+            own = read_signals_of([bag], self.config, names=[name]).trajectories
+        except DataError as error:
+            if not is_of_content(error):
+                raise
+            refused = f"`nlsid identify` leaves it out: {without_name(str(error), bag, name)}"
+        else:
+            samples = "".join(samples_digest(own))
+            excited = any((trial.u != trial.u[0]).any() for trial in own)
+        findings = list(self._findings(bag, name, definitions, taken=not refused))
+        counts = [text for key, text in custom.items() if key.endswith(LOST)]
+        lost = sum(int(text) for text in counts if text.isdigit()) if counts else None
+        if lost:
+            findings.append(Finding(Level.LOOK, "losses", f"its recorder lost {lost} messages"))
+        if refused:
+            findings.insert(0, Finding(Level.BAD, "identify", refused))
+        wrong = sorted((f for f in findings if f.level is not Level.GOOD), key=lambda f: -f.level)
+        checked = Checked(
+            bag=name,
+            robot="-",  # told from the others at home
+            verdict=wrong[0].level.name.lower() if wrong else GOOD,
+            start=iso(start_ns),
+            lost=lost,
+            clock=next((f.what for f in wrong if f.check == "clock"), ""),
+            gaps=next((f.what for f in findings if " the longest " in f.what), ""),
+            trouble=wrong[0].what if wrong else "",
+            findings=tuple(f"{f.level.name.lower()}: {f.check}: {f.what}" for f in findings),
+            excited=excited,
+            digest=digest,
+            samples=samples,
+        )
+        return canonical(asdict(checked))
+
+    def _findings(self, bag: Path, name: str, definitions: Any, *, taken: bool) -> list[Finding]:
+        """What `nlsid bag check` finds, of one bag among others.
+
+        taken: `nlsid identify` takes its samples, with the configured grid.
+        """
         (fitness,) = check_fitness(
             [bag],
             excitations=[signal.path for signal in self.config.signals.excitation],
@@ -72,38 +138,21 @@ class CheckBag:
             clock=self.config.clock,
             definitions=definitions,
         )
-        fitness = replace(fitness, findings=tuple(map(_of_one_bag, fitness.findings)))
-        start_ns, custom = 0, {}
-        try:
-            with Bag(bag, unfinished=True, definitions=definitions) as source:
-                start_ns, custom = source.start_ns, source.custom
-        except BagError:
-            assert fitness.verdict is Level.BAD
-        counts = [text for key, text in custom.items() if key.endswith(LOST)]
-        wrong = sorted(
-            (f for f in fitness.findings if f.level is not Level.GOOD), key=lambda f: -f.level
-        )
-        checked = Checked(
-            bag=name,
-            robot=robot_of(name),
-            verdict=fitness.verdict.name.lower(),
-            start=iso(start_ns),
-            lost=sum(int(text) for text in counts if text.isdigit()) if counts else None,
-            clock=next((f.what for f in wrong if f.check == "clock"), ""),
-            gaps=next((f.what for f in wrong if " gaps, " in f.what), ""),
-            trouble=wrong[0].what if wrong else "",
-            findings=tuple(
-                f"{f.level.name.lower()}: {f.check}: {f.what}" for f in fitness.findings
-            ),
-        )
-        return canonical(asdict(checked))
+        return [
+            replace(
+                found,
+                level=Level.GOOD if _is_of_others(found) or (taken and decided) else found.level,
+                what=without_name(found.what, bag, name),
+            )
+            for found in fitness.findings
+            for decided in [found.check in ("regularity", "samples")]
+            if not (taken and found.check == "samples" and found.level is not Level.GOOD)
+        ]
 
 
-def _of_one_bag(finding: Finding) -> Finding:
-    """The finding, of one bag among others."""
-    if finding.check != "excitation" or finding.level is not Level.BAD:
-        return finding
-    return Finding(Level.LOOK, finding.check, f"{finding.what} in this bag alone")
+def _is_of_others(found: Finding) -> bool:
+    """Whether it is about a command that moves too little here: others may have it move."""
+    return found.check == "excitation" or (found.check, found.level) == ("delay", Level.LOOK)
 
 
 def check_fleet(
@@ -112,16 +161,28 @@ def check_fleet(
     *,
     workers: Workers,
     manifest: Path | None = None,
+    folder: int | None = None,
     progress: Progress = silent,
-) -> list[Checked]:
-    """A row a bag, in the order of `bags`; one that cannot be reached is `not read`."""
+) -> FleetCheck:
+    """A row a bag, in the order of `bags`; one that cannot be read is `not read`.
+
+    folder: of a bag's name, that says whose it is (`robots_of`).
+    """
+    robots, recordings = robots_of(bags, folder), Recordings()
+    rows: list[Checked] = []
+    known = 0
     with Manifest(manifest) as kept:
-        return [
-            Checked(answer.name, robot_of(answer.name), UNREAD, trouble=answer.reason)
-            if answer.reason
-            else Checked(**_document(answer.content))
-            for answer in ask(CheckBag(config), bags, workers, kept, progress=progress)
-        ]
+        for answer in ask(CheckBag(config), bags, workers, kept, progress=progress):
+            known += answer.kept
+            if answer.reason:
+                row = Checked(answer.name, "", UNREAD, trouble=answer.reason)
+            else:
+                row = Checked(**_document(answer.content))
+                marks = [mark for mark in (row.digest, row.samples) if mark]
+                if (first := recordings.first(row.bag, marks)) != row.bag:
+                    row = replace(row, verdict=COPY, trouble=same_as(first))
+            rows.append(replace(row, robot=robots[row.bag]))
+    return FleetCheck(tuple(rows), known)
 
 
 def _document(content: bytes) -> dict[str, Any]:

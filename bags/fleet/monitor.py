@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import pickle
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -18,7 +17,7 @@ from bags.chain.training import load_held_back, load_training
 from bags.designs import documents
 from bags.designs.design import AnyDesign
 from bags.designs.documents import Proved
-from bags.fleet.bags import robot_of
+from bags.fleet.bags import COPY, UNREAD, Recordings, robots_of, same_as
 from bags.fleet.check import iso
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import ask
@@ -33,25 +32,24 @@ from nlsid_core.funnels.tube import TubeFunnel
 from nlsid_core.progress import Progress, silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.monitor import Monitor
-from nlsid_core.running.reading import Reading, Status
+from nlsid_core.running.reading import Reading, Status, cause
 
 RARE = 0.01  # probability of the second bound that is stated, where there are bags enough
 BINS = 10  # of the histogram, of what the assumption allows
 LEAST = 3  # bags of a month, and calibration trials, that are compared
-UNREAD = "not read"
-COPY = "copy"  # of a recording that another bag has: judged there
 
 
 @dataclass(frozen=True)
 class Judged:
     """One bag: its verdict, and the numbers behind it.
 
-    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: which one
-    was broken first, in words. spent: the largest part of what is assumed that was used (None: not
-    measured), at spent_at, s of the run. margin: the least (None: nothing judged), margin_at: s.
-    start: of the bag, spent_when, and bad_from: of the first bad sample, all ISO 8601 in UTC.
-    alarm: of the second alarm. judged, span: s. filled: samples nobody measured. digest: of the
-    recording.
+    verdict: of `Replay`, `not read` or `copy`. reason: why it is not inside. assumption: what of it
+    was broken first, without numbers. spent: the largest part of what is assumed that was used
+    (None: not measured), at spent_at, s of the run. margin: the least (None: nothing judged),
+    margin_at: s. start: the bag's first log time, spent_when, and bad_from: of the first bad
+    sample, all ISO 8601 in UTC; bad_at: s of the run. alarm: of the second alarm. unjudged: from
+    where on it was not judged, and why, also of a bag that is bad. clock: where its stamps go back.
+    judged, span: s. filled: samples nobody measured. digest: of the recording.
     """
 
     bag: str
@@ -66,7 +64,10 @@ class Judged:
     margin_at: float = 0.0
     start: str = ""
     bad_from: str = ""
+    bad_at: float = 0.0
     alarm: str = ""
+    unjudged: str = ""
+    clock: str = ""
     judged: float = 0.0
     span: float = 0.0
     filled: int = 0
@@ -76,6 +77,11 @@ class Judged:
     def month(self) -> str:
         """The month of its start, `2026-11`; empty if unknown."""
         return self.start[:7]
+
+    @property
+    def has_trouble(self) -> bool:
+        """Whether there is something to look at; a copy is looked at where it counts."""
+        return bool(self.alarm or self.clock) or self.verdict not in (Status.INSIDE.value, COPY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +98,7 @@ class JudgeBag:
         types = texts_of(self.definitions)
         wiring = hashlib.sha256(pickle.dumps(self.proved.design.wiring)).hexdigest()
         digest = self.proved.design.digest
-        return f"monitor {version('nlsid')} {digest} {self.centre} {wiring} {types}"
+        return f"judge {version('nlsid')} {digest} {self.centre} {wiring} {types}"
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """A Judged, as JSON."""
@@ -107,23 +113,40 @@ def judged_of(replay: Replay, bag: Path, name: str) -> Judged:
     alarm = replay.first_alarm
     return Judged(
         bag=name,
-        robot=robot_of(name),
+        robot="-",  # told from the others at home
         verdict=replay.verdict,
         reason=replay.reason,
-        assumption="" if bad is None or bad.status is Status.OUTSIDE else bad.assuming,
+        assumption="" if bad is None or bad.status is Status.OUTSIDE else _broken(bad.reason),
         spent=None if most is None else most.assumption,
         spent_at=0.0 if most is None else most.t,
         spent_when="" if most is None else iso(stamps[id(most)]),
         margin=None if worst is None else max(worst.margin, -1e300),
         margin_at=0.0 if worst is None else worst.t,
-        start=iso(replay.stamps_ns[0]) if replay.stamps_ns else "",
+        start=iso(replay.start_ns),
         bad_from="" if bad is None else iso(stamps[id(bad)]),
+        bad_at=0.0 if bad is None else bad.t,
         alarm="" if alarm is None else alarm.alarm,
+        unjudged=_unjudged(replay),
+        clock=replay.clock,
         judged=replay.judged_span,
         span=replay.span,
         filled=replay.filled,
         digest=bag_origin(bag)["digest"],
     )
+
+
+def _broken(reason: str) -> str:
+    """What was broken, whenever and by however much."""
+    return cause(reason.partition(" at t = ")[0]).replace("#", "...").rstrip(",")
+
+
+def _unjudged(replay: Replay) -> str:
+    """The first stretch that was not judged, and how many more are; empty if there is none."""
+    if not replay.unjudged:
+        return ""
+    first, *more = replay.unjudged
+    said = f"from {first.t:.3f} s on: {first.reason}"
+    return f"{said} (and later in {len(more)} more places)" if more else said
 
 
 def most_spent(readings: Sequence[Reading]) -> Reading | None:
@@ -148,19 +171,24 @@ class Drift:
 
     def __str__(self) -> str:
         return (
-            f"{self.month}: {self.bags} bags, {self.trials} calibration trials: a bag spends more "
-            f"than a trial in {100 * self.larger:.0f} % of the pairs. Were they exchangeable, they "
-            f"would differ as much with p = {self.p:.2g} (rank test)"
+            f"drift: of {self.bags} bags of {self.month} and {self.trials} calibration trials, a "
+            f"bag spends more than a trial in {100 * self.larger:.0f} % of the pairs. Were they "
+            f"exchangeable, they would differ as much with p = {self.p:.2g} (rank test)"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class FleetVerdict:
-    """Every bag's row, in order; calibration: what each trial that scaled the design spent."""
+    """Every bag's row, in order.
+
+    calibration: what each trial that scaled the design spent. made_of: digests of the recordings
+    that designed or scaled it. known: how many rows were in the manifest before.
+    """
 
     rows: tuple[Judged, ...]
     calibration: tuple[float, ...]
-    made_of: frozenset[str]  # digests of the recordings that designed or scaled it
+    made_of: frozenset[str]
+    known: int = 0
 
     @property
     def others(self) -> list[Judged]:
@@ -171,6 +199,11 @@ class FleetVerdict:
     def unrecognised(self) -> bool:
         """Whether no bag here is known to be one that the design was made of."""
         return bool(self.made_of) and not any(row.digest in self.made_of for row in self.rows)
+
+    @property
+    def own(self) -> int:
+        """How many bags the design was made of."""
+        return sum(row.digest in self.made_of for row in self.rows)
 
     @property
     def worst(self) -> list[Judged]:
@@ -187,14 +220,12 @@ class FleetVerdict:
                 counts[min(BINS, math.ceil(max(BINS * row.spent - 1.0, 0.0)))] += 1
         return counts
 
-    def by(self, key: str) -> dict[str, Counter[str]]:
-        """Verdicts by `robot` or by `day`, those with nothing but inside last."""
-        found: dict[str, Counter[str]] = {}
+    def by(self, key: str) -> dict[str, list[Judged]]:
+        """The rows by `robot` or by `day` (empty: unknown), those with the most trouble first."""
+        found: dict[str, list[Judged]] = {}
         for row in self.rows:
-            group = row.start[:10] if key == "day" else row.robot
-            found.setdefault(group, Counter())[row.verdict] += 1
-        good = Status.INSIDE.value
-        return dict(sorted(found.items(), key=lambda e: (e[1][good] - e[1].total(), e[0])))
+            found.setdefault(row.start[:10] if key == "day" else row.robot, []).append(row)
+        return dict(sorted(found.items(), key=lambda e: (-trouble_in(e[1]), e[0])))
 
     @property
     def ranks(self) -> list[str]:
@@ -207,7 +238,7 @@ class FleetVerdict:
         if (rare := math.floor(RARE * (m + 1))) > 1:
             ranks.append(rare)
         return [
-            f"the next bag spends more than {_percent(spent[rank - 1])} of what is assumed with "
+            f"the next bag spends more than {in_percent(spent[rank - 1])} of what is assumed with "
             f"probability {rank}/{m + 1} = {_above(rank / (m + 1))} at most, if it is exchangeable "
             f"with these {m}"
             for rank in ranks
@@ -228,6 +259,11 @@ class FleetVerdict:
         )  # fmt: skip
 
 
+def trouble_in(rows: Sequence[Judged]) -> int:
+    """How many of them have trouble."""
+    return sum(row.has_trouble for row in rows)
+
+
 def monitor_fleet(
     bags: Mapping[str, Path],
     funnel: Path,
@@ -237,35 +273,40 @@ def monitor_fleet(
     definitions: Definitions,
     workers: Workers,
     manifest: Path | None = None,
+    folder: int | None = None,
     progress: Progress = silent,
 ) -> FleetVerdict:
     """Each bag as `nlsid monitor` judges it; one that cannot be read or judged is `not read`.
 
-    funnel: the file, beside which the trials of the calibration are looked for.
+    funnel: the file, beside which the trials of the calibration are looked for. folder: of a bag's
+    name, that says whose it is (`robots_of`).
     """
-    task = JudgeBag(proved, centre, definitions)
+    task, robots, known = JudgeBag(proved, centre, definitions), robots_of(bags, folder), 0
+    rows = []
     with Manifest(manifest) as kept:
-        rows = [
-            Judged(answer.name, robot_of(answer.name), UNREAD, answer.reason)
-            if answer.reason
-            else Judged(**_document(answer.content))
-            for answer in ask(task, bags, workers, kept, progress=progress)
-        ]
+        for answer in ask(task, bags, workers, kept, progress=progress):
+            known += answer.kept
+            row = (
+                Judged(answer.name, "", UNREAD, answer.reason)
+                if answer.reason
+                else Judged(**_document(answer.content))
+            )
+            rows.append(replace(row, robot=robots[row.bag]))
     design: Any = proved.design
-    made_of = frozenset(design.made_with)
-    return FleetVerdict(tuple(counted_once(rows)), calibration_spent(funnel, design), made_of)
+    return FleetVerdict(
+        tuple(counted_once(rows)), calibration_spent(funnel, design),
+        frozenset(design.made_with), known,
+    )  # fmt: skip
 
 
 def counted_once(rows: Sequence[Judged]) -> list[Judged]:
     """The rows, but the second of a recording (by its digest, or all numbers) is a `copy`."""
-    first: dict[object, str] = {}
-    counted = []
+    recordings, counted = Recordings(), []
     for row in rows:
         numbers = replace(row, bag="", robot="", digest="") if row.judged else None
         marks = [mark for mark in (row.digest, numbers) if mark]
-        if known := [first[mark] for mark in marks if mark in first]:
-            row = Judged(row.bag, row.robot, COPY, f"the same recording as {known[0]}")
-        first = dict.fromkeys(marks, row.bag) | first
+        if (first := recordings.first(row.bag, marks)) != row.bag:
+            row = Judged(row.bag, row.robot, COPY, same_as(first), start=row.start)
         counted.append(row)
     return counted
 
@@ -309,7 +350,8 @@ def _document(content: bytes) -> dict[str, Any]:
     return found
 
 
-def _percent(part: float) -> str:
+def in_percent(part: float) -> str:
+    """A part of what is assumed, three digits, rounded up."""
     return f"{_above(100.0 * part)} %"
 
 

@@ -19,6 +19,7 @@ from typing import Final, Protocol
 from bags.fleet.manifest import Manifest, key_of
 from bags.fleet.workers import Workers
 from bags.recordings.remote import RemotePath
+from bags.signals.reader import SamplesError
 from nlsid_core.errors import BagError, DataError
 from nlsid_core.progress import Progress, silent
 
@@ -40,13 +41,15 @@ class Task(Protocol):
 class Answer:
     """Of one bag: content, or the reason why there is none.
 
-    kept: it was in the manifest. seconds; requests, fetched (bytes): what reading it took.
+    was_read: the reason is what the bag holds, not that it cannot be read. kept: it was in the
+    manifest. seconds; requests, fetched (bytes): what reading it took.
     """
 
     bag: Path
     name: str
     content: bytes = b""
     reason: str = ""
+    was_read: bool = False
     kept: bool = False
     seconds: float = 0.0
     requests: int = 0
@@ -78,7 +81,7 @@ def ask(
         try:
             keys[name] = key_of(bag, name, task.asked)
         except (OSError, BagError) as error:
-            answers[name] = Answer(bag, name, reason=_said(error))
+            answers[name] = Answer(bag, name, reason=_said(error, bag, name))
             continue
         if keys[name] in manifest:
             answers[name] = Answer(bag, name, kept=True)
@@ -86,6 +89,8 @@ def ask(
             fresh.append(name)
     if strict and (lost := [answer for answer in answers.values() if answer.reason]):
         raise BagError(f"{lost[0].bag}: {lost[0].reason}")
+    if known := sum(answer.kept for answer in answers.values()):
+        progress(f"{known} of {len(bags)} bags are known", len(answers) / len(bags))
     asked = {name: (bags[name], keys[name]) for name in fresh}
     with closing(_asked(task, asked, workers)) as given:
         for answer in given:
@@ -128,7 +133,7 @@ def _asked(
                 if error is None:
                     yield future.result()
                 elif not isinstance(error, BrokenExecutor):
-                    yield Answer(bags[name][0], name, reason=_said(error))
+                    yield Answer(bags[name][0], name, reason=_said(error, bags[name][0], name))
                 else:
                     broken = True
                     deaths[name] += 1
@@ -163,19 +168,25 @@ def answered(task: Task, bag: Path, key: str, name: str) -> Answer:
     files would be taken for one recording.
     """
     started = time.monotonic()
-    content, reason = b"", ""
+    content, reason, was_read = b"", "", False
     again = bag.anew() if isinstance(bag, RemotePath) else bag
     try:
         content = task(bag, name)
         if key_of(again, name, task.asked) != key:
             content, reason = b"", "it changed while it was read; start the command again"
     except Exception as error:  # bags are untrusted: whatever one of them causes is about it alone
-        reason = _said(error)
+        reason, was_read = _said(error, bag, name), is_of_content(error)
     requests, fetched = map(sum, zip(_traffic(bag), _traffic(again), strict=True))
     if isinstance(bag, RemotePath):
         bag.forget()
     seconds = time.monotonic() - started
-    return Answer(bag, name, content, reason, False, seconds, requests, fetched)
+    return Answer(bag, name, content, reason, was_read, False, seconds, requests, fetched)
+
+
+def is_of_content(error: BaseException) -> bool:
+    """Whether a bag was read, and what it holds cannot be used; of others nothing can be said."""
+    of_bag = isinstance(error, BagError) and not isinstance(error, SamplesError)
+    return isinstance(error, DataError) and not of_bag
 
 
 def _traffic(bag: Path) -> tuple[int, int]:
@@ -199,8 +210,16 @@ def _error(future: "Future[Answer]") -> BaseException | None:
         ) from error
 
 
-def _said(error: BaseException) -> str:
+def _said(error: BaseException, bag: Path, name: str) -> str:
+    """What is said of a bag beside its name, so without it."""
     if isinstance(error, FileNotFoundError):
         return "it is not there any more"
-    text = str(error)[:500]
+    text = without_name(str(error), bag, name)[:500]
     return text if isinstance(error, (DataError, OSError)) else f"{type(error).__name__}: {text}"
+
+
+def without_name(text: str, bag: Path, name: str) -> str:
+    """An error's text less the bag's name at its beginning."""
+    for called in (str(bag), name):
+        text = text.removeprefix(f"{called}: ").removeprefix(f"{called} ")
+    return text

@@ -17,8 +17,9 @@ import numpy as np
 from bags.chain.config import Config
 from bags.chain.steps import Trials, by_use, read_signals_of
 from bags.chain.training import decoded, encoded
+from bags.fleet.bags import Recordings, same_as
 from bags.fleet.manifest import Manifest
-from bags.fleet.run import Answer, ask
+from bags.fleet.run import Answer, ask, without_name
 from bags.fleet.workers import Workers
 from bags.recordings.definitions import read_definitions, texts_of
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -48,11 +49,28 @@ class ReadTrials:
 
 @dataclass(frozen=True, eq=False)
 class FleetTrials:
-    """The trials by use, every bag's answer, and those that are left out, with the reason."""
+    """What was read of every bag, without what it says; the trials of all that can be used; and who
+    is left out, by name with the reason: not read, not usable as configured, or a copy.
+    """
 
-    trials: Trials
+    config: Config
     answers: tuple[Answer, ...]
-    left_out: dict[str, str]
+    read: tuple[Trajectory, ...]
+    unread: Mapping[str, str]
+    unusable: Mapping[str, str]
+    copies: Mapping[str, str]
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """All that are, by name."""
+        return dict(sorted({**self.unread, **self.unusable, **self.copies}.items()))
+
+    @cached_property
+    def trials(self) -> Trials:
+        """The trials by use; DataError if there is none, or for the split."""
+        if not self.read:
+            raise DataError(f"none of {len(self.answers)} bags can be used")
+        return by_use(Dataset(self.read), self.config)
 
 
 def read_fleet(
@@ -67,50 +85,47 @@ def read_fleet(
     """`read_trials` of bags by name, by workers; what they read is kept in OUT/fleet.sqlite.
 
     A bag that cannot be read or used is left out, and so is a second copy of one recording; with
-    `strict` the first of them raises. Raises DataError if no bag is left, or for the split.
+    `strict` the first of them raises BagError.
     """
     with Manifest(out / MANIFEST) as manifest:
         given = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
-        answers, trials, left_out = usable_trials(given)
-    if strict and left_out:
-        name, reason = next(iter(left_out.items()))
+        found = usable_trials(given, config)
+    if strict and found.left_out:
+        name, reason = next(iter(found.left_out.items()))
         raise BagError(f"{bags[name]}: {reason}")
-    if not trials:
-        some = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:3])
-        raise DataError(f"none of {len(bags)} bags can be used: {some}")
-    return FleetTrials(by_use(Dataset(tuple(trials)), config), tuple(answers), left_out)
+    return found
 
 
-def usable_trials(
-    given: Iterable[Answer],
-) -> tuple[list[Answer], list[Trajectory], dict[str, str]]:
-    """The answers without what they say, their trials, and who is left out, with the reason.
+def usable_trials(given: Iterable[Answer], config: Config) -> FleetTrials:
+    """The answers and the trials in them.
 
     Left out is what was not read, what does not go with the first trial, and the second copy of a
     recording: another with its digest, or with the same samples, which noise does not repeat.
     """
     answers: list[Answer] = []
     trials: list[Trajectory] = []
-    left_out: dict[str, str] = {}
-    recorded: dict[str, str] = {}
+    unread: dict[str, str] = {}
+    unusable: dict[str, str] = {}
+    copies: dict[str, str] = {}
+    recordings = Recordings()
     for answer in given:
+        name = answer.name
         answers.append(replace(answer, content=b""))
         if answer.reason:
-            left_out[answer.name] = answer.reason
+            (unusable if answer.was_read else unread)[name] = answer.reason
             continue
-        own = decoded(answer.content, source=f"{answer.name}: not trials")[""].trajectories
-        marks = [own[0].digest, *samples_digest(own)]
-        if known := [recorded[mark] for mark in marks if mark in recorded]:
-            left_out[answer.name] = f"the same recording as {known[0]}"
+        own = decoded(answer.content, source=f"{name}: not trials")[""].trajectories
+        first = recordings.first(name, [own[0].digest, *samples_digest(own)])
+        if first != name:
+            copies[name] = same_as(first)
             continue
-        recorded |= dict.fromkeys(marks, answer.name)
         try:
             Dataset((*trials[:1], *own))
         except NlsidError as error:
-            left_out[answer.name] = str(error)
+            unusable[name] = without_name(str(error), answer.bag, name)
             continue
         trials += own
-    return answers, trials, left_out
+    return FleetTrials(config, tuple(answers), tuple(trials), unread, unusable, copies)
 
 
 def samples_digest(trials: Sequence[Trajectory]) -> list[str]:

@@ -37,7 +37,8 @@ class Replay:
     """One bag's readings, and what a summary says of them.
 
     axis: what is measured; unit, half_width: of the one output of a tube, else empty and 0.
-    forecasts: those that were followed, one after another, if any were asked for.
+    forecasts: those that were followed, one after another, if any were asked for. start_ns: the
+    bag's first log time. clock: what is wrong with the stamps, in words; empty if nothing.
     """
 
     name: str
@@ -48,6 +49,8 @@ class Replay:
     half_width: float
     period: float = 0.0
     forecasts: tuple[Forecasted, ...] = ()
+    start_ns: int = 0
+    clock: str = ""
 
     @property
     def span(self) -> float:
@@ -247,7 +250,8 @@ def replay_bag(
     `replay_messages`, DataError of a forecast with a funnel that gives none.
     """
     design = proved.design
-    stamped, forecasts = _replayed(design, bag, centre, definitions, forecast)
+    clock = _Clock()
+    stamped, forecasts = _replayed(design, bag, centre, definitions, forecast, clock)
     unit, half_width = "", 0.0
     if is_tube(design) and len(design.signals[0]) == 1:
         unit, half_width = design.signals[0][0].unit, design.funnel.half_width
@@ -260,6 +264,8 @@ def replay_bag(
         half_width=half_width,
         period=design.period,
         forecasts=tuple(forecasts),
+        start_ns=clock.start_ns,
+        clock=str(clock),
     )
 
 
@@ -277,7 +283,7 @@ def replay_messages(
     be read or does not hold the funnel's signals with stamps of their clock. What is wrong with the
     signals themselves (NaN, gaps, time going back) shows as unknown, as it does live.
     """
-    return _replayed(design, bag, centre, definitions, 0.0)[0]
+    return _replayed(design, bag, centre, definitions, 0.0, _Clock())[0]
 
 
 def _replayed(
@@ -286,6 +292,7 @@ def _replayed(
     centre: Centre,
     definitions: Definitions | None,
     forecast: float,
+    clock: "_Clock",
 ) -> tuple[list[Stamped], list[Forecasted]]:
     """The readings, and the forecasts that were followed."""
     bag = place(bag)
@@ -294,7 +301,9 @@ def _replayed(
     steps = max(1, round(forecast / design.period)) if forecast > 0.0 else 0
     watch = Watch(design, centre=centre, announced=announced, steps=steps)
     stamped = [
-        entry for said in _fed(watch, bag, definitions, announced=announced) for entry in said
+        entry
+        for said in _fed(watch, bag, definitions, clock, announced=announced)
+        for entry in said
     ]
     stamped += watch.end()
     if not stamped:
@@ -330,13 +339,41 @@ def announced_runs(
     return [run for run in found if run.funnel == digest]
 
 
+class _Clock:
+    """The stamps of a bag's messages, topic by topic, and where they go back."""
+
+    def __init__(self) -> None:
+        self.start_ns = 0
+        self._last: dict[str, int] = {}
+        self._back: dict[str, list[int]] = {}  # ns, of each place
+
+    def add(self, topic: str, stamp_ns: int) -> None:
+        last = self._last.get(topic, stamp_ns)
+        self._last[topic] = stamp_ns
+        if stamp_ns < last:
+            self._back.setdefault(topic, []).append(last - stamp_ns)
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"stamps of {topic} go back in {len(steps)} "
+            f"{'place' if len(steps) == 1 else 'places'}, by up to {max(steps) / 1e9:g} s"
+            for topic, steps in self._back.items()
+        )
+
+
 def _fed(
-    watch: Watch, bag: Path, definitions: Definitions | None, *, announced: bool
+    watch: Watch,
+    bag: Path,
+    definitions: Definitions | None,
+    clock: _Clock,
+    *,
+    announced: bool,
 ) -> Iterator[list[Stamped]]:
     """What `watch` says to every message, by log time; as recorded where it goes back itself."""
     digest = watch.design.digest
     with Bag(bag, definitions=definitions) as source:
         _check(watch.pairing, source, bag)
+        clock.start_ns = source.start_ns
         run_topics = _run_topics(source) if announced else []
         topics = watch.pairing.topics
         set_back = watch.pairing.clock == "log" and bool(source.log_order(topics).back)
@@ -347,6 +384,7 @@ def _fed(
                     yield watch.begin(run.start_ns)
                 continue
             stamp_ns = watch.pairing.stamp(message.data, message.log_time_ns)
+            clock.add(message.topic, stamp_ns)
             decoded = decode(message.data, *source.types_on(message.topic))
             yield watch.message(message.topic, stamp_ns, decoded)
 

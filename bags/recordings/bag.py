@@ -73,7 +73,8 @@ class Bag:
         self._storage.channels = [
             defined(channel, definitions or {}) for channel in self._storage.channels
         ]
-        self.ending = self._storage.ending or self.ending
+        if self._storage.ending is not None:  # of a bag that is one file that is said already
+            self.ending = self._storage.ending.removeprefix(f"{self.path}: ")
         if self.ending is not None and not unfinished:
             self.close()
             raise BagError(self._unfinished())
@@ -122,7 +123,8 @@ class Bag:
         if not found:
             there = listed(f"{name} ({kind})" for name, kind in self.topics.items())
             near = did_you_mean(topic, self.topics)
-            raise BagError(f"{self.path} has no topic {topic}; it has: {there}{near}")
+            cut = "" if self.ending is None else f". It is truncated or unfinished: {self.ending}"
+            raise BagError(f"{self.path} has no topic {topic}; it has: {there}{near}{cut}")
         if len({c.msgtype for c in found}) > 1:
             raise BagError(
                 f"{self.path}: {topic} holds messages of {self.topics[topic]}; "
@@ -196,8 +198,9 @@ class Bag:
             )
         bytes_there = sum(file.stat().st_size for file in self.files)
         return (
-            f"{self.path} is truncated or unfinished: of {bytes_there} bytes, {self.ending}; "
-            f"copy it again, or recover its complete chunks with {RECOVER}"
+            f"{self.path} is truncated or unfinished, without the summary that ends a bag: of "
+            f"{bytes_there} bytes, {self.ending}; copy it again, or recover its complete chunks "
+            f"with {RECOVER}"
         )
 
 

@@ -1,6 +1,7 @@
 """Which bags a person means by a path, and which files a bag is made of."""
 
 import os
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +18,7 @@ ROS1: Final = ".bag"
 DATA_FILES: Final = (".mcap", ".db3", ROS1)
 COMPRESSED: Final = ".zstd"  # a file rosbag2 compressed whole
 NEWEST_VERSION: Final = 9  # of metadata.yaml; ROS 2 Jazzy's
+MOST_LOOKED_AT: Final = 50  # folders, for bags that lie deeper than what was given
 MAX_METADATA_BYTES: Final = 32 * 2**20  # 10 000 topics are 6 MB
 
 # The C loader where PyYAML has it: ten thousand topics are seconds in Python.
@@ -58,7 +60,9 @@ def expand_bags(paths: Iterable[Path]) -> list[Path]:
             if (p.is_dir() and _is_bag(p)) or (p.is_file() and p.suffix in DATA_FILES)
         )
         if not inside:
-            raise BagError(f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)})")
+            raise BagError(
+                f"{path} is not a bag and holds none (no {' or '.join(DATA_FILES)}){_deeper(path)}"
+            )
         found += inside
     return list(dict.fromkeys(found))
 
@@ -68,6 +72,27 @@ def _matches(path: Path) -> list[Path]:
     if not found:
         raise BagError(f"nothing matches {path}; name a rosbag2 folder or an .mcap file")
     return found
+
+
+def _deeper(folder: Path) -> str:
+    """That folders in it hold bags, as one pattern for those that lie as deep as the first."""
+    waiting = deque([(folder, "")])
+    for _ in range(MOST_LOOKED_AT):
+        if not waiting:
+            break
+        place_of, pattern = waiting.popleft()
+        for path in sorted(place_of.iterdir()):
+            if path.suffix in DATA_FILES:
+                kind = f"{pattern}/*{path.suffix}"
+            elif not path.is_dir():
+                continue
+            elif _is_bag(path):
+                kind = f"{pattern}/*"
+            else:
+                waiting.append((path, f"{pattern}/*"))
+                continue
+            return f"; folders in it do: give the pattern '{folder}{kind}', in quotes"
+    return ""
 
 
 def trial_name(path: Path) -> str:

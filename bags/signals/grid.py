@@ -471,5 +471,5 @@ def _refuse_gaps(stamp_ns: IntArray, gap_ns: int, where: str) -> None:
         raise DataError(
             f"{where}: a gap of {gap} s after sample {worst} at "
             f"{stamp_text(int(stamp_ns[worst]))}; at most {most} s was asked for "
-            f"({len(wide)} such gaps); split_gaps leaves them out"
+            f"({len(wide)} such {'gap' if len(wide) == 1 else 'gaps'}); split_gaps leaves them out"
         )

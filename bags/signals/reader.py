@@ -26,6 +26,10 @@ PUBLISH_TIME: Final = "publish time"
 CLOCKS: Final = (HEADER_STAMP, LOG_TIME, PUBLISH_TIME)
 
 
+class SamplesError(BagError):
+    """A bag that was read, with a signal that cannot be used: NaN, or time that goes back."""
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """A signal as recorded; arrays are read-only.
@@ -72,8 +76,8 @@ def read_signals(
     definitions: of message types that the bag does not define.
     `[*]` gives one entry per element. Every path is checked against the types in the bag before a
     message is read. Raises BagError, naming the bag, if the bag is missing, unfinished or damaged;
-    if a topic or field does not exist or is no number; if a topic has no messages; if a value is
-    not finite or time goes back.
+    if a topic or field does not exist or is no number; if a topic has no messages; SamplesError if
+    a value is not finite or time goes back.
     """
     if clock is not None and clock not in CLOCKS:
         raise BagError(f"no clock '{clock}'; there are: {', '.join(CLOCKS)}")
@@ -195,7 +199,7 @@ def _applied(
     kept = finite if gaps else np.arange(len(values)) >= int(np.argmax(finite))
     if not (finite[kept].all() and kept.any()):
         missing = int(np.flatnonzero(kept & ~finite)[0])
-        raise BagError(
+        raise SamplesError(
             f"{source.path}: {expression} has no value at message {missing}, "
             f"{stamp_text(int(recorded.stamp_ns[missing]))}: too few samples before it; take a "
             "longer window, or cut the bag at the gap"
@@ -237,7 +241,7 @@ class _Topic:
         if not len(stamps):
             raise BagError(f"{self._where} has no messages; was its publisher running?")
         if self._clock == HEADER_STAMP and not stamps.any():
-            raise BagError(
+            raise SamplesError(
                 f"{self._where}: every header stamp is 0; its publisher does not fill it in"
             )
         back = self._back or [
@@ -246,7 +250,7 @@ class _Topic:
         ]
         if back:
             at, before, after = back[0]
-            raise BagError(
+            raise SamplesError(
                 f"{self._where}: time goes back by {(before - after) / 1e9:g} s at message {at}: "
                 f"{self._clock} {stamp_text(before)}, then {stamp_text(after)} "
                 f"({len(back)} such {'place' if len(back) == 1 else 'places'})"
@@ -265,7 +269,7 @@ class _Topic:
             return Samples(name, self._stamps[finite], values[finite], self._clock)
         if len(bad := np.flatnonzero(~finite)):
             i = int(bad[0])
-            raise BagError(
+            raise SamplesError(
                 f"{self._bag}: {name} is {values[i]} in message {i} at "
                 f"{stamp_text(int(self._stamps[i]))} ({len(bad)} of {len(values)} messages "
                 "are not finite); record it again or cut the bag there"

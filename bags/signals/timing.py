@@ -65,7 +65,7 @@ class ClockRelation:
                 f"one clock, logged {abs(1e3 * self.offset):.3g} ms after the stamp at the soonest"
             )
         if abs(self.drift) > OWN_PACE:
-            return f"stamps run at {1 + self.drift:.3g} times the pace of log time: simulated time?"
+            return f"stamps run at {1 + self.drift:.4g} times the pace of log time: simulated time?"
         drift = f", drifting {1e6 * self.drift:+.3g} ppm" if self.drift else ", constant"
         return f"stamps {self.offset:+.3f} s from log time{drift}"
 

@@ -188,7 +188,7 @@ def _clocks(bag: Bag, signals: Sequence[str]) -> list[Finding]:
         back = int((np.diff(columns.stamp_ns) < 0).sum())
         if back:
             findings.append(
-                Finding(Level.BAD, "clock", f"{topic}: stamps go back in {back} places")
+                Finding(Level.BAD, "clock", f"{topic}: stamps go back in {_counted(back, 'place')}")
             )
         relation = clock_relation(columns.stamp_ns, columns.log_ns)
         offsets[topic] = relation.offset
@@ -217,7 +217,7 @@ def _regularity(samples: Samples) -> list[Finding]:
     period = float(np.median(steps))
     gaps = steps > GAP * period
     if gaps.any():
-        what = f"{name}: {int(gaps.sum())} gaps, the longest {np.max(steps):.3g} s"
+        what = f"{name}: {_counted(int(gaps.sum()), 'gap')}, the longest {np.max(steps):.3g} s"
         findings.append(Finding(Level.LOOK, "regularity", what))
     jitter = float(np.quantile(np.abs(steps[~gaps] - period), 0.95)) / period
     level = Level.LOOK if jitter > JITTER_LOOK else Level.GOOD
@@ -250,6 +250,10 @@ def _commands(samples: Samples, last_ns: int) -> list[Finding]:
         what = f"{name}: {repeats} of {len(samples)} stamps repeat the one before; the last counts"
         findings.append(Finding(Level.LOOK, "commands", what))
     return findings
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _percent(share: float) -> str:

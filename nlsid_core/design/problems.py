@@ -115,6 +115,9 @@ class ContinuousTracking:
     assumed to act continuously). K is then linear between knots. error: (n,)
     bounds of how much each state is measured wrong (None: not at all).
 
+    decay: 1/s, λ of a claim that every solution comes nearer: V̇ ≤ λ(σ - V) wherever σ ≤ V ≤ 1, for
+    the least floor σ that is found; V is 1 on the funnel's boundary (None: only that it stays).
+
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
     """
@@ -132,8 +135,11 @@ class ContinuousTracking:
     uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None
     error: ArrayLike | None = None
+    decay: float | None = None
 
     def __post_init__(self) -> None:
+        if self.decay is not None:
+            require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))
         require_one_of(self, "objective", get_args(Objective))
         require_one_of(self, "gain", GAINS)

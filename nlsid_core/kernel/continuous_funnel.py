@@ -8,7 +8,9 @@ for every x̄: then V = W/ρ falls by margin or more, in 1/s, where V = 1 (thesi
 f is affine in each entry of w, so a vertex of its box each is enough; or, where w only pushes, with
 ẋ = ... + Gw, h |2x̄'Pg| r <= h r (κ(x̄'Pg)² + 1/κ) is added for each w instead, r half its range.
 Where u = clip(ũ), ũ = u₀ - Kx̄, each clipped input is free, low or high; τ_l >= 0 multiplies
-q_l >= 0 of that mode. Where the input is held, it is clip(ũ) + δ with |δ_i| <= W_i: every corner of
+q_l >= 0 of that mode. Where V is claimed to decay, dV/dt <= λ(σ - V) wherever σ <= V <= 1, so
+    c(s, x̄) = W dρ/ds - ρ dW/ds + hλρ (σρ - W) - τ (ρ - W) - τ' (W - σρ) - Σ_l τ_l q_l > 0
+instead (Lemma 5.3). Where the input is held, it is clip(ũ) + δ with |δ_i| <= W_i: every corner of
 that box is a case as every vertex of w is, and pieces of rates show that |dũ_i/dt| < R_i.
 Why that is enough: docs/certificate_continuous_funnel.md.
 """
@@ -87,6 +89,14 @@ class Hold:
 
 
 @dataclass(frozen=True)
+class Decay:
+    """dV/dt <= rate (floor - V) wherever floor <= V <= 1; rate in 1/s."""
+
+    rate: Fraction
+    floor: Fraction
+
+
+@dataclass(frozen=True)
 class Funnel:
     """Knots, control points of x₀, and P and ρ at the knots."""
 
@@ -105,16 +115,18 @@ def decide_funnel(
     claim: Node, proof: Node, read: Read, work: Work | None = None
 ) -> tuple[Decision, Funnel]:
     """The decision, and the funnel that it is about; `work` is shared by several."""
-    parts = claim.members("kind about", "goal hold error")
+    parts = claim.members("kind about", "goal hold error decay")
     documents, digests = bound_files(parts["about"], read, "vector_field policy funnel")
     field = read_field(documents["vector_field"])
     funnel = read_funnel(documents["funnel"], field.n, digests)
     policy = read_policy(documents["policy"], field, funnel, digests)
-    required = "margin basis multiplier pieces" + " goal_multiplier" * ("goal" in parts)
-    required += " sides" * bool(policy.limits or "hold" in parts)
+    required = "basis pieces" + " goal_multiplier" * ("goal" in parts)
+    required += " margin multiplier" * ("decay" not in parts)
+    required += " sides" * bool(policy.limits or "hold" in parts or "decay" in parts)
     required += " rates rate_pieces" * ("hold" in parts)
     stated = proof.members(required, "kappa" if field.box else "")
-    margin = stated["margin"].number()
+    falls = _read_decay(parts["decay"]) if "decay" in parts else stated["margin"].number()
+    margin = falls.rate * (1 - falls.floor) if isinstance(falls, Decay) else falls
     if margin <= 0:
         raise Rejected("the margin should be positive")
     goal = _decide_goal(parts["goal"], stated, funnel) if "goal" in parts else ""
@@ -126,7 +138,7 @@ def decide_funnel(
     spans = [sum(t <= start for t in field.breaks) for start in funnel.t[:-1]]
     bounds = [field.bounds[span] for span in spans]
     _decide_valid(field, policy, funnel, bounds, hold, work)
-    count = _decide_pieces(field, policy, funnel, spans, stated, margin, hold, work)
+    count = _decide_pieces(field, policy, funnel, spans, stated, falls, hold, work)
     if hold.period:
         count += _decide_rates(field, policy, funnel, spans, stated, hold, work)
     end = text.exact(funnel.t[-1])
@@ -134,8 +146,8 @@ def decide_funnel(
     whose = "that starts in it" if hold.period else "that is in it"
     decision = Decision(
         f"funnel: every solution {whose} at a time from {text.exact(funnel.t[0])} to {end} s "
-        f"stays in it until {end} s{goal}{_kept(field, bounds)}; {count} pieces of time decided, "
-        "on its boundary V falls by at least the margin, in 1/s",
+        f"stays in it until {end} s{goal}{_kept(field, bounds)}{_falls(falls)}; {count} pieces of "
+        "time decided, on its boundary V falls by at least the margin, in 1/s",
         margin,
         _assumptions(field, policy, bounds, hold),
         digests,
@@ -253,6 +265,24 @@ def _read_hold(
             ]
         )
     return Hold(period, error, rates, widths)
+
+
+def _read_decay(node: Node) -> Decay:
+    parts = node.members("rate floor")
+    decay = Decay(parts["rate"].number(), parts["floor"].number())
+    if decay.rate <= 0 or not 0 <= decay.floor < 1:
+        raise Rejected("decay should have a rate above 0 and a floor from 0 to below 1")
+    return decay
+
+
+def _falls(falls: Decay | Fraction) -> str:
+    if not isinstance(falls, Decay):
+        return ""
+    rate, floor = text.exact(falls.rate), text.exact(falls.floor)
+    return (
+        f", and for any times t1 <= t2 from then on V(t2) <= {floor} or V(t2) <= {floor} + "
+        f"exp(-{rate} (t2 - t1)) (V(t1) - {floor}), V = |x - x0|^2_P / rho"
+    )
 
 
 def _increasing(node: Node, least: int, most: int) -> list[Fraction]:
@@ -392,7 +422,7 @@ Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign
 
 def _decide_pieces(
     field: Field, policy: Policy, funnel: Funnel, spans: list[int], stated: dict[str, Node],
-    margin: Fraction, hold: Hold, work: Work,
+    falls: Decay | Fraction, hold: Hold, work: Work,
 ) -> int:  # fmt: skip
     """Prove c > 0 on every piece, and that the pieces cover every time, vertex and mode."""
     kappa = None
@@ -406,10 +436,12 @@ def _decide_pieces(
     _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits))
     values = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
     vertices, modes = list(product(hold.corners, values)), _modes(policy)
-    names = "mu" + " mode tau" * bool(policy.limits)
+    decays = isinstance(falls, Decay)
+    names = "tau" if decays else "mu" + " tau" * bool(policy.limits)
+    names += " mode" * bool(policy.limits)
     needed = list(product(range(len(spans)), range(len(vertices)), modes))
     order, pieces = _in_order(stated["pieces"], names, needed, len(modes[0]), work)
-    multiplier = stated["multiplier"].monomials(field.n)
+    multiplier = [] if decays else stated["multiplier"].monomials(field.n)
     loops: dict[tuple[object, ...], _Loop] = {}  # of the last piece: those that share one follow
 
     def decide_piece(ring: Ring, number: int) -> None:
@@ -420,7 +452,7 @@ def _decide_pieces(
             loops.clear()
             push = hold.push(k, corner)
             loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, push)
-            loops[key].grow(field, kappa[k] if kappa else [], margin)
+            loops[key].grow(field, kappa[k] if kappa else [], falls)
         loop, piece = loops[key], pieces[i]
         c = loop.condition(multiplier, piece, stated, w)
         squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
@@ -577,44 +609,56 @@ class _Loop:
         """dx₀/ds."""
         return [self.in_time(_slope(p)) for p in zip(*self.funnel.x[self.k], strict=True)]
 
-    def grow(self, field: Field, kappa: Sequence[Fraction], margin: Fraction) -> None:
-        """`rest` and, by monomials in w, `growth`: all of c(s, x̄) but its multipliers."""
+    def grow(self, field: Field, kappa: Sequence[Fraction], falls: Decay | Fraction) -> None:
+        """`rest` and, by monomials in w, `growth`: all of c(s, x̄) but its multipliers.
+
+        falls: the decay, or the margin on the boundary. `shell`: what is nonnegative for a decay.
+        """
         ring, k, h, x = self.ring, self.k, self.h, self.ring.variables
         bend = [
             [b - a for a, b in zip(*rows, strict=True)]
             for rows in zip(self.funnel.P[k], self.funnel.P[k + 1], strict=True)
         ]
-        # dρ/ds - margin h ρ + 2x̄'P dx₀/ds - x̄'(dP/ds)x̄
-        rise = self.funnel.rho[k + 1] - self.funnel.rho[k]
-        rest = rise - margin * h * self.rho - ring.form(bend, x)
-        rest += 2 * ring.dot(self._motion(), self.Px)
+        # 2x̄'P dx₀/ds - x̄'(dP/ds)x̄: what of -dW/ds does not come from f
+        rest = 2 * ring.dot(self._motion(), self.Px) - ring.form(bend, x)
         self.growth = _along(ring, self.equations, self.Px, self.forms, 2 * h)
         for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=False)):
             unit = tuple(int(i == j) for i in range(len(field.box)))
             along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
             half = (high - low) / 2
             rest -= half * bound / (4 * h) * (along * along) + half * h / bound
-        self.rest = rest
+        rise, rho, W = self.funnel.rho[k + 1] - self.funnel.rho[k], self.rho, self.rho - self.gap
+        if isinstance(falls, Decay):
+            floor = falls.floor * rho
+            self.rest = rho * rest + rise * W + falls.rate * h * (rho * (floor - W))
+            self.growth = {used: rho * part for used, part in self.growth.items()}
+            self.shell = [self.gap, W - floor]
+        else:
+            self.rest, self.shell = rise - falls * h * rho + rest, []
 
     def condition(
         self, multiplier: list[tuple[int, ...]], piece: dict[str, Node], stated: dict[str, Node],
         w: Sequence[Fraction],
     ) -> Polynomial:  # fmt: skip
         """c(s, x̄) of a piece at a vertex w."""
-        ring, size = self.ring, len(multiplier)
-        stated_mu = piece["mu"].members("shifts start end")
-        shifts = powers_of_two(stated_mu["shifts"], size)
-        ends = zip(stated_mu["start"].wholes(size), stated_mu["end"].wholes(size), strict=True)
+        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
+        if "mu" in piece:
+            parts.append((1, self._multiplied(multiplier, piece["mu"])))
+        parts += [(-weight, growth) for weight, growth in _at(w, self.growth)]
+        if "tau" in piece:
+            parts += self._taken(piece["tau"], self.shell + self.held, stated)
+        return self.ring.weighted(parts)
+
+    def _multiplied(self, multiplier: list[tuple[int, ...]], mu: Node) -> Polynomial:
+        """μ (ρ - W)."""
+        ring, size, stated = self.ring, len(multiplier), mu.members("shifts start end")
+        shifts = powers_of_two(stated["shifts"], size)
+        ends = zip(stated["start"].wholes(size), stated["end"].wholes(size), strict=True)
         lines = [
             ring.bernstein(pair) * ring.monomial(row)
             for pair, row in zip(ends, multiplier, strict=True)
         ]
-        mu = ring.dot([Fraction(2) ** shift for shift in shifts], lines)
-        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest), (1, mu * self.gap)]
-        parts += [(-weight, growth) for weight, growth in _at(w, self.growth)]
-        if self.held:
-            parts += self._taken(piece["tau"], self.held, stated)
-        return ring.weighted(parts)
+        return ring.dot([Fraction(2) ** shift for shift in shifts], lines) * self.gap
 
     def rate_condition(
         self, room: Fraction, i: int, sign: int, piece: dict[str, Node], stated: dict[str, Node],

@@ -31,7 +31,7 @@ def decide(claim: Node, proof: Node, read: Read) -> Decision:
             stage = documents[role].document("proof", "claim proof")
             if stage["claim"].kind() != "continuous_funnel":
                 raise Rejected("a stage should claim a continuous_funnel")
-            if "hold" in stage["claim"].members("kind about", "goal hold error"):
+            if "hold" in stage["claim"].members("kind about", "goal hold error decay"):
                 raise Rejected("an input that is held into the next stage is not covered")
             decision, funnel = decide_funnel(stage["claim"], stage["proof"], read, work)
         except Rejected as refusal:

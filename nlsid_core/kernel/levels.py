@@ -53,7 +53,9 @@ def _term(node: Node, inputs: int) -> Term:
     parts = node.members("inputs of centre scale fading")
     factors = tuple(parts["inputs"].wholes(None))
     if len(factors) > MAX_FACTORS or any(not 0 <= i < inputs for i in factors):
-        raise Rejected(f"{node.where}: inputs should be at most {MAX_FACTORS}, among the model's {inputs}")
+        raise Rejected(
+            f"{node.where}: inputs should be at most {MAX_FACTORS}, among the model's {inputs}"
+        )
     of = parts["of"].text()
     if of not in ("value", "change"):
         raise Rejected(f"{node.where}: of should be value or change, not {of!r}")

@@ -25,7 +25,7 @@ from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
-from bags.setup.proposal import choose
+from bags.setup.proposing import choose
 from bags.tools.fitness import check_fitness
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (

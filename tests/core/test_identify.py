@@ -172,7 +172,7 @@ def test_the_command_line_compares_methods_on_the_same_bags(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A console that was made by an earlier test keeps the width it found.
-    monkeypatch.setattr("bags.commands.cli.out._width", 80)
+    monkeypatch.setattr("bags.commands.options.out._width", 80)
     made = CliRunner().invoke(
         app, ["compare", *BAGS, "--config", str(config), "--lags", "1", "--lags", "2"]
     )

@@ -33,7 +33,7 @@ def judged(document: Json, name: str) -> None:
             jsonschema.validate(damaged, schema)
 
 
-@pytest.mark.parametrize("case", ["clipped", "held", "pushed"])
+@pytest.mark.parametrize("case", ["clipped", "decaying", "held", "pushed"])
 @pytest.mark.parametrize(("file", "name"), FILES.items())
 def test_a_continuous_funnels_documents_validate(case: str, file: str, name: str) -> None:
     judged(files.load_document(CORPUS / "continuous_funnel" / case / file), name)

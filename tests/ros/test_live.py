@@ -13,7 +13,7 @@ from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.samples import f1tenth
 from bags.setup.candidates import look
-from bags.setup.proposal import propose
+from bags.setup.proposing import propose
 from bags.setup.written import yaml_text
 from nlsid_core.progress import silent
 

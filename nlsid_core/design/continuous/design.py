@@ -13,6 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design.continuous.counterexample import try_to_miss
+from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
@@ -77,6 +78,7 @@ def design_funnel(
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
+    decay: float | None = None,
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> FunnelDesign:
@@ -88,16 +90,20 @@ def design_funnel(
     started = time.perf_counter()
     setting = prepare(
         dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
-        uncertain=uncertain, hold=hold, error=error,
+        uncertain=uncertain, hold=hold, error=error, decay=decay,
     )  # fmt: skip
+    if decay is not None:
+        refuse_decay(setting.steps)
     if shape == "P":
         refuse_shape(setting.steps)
-        if setting.hold is not None:
-            raise DataError("V-steps search without hold or error: take shape rho")
+        if setting.hold is not None or decay is not None:
+            raise DataError("V-steps search without hold, error or decay: take shape rho")
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     try:
         setting, funnel, proved, margin = _found(setting, progress)
+        if decay is not None:
+            proved = prove_decay(setting.steps, setting.policy, funnel)
     except Infeasible as refusal:
         raise Infeasible(f"{refusal}. {_in_use(setting)}{_simulated(setting)}") from refusal
     history = [("rho", funnel.volume_integral())]
@@ -133,6 +139,8 @@ def decided(
         raise Infeasible("the funnel's end is not inside the goal")
     proof = proof_of(setting.steps, policy, funnel, proved) | {"goal_multiplier": multiplier}
     claim = {"kind": KIND, "goal": {"centre": goal.centre.tolist(), "P": goal.P.tolist()}}
+    if proved.pieces.decay is not None:
+        claim["decay"] = dict(zip(("rate", "floor"), proved.pieces.decay, strict=True))
     if setting.hold is not None:
         claim |= setting.hold.claim()
         proof |= setting.rate_proof(funnel, proved.pieces.basis)
@@ -239,7 +247,7 @@ def _held(
         outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
         held = LSteps(
             field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            widths=np.zeros((len(P) - 1, field.m)),
+            widths=np.zeros((len(P) - 1, field.m)), decay=steps.decay,
         )  # fmt: skip
         rates, widths = fastest(held, policy, outer, hold)
         held.widths = widths
@@ -304,7 +312,8 @@ def _expanded(
                            rho_final=setting.rho_final, progress=progress)  # fmt: skip
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
-    proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed)
+    proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
+                     decay=steps.decay)  # fmt: skip
     proving.kappa = steps.kappa
     return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 

@@ -24,7 +24,7 @@ from nlsid_core.design.continuous.pieces import (
     substitution,
     unsolved,
 )
-from nlsid_core.design.continuous.witnesses import multipliers_of_rates, rate_documents
+from nlsid_core.design.continuous.witnesses import rate_documents, stated_multipliers
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
@@ -374,7 +374,7 @@ def _witnessed(
         for b in range(len(pieces)):
             M = substitution(pieces.basis, inverse[b])
             gram[b, end] = M.T @ shown.gram[b] @ M
-    return replace(batch, pieces=multipliers_of_rates(replace(pieces, tau=tau, gram=gram)))
+    return replace(batch, pieces=stated_multipliers(replace(pieces, tau=tau, gram=gram)))
 
 
 def _ends(pieces: Pieces) -> tuple[FloatArray, FloatArray]:

@@ -106,8 +106,9 @@ class LSteps:
     clipped. widths: (intervals, m) of what the applied input is off, δ; None if it is not.
     nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
-    field's `is_pushed`). kappa: (intervals, n_w), if it is. local: what the dynamics are on an
-    interval, where a search expands them anew; else they are the field.
+    field's `is_pushed`). decay: 1/s, the rate of V̇ that every margin is above. kappa: (intervals,
+    n_w), if it is bounded. local: what the dynamics are on an interval, where a search expands
+    them anew; else they are the field.
     """
 
     def __init__(
@@ -119,9 +120,10 @@ class LSteps:
         pushed: bool | None = None,
         tolerance: float = 1e-5,
         widths: FloatArray | None = None,
+        decay: float = 0.0,
     ) -> None:
         refuse_degree(field)
-        self.field = field
+        self.field, self.decay = field, decay
         self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
         taken = field.curved_states if self.pushed else field.nonlinear_states
         self.nonlinear = taken if nonlinear is None else nonlinear
@@ -183,7 +185,7 @@ class LSteps:
         return vertex, corner, self.modes[mode]
 
     def values(self, section: Section, rho: float, cases: Sequence[int]) -> FloatArray:
-        """(cases, N) -Ẇ/ρ at the program's points, straight from the vector field in each mode."""
+        """(cases, N) -Ẇ/ρ - decay at the program's points, in each mode, from the vector field."""
         x_bar = np.sqrt(rho) * self.program.points @ section.base.T
         u: FloatArray = np.tile(section.u - x_bar @ section.K.T, (len(cases), 1, 1))
         w = np.empty((*u.shape[:2], self.vertices.shape[1]))
@@ -203,7 +205,7 @@ class LSteps:
         W_rate += np.einsum("ij,ij->i", x_bar @ section.P_rate, x_bar)
         if self.kappa is not None:
             W_rate += self.from_pushes(section, x_bar).sum(axis=1)
-        return np.asarray(-W_rate / rho - self._from_defect(section, rho))
+        return np.asarray(-W_rate / rho - self._from_defect(section, rho) - self.decay)
 
     def from_pushes(self, section: Section, x_bar: FloatArray) -> FloatArray:
         """(N, n_w) r(κ(x̄'Pg)² + 1/κ) for every w: at least what it adds to Ẇ."""

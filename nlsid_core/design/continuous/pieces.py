@@ -158,7 +158,8 @@ def _pieces(
             h = float(funnel.t[i + 1] - funnel.t[i])
             growth = float(funnel.rho[i + 1] - funnel.rho[i]) / h / rho[b]
             target = {q: values[b] for q, values in at_end.items()}
-            Q, scaled = end_proof(program, solution, target, h * rho[b], solution.m + growth)
+            Q, scaled = end_proof(program, solution, target, h * rho[b],
+                                  solution.m + steps.decay + growth)  # fmt: skip
             # From z to y = x̄ in the order in which T is triangular: z = A y.
             A = np.triu(np.linalg.inv(T[b][order]))
             M = substitution(basis, A)
@@ -325,7 +326,7 @@ def _joined(steps: LSteps, done: list[tuple[Pieces, FloatArray]]) -> tuple[Piece
 def stacked(parts: Sequence[Pieces]) -> Pieces:
     """All pieces in one; they have the same basis."""
     keys = [f.name for f in fields(Pieces) if f.name not in SHARED]
-    whole = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
+    whole: Json = {key: np.concatenate([getattr(part, key) for part in parts]) for key in keys}
     return replace(parts[0], **whole)
 
 
@@ -334,24 +335,22 @@ def proof_of(
 ) -> Json:
     """The witnesses of all pieces as a proof states them; the kernel has not decided them yet."""
     pieces, n = proved.pieces, funnel.n
-    margin = stated_margin(proved.margins)
+    margin = stated_margin(proved.margins) if pieces.decay is None else 0.0
     written: list[Json] = [{}] * len(pieces)
     for chosen in batches(steps.field, funnel, pieces):
         found = documents(steps.field, policy, funnel, pieces.select(chosen), margin)
         for i, document in zip(chosen.tolist(), found, strict=True):
             written[i] = document
-    used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))
-    for document in written:
-        document["mu"] = {
-            key: [row[i] for i in used.tolist()] for key, row in document["mu"].items()
-        }
-    proof: Json = {
-        "margin": margin,
-        "basis": pieces.basis.tolist(),
-        "multiplier": monomials(n, Pieces.multiplier_degrees(pieces.basis))[used].tolist(),
-        "pieces": written,
-    }
-    if pieces.mode.shape[1]:
+    proof: Json = {"basis": pieces.basis.tolist(), "pieces": written}
+    if pieces.decay is None:
+        used = np.flatnonzero(pieces.mu.any(axis=(0, 1)))
+        for document in written:
+            document["mu"] = {
+                key: [row[i] for i in used.tolist()] for key, row in document["mu"].items()
+            }
+        rows = monomials(n, Pieces.multiplier_degrees(pieces.basis))[used]
+        proof |= {"margin": margin, "multiplier": rows.tolist()}
+    if pieces.tau.shape[2]:
         proof["sides"] = affine(n).tolist()
     if pieces.kappa is not None:
         proof["kappa"] = pieces.kappa.tolist()

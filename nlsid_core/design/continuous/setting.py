@@ -116,6 +116,7 @@ def prepare(
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
     error: ArrayLike | None = None,
+    decay: float | None = None,
 ) -> Setting:
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
@@ -137,7 +138,7 @@ def prepare(
     nonlinear = None
     if expansion is not None and (pushed or not len(field.uncertain)):
         nonlinear = expansion.nonlinear_states()
-    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed)
+    steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed, decay=decay or 0.0)
     if held is not None:
         held.refuse(field, policy)
     rho_final, target = _final(steps, policy, S, wanted, expansion)

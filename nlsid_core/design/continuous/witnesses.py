@@ -113,17 +113,22 @@ def documents(
     return [_written(pieces, curves, b) for b in range(len(pieces))]
 
 
-def multipliers_of_rates(pieces: Pieces) -> Pieces:
-    """The pieces with τ of few bits, and how a proof states it: the rest of τ is zero."""
+def stated_multipliers(pieces: Pieces) -> Pieces:
+    """The pieces with τ of few bits, and how a proof states it; there is no μ."""
     n = pieces.basis.shape[1]
     sides = np.vstack([np.zeros((1, n), dtype=np.int64), np.eye(n, dtype=np.int64)])
-    nothing = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
+    nothing: Json = {"columns": [0] * (n + 1), "squares": {"unit": 0, "factors": [[]]}}
     tau, stated = np.zeros_like(pieces.tau), np.empty(len(pieces), dtype=object)
     for b in range(len(pieces)):
-        found = multiplier(sides, pieces.tau[b, :, 0], bits=TAU_BITS)
-        tau[b, :, 0] = matrices(found["columns"], found["squares"])
-        first = {"columns": found["columns"], "squares": found["squares"]}
-        stated[b] = {"tau": [first] + [nothing] * pieces.mode.shape[1]}
+        factors = []
+        for place in range(tau.shape[2]):
+            written = nothing
+            if pieces.tau[b, :, place].any():
+                found = multiplier(sides, pieces.tau[b, :, place], bits=TAU_BITS)
+                written = {key: found[key] for key in nothing}
+                tau[b, :, place] = matrices(written["columns"], written["squares"])
+            factors.append(written)
+        stated[b] = {"tau": factors}
         if pieces.mode.shape[1]:
             stated[b]["mode"] = pieces.mode[b].tolist()
     return replace(pieces, tau=tau, stated=stated)

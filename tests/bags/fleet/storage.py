@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -36,8 +36,17 @@ def drive(
     compression: CompressionType = CompressionType.NONE,
     image_bytes: int = 0,
     chunk_size: int = 64 * 2**10,
+    start_ns: int = START_NS,
+    held: float | None = None,
+    without: Container[int] = (),
+    back_from: int | None = None,
+    odom: str = ODOM,
 ) -> Path:
-    """An MCAP file of a car's speed that follows commands, in chunks, with images between."""
+    """An MCAP file of a car's speed that follows commands, in chunks, with images between.
+
+    held: the command throughout. without: samples of the speed that are not there. back_from: the
+    sample from which on stamps, not log times, are ten samples earlier. odom: the speed's topic.
+    """
     from bags.recordings.definitions import standard_definition
 
     rng = np.random.default_rng(seed)
@@ -50,16 +59,19 @@ def drive(
         )
         writer.start(profile="ros2")
         channels = {}
-        for topic, kind in ((CMD, CMD_TYPE), (ODOM, ODOM_TYPE), (IMAGE, IMAGE_TYPE)):
+        for topic, kind in ((CMD, CMD_TYPE), (odom, ODOM_TYPE), (IMAGE, IMAGE_TYPE)):
             schema = writer.register_schema(
                 kind, "ros2msg", standard_definition(kind).text.encode()
             )
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for k, u in enumerate(commands.tolist()):
-            at = START_NS + k * PERIOD_NS
+            u = u if held is None else held
+            at = start_ns + k * PERIOD_NS
+            stamp = at if back_from is None or k < back_from else at - 10 * PERIOD_NS
             speed = 0.8 * speed + 0.2 * u + 1e-3 * rng.standard_normal()
-            writer.add_message(channels[CMD], at, command(at, u), at)
-            writer.add_message(channels[ODOM], at, odometry(at, speed), at)
+            writer.add_message(channels[CMD], at, command(stamp, u), at)
+            if k not in without:
+                writer.add_message(channels[odom], at, odometry(stamp, speed), at)
             if image_bytes:
                 writer.add_message(channels[IMAGE], at, b"\0\1\0\0" + rng.bytes(image_bytes), at)
         writer.finish()  # type: ignore[no-untyped-call]

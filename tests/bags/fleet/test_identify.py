@@ -17,7 +17,7 @@ from mcap.writer import Writer
 from bags.chain.config import Config, load_config
 from bags.chain.steps import identify_bags, identify_trials
 from bags.designs import documents
-from bags.fleet.bags import named_bags, robot_of
+from bags.fleet.bags import Recordings, named_bags, robots_of
 from bags.fleet.check import CheckBag
 from bags.fleet.manifest import Manifest
 from bags.fleet.run import Answer, ask
@@ -91,9 +91,56 @@ def test_names_follow_the_pattern_and_stay_when_others_come(tmp_path: Path) -> N
     assert list(named_bags([folder / "robot_*" / "*_1.mcap"])) == ["robot_1/drive_1"]
     assert list(named_bags([folder / "robot_0"])) == ["drive_0", "drive_2"]
     assert list(named_bags([folder / "robot_0" / "drive_2.mcap"])) == ["drive_2"]
-    assert (robot_of("robot_0/drive_2"), robot_of("drive_2")) == ("robot_0", "-")
     with pytest.raises(DataError, match="two bags are called 'drive_0'"):
         named_bags([folder / "robot_0", drive(tmp_path / "drive_0.mcap")])
+
+
+@pytest.mark.parametrize(
+    ("names", "folder", "robots"),
+    [
+        (["a/d_1", "b/d_1"], None, ["a", "b"]),
+        (["d_1", "d_2"], None, ["-", "-"]),
+        (["a/2026-08/d", "b/2026-08/d", "a/2026-09/d"], None, ["a", "b", "a"]),
+        (["2026-08/a/d", "2026-08/b/d", "2026-09/a/d"], None, ["a", "b", "a"]),
+        (["2026/8/01/a/d", "2026/9/02/b/d"], None, ["a", "b"]),
+        (["x/20260801/1/d", "x/20260801/2/d"], None, ["x", "x"]),
+        (["fleet/1/2026-08-01/d", "fleet/2/2026-08-01/d"], None, ["1", "2"]),
+        (["date=2026-08-01/a/d", "date=2026-08-02/b/d"], None, ["a", "b"]),
+        (["site/a/run_1/d", "site/a/run_2/d"], None, ["run_1", "run_2"]),
+        (["site/a/run_1/d", "site/a/run_2/d"], 2, ["a", "a"]),
+        (["a/2026-08/d", "d"], -1, ["2026-08", "-"]),
+        (["a/2026-08/d", "d"], 7, ["-", "-"]),
+    ],
+)
+def test_the_robot_is_the_folder_that_tells_bags_apart_and_is_no_date(
+    names: list[str], folder: int | None, robots: list[str]
+) -> None:
+    assert robots_of(names, folder) == dict(zip(names, robots, strict=True))
+
+
+def test_folders_of_a_name_are_counted_from_one() -> None:
+    with pytest.raises(DataError, match="counted from 1"):
+        robots_of(["a/d"], 0)
+
+
+def test_a_folder_whose_folders_hold_bags_says_the_pattern(tmp_path: Path) -> None:
+    fleet(tmp_path / "cars", 4)
+    (tmp_path / "cars" / "empty").mkdir()
+    with pytest.raises(BagError, match=r"give the pattern '.*/cars/\*/\*\.mcap', in quotes"):
+        named_bags([tmp_path / "cars"])
+    with pytest.raises(BagError, match=r"the pattern '.*/\*/\*/\*\.mcap'"):
+        named_bags([tmp_path])
+    with pytest.raises(BagError, match=r"holds none \(no .mcap or .db3 or .bag\)$"):
+        named_bags([tmp_path / "cars" / "empty"])
+    assert len(named_bags([tmp_path / "cars" / "*" / "*.mcap"])) == 4
+
+
+def test_a_recording_is_known_by_any_of_its_marks_and_named_by_who_had_it_first() -> None:
+    known = Recordings()
+    assert known.first("a", ["digest a", "samples 1"]) == "a"
+    assert known.first("b", ["digest b", "samples 1"]) == "a"
+    assert known.first("c", ["digest b"]) == "a"
+    assert known.first("d", ["digest d"]) == "d"
 
 
 @pytest.mark.slow
@@ -155,6 +202,9 @@ def test_a_bad_bag_is_listed_by_name_and_reason(tmp_path: Path, config: Path) ->
     assert "truncated or unfinished" in found.left_out["robot_0/cut"]
     assert "is not an MCAP file" in found.left_out["robot_0/text"]
     assert found.left_out["robot_1/copy"] == "the same recording as robot_0/drive_2"
+    assert (set(found.unread), set(found.unusable), set(found.copies)) == (
+        {"robot_0/cut", "robot_0/text"}, set(), {"robot_1/copy"},
+    )  # fmt: skip
     assert len(found.trials.train) + len(found.trials.test) == 6
     with pytest.raises(BagError, match=r"cut\.mcap"):
         run(folder / "*" / "*.mcap", config, tmp_path / "strict", strict=True)

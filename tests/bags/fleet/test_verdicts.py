@@ -1,5 +1,6 @@
 """`nlsid fleet check` and `nlsid fleet monitor`: a row a bag, and what the rows say together."""
 
+import io
 import math
 import os
 import re
@@ -10,24 +11,36 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import permutations
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
 from bags.chain.steps import design_funnel_files, identify_bags
+from bags.commands import fleet_cli
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.fleet.bags import named_bags
 from bags.fleet.check import Checked, check_fleet, write_parquet
-from bags.fleet.monitor import FleetVerdict, Judged, calibration_spent, monitor_fleet
+from bags.fleet.monitor import (
+    FleetVerdict,
+    Judged,
+    calibration_spent,
+    monitor_fleet,
+    trouble_in,
+)
+from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import replay_bag
 from bags.recordings.remote import TAIL_BYTES
 from bags.samples import f1tenth
+from nlsid_core.errors import DataError
 from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
+from tests.bag_messages import START_NS
 from tests.bags.fleet.storage import drive, web_server
 
 CONFIG = Path("config/f1tenth.yaml")
@@ -130,8 +143,10 @@ def test_groups_with_trouble_come_first() -> None:
     rows = (
         judged(0.1, robot="a"), judged(0.2, robot="b", verdict="outside"), judged(0.3, robot="b"),
     )  # fmt: skip
-    assert list(FleetVerdict(rows, (), frozenset()).by("robot")) == ["b", "a"]
-    assert list(FleetVerdict(rows, (), frozenset()).by("day")) == ["2026-01-03"]
+    found = FleetVerdict((*rows, judged(0.4, robot="c", verdict="copy")), (), frozenset())
+    assert list(found.by("robot")) == ["b", "a", "c"]
+    assert [trouble_in(own) for own in found.by("robot").values()] == [1, 0, 0]
+    assert list(found.by("day")) == ["2026-01-03"]
 
 
 def test_the_command_says_who_was_outside_and_that_one_was_not_read(
@@ -211,7 +226,7 @@ def test_names_of_objects_cannot_write_to_the_terminal(design: Path, tmp_path: P
     (fleet / "b[").mkdir()  # the rest of the name is after a slash
     (fleet / "b[/bold].mcap").write_bytes(b"no bag")
     check, monitor = ["check", "--config", str(CONFIG)], ["monitor", "--funnel", str(design)]
-    for given, status in ((check, 1), (monitor, 2)):  # bad; nothing could be judged
+    for given, status in ((check, 2), (monitor, 2)):  # one was not read
         done = CliRunner().invoke(app, ["fleet", *given, str(fleet)], env={"COLUMNS": "200"})
         assert done.exit_code == status, done.output
         assert "a[bold][" in done.output
@@ -224,9 +239,9 @@ def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
     bags = {path.name: path for path in f1tenth()[:3]}
     (tmp_path / "cut.mcap").write_bytes(b"no bag")
     bags |= named_bags([tmp_path / "cut.mcap"])
-    rows = check_fleet(bags, load_config(CONFIG), workers=Workers())
+    rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
     assert [row.bag for row in rows] == list(bags)
-    assert rows[-1].verdict == "bad"
+    assert rows[-1].verdict == "not read"
     assert "is not an MCAP file" in rows[-1].trouble
     assert all(row.findings and row.start.startswith("2022-01-01T00:") for row in rows[:3])
     parquet = pytest.importorskip("pyarrow.parquet")
@@ -237,17 +252,153 @@ def test_check_lists_fitness_clocks_and_losses(tmp_path: Path) -> None:
 def test_a_command_that_one_bag_holds_does_not_make_it_bad() -> None:
     """Each of the shipped trials 6 to 11 does so, and they are identified from."""
     bags = {path.name: path for path in f1tenth()[5:7]}
-    rows = check_fleet(bags, load_config(CONFIG), workers=Workers())
-    assert [row.verdict for row in rows] == ["look", "look"]
-    assert all("no excitation in this bag alone" in row.trouble for row in rows)
+    rows = check_fleet(bags, load_config(CONFIG), workers=Workers()).rows
+    assert [row.verdict for row in rows] == ["good", "good"]
+    assert all("no excitation" in " ".join(row.findings) for row in rows)
 
 
-def test_the_command_check_says_what_is_bad(tmp_path: Path) -> None:
-    (tmp_path / "cut.mcap").write_bytes(b"no bag")
-    given = ["fleet", "check", str(tmp_path), "--config", str(CONFIG)]
-    done = CliRunner().invoke(app, given)
-    assert done.exit_code == 1
-    assert "1 bad" in done.output
+@pytest.fixture(scope="module")
+def spoiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight bags of four robots and three days, and one of each kind of spoiled ones."""
+    folder = tmp_path_factory.mktemp("spoiled")
+    for k in range(8):
+        start_ns = START_NS + (k % 3) * 86_400 * 10**9
+        file = folder / f"r{k % 4}" / "2022-01" / f"d{k:02d}.mcap"
+        drive(file, samples=60, seed=k, start_ns=start_ns)
+    own = folder / "r9" / "2022-01"
+    whole = drive(own / "cut.mcap", samples=60, seed=50).read_bytes()
+    (own / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    (own / "empty.mcap").write_bytes(b"")
+    drive(own / "gap.mcap", samples=60, seed=51, without=range(30, 45))
+    drive(own / "back.mcap", samples=60, seed=52, back_from=30)
+    drive(own / "still.mcap", samples=60, seed=53, held=0.25)
+    drive(own / "other.mcap", samples=60, seed=54, odom="/wheels")
+    (own / "copy.mcap").write_bytes((folder / "r1" / "2022-01" / "d01.mcap").read_bytes())
+    return folder
+
+
+def fleet_command(verb: str, *given: str, columns: int = 80) -> tuple[int, list[str]]:
+    done = CliRunner().invoke(app, ["fleet", verb, *given], env={"COLUMNS": str(columns)})
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.output.splitlines()
+
+
+@pytest.mark.parametrize("columns", [80, 140])
+def test_check_puts_first_what_the_next_step_refuses(spoiled: Path, columns: int) -> None:
+    given = (str(spoiled / "*" / "*" / "*.mcap"), "--config", str(CONFIG))
+    status, lines = fleet_command("check", *given, columns=columns)
+    assert status == 1
+    assert lines[0] == "15 bags: 3 not read, 2 bad, 1 copy, 0 look, 9 good"
+    shown = [line.split()[:3] for line in lines if line.startswith("r")]
+    assert [" ".join(words).replace("not read", "unread").split()[:2] for words in shown] == [
+        ["r9/2022-01/cut", "unread"],
+        ["r9/2022-01/empty", "unread"],
+        ["r9/2022-01/other", "unread"],
+        ["r9/2022-01/back", "bad"],
+        ["r9/2022-01/gap", "bad"],
+        ["r9/2022-01/copy", "copy"],
+    ]
+    assert all(len(line) <= columns for line in lines)
+    said = " ".join(" ".join(lines).split())
+    assert "truncated or unfinished" in said
+    assert "lost" not in lines[1]
+    if columns == 140:
+        assert "`nlsid identify` leaves it out: /odom: time goes back by" in said
+        assert "a gap of 0.4 s after sample 29" in said
+
+
+def test_check_says_that_every_bag_it_calls_bad_is_one_that_identify_leaves_out(
+    spoiled: Path, tmp_path: Path
+) -> None:
+    bags, config = named_bags([spoiled / "*" / "*" / "*.mcap"]), load_config(CONFIG)
+    checked = {
+        verdict: {row.bag for row in check_fleet(bags, config, workers=Workers()).rows
+                  if row.verdict == verdict}
+        for verdict in ("not read", "bad", "copy")
+    }  # fmt: skip
+    read = read_fleet(bags, config, tmp_path, workers=Workers())
+    assert checked == {
+        "not read": set(read.unread), "bad": set(read.unusable), "copy": set(read.copies),
+    }  # fmt: skip
+
+
+def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
+    spoiled: Path, design: Path, tmp_path: Path
+) -> None:
+    pattern, kept = str(spoiled / "*" / "*" / "*.mcap"), str(tmp_path / "kept.sqlite")
+    given = (pattern, "--funnel", str(design), "--manifest", kept)
+    _, lines = fleet_command("monitor", *given, columns=80)
+    said = "\n".join(lines)
+    assert re.match(r"15 bags: .*3 not read, 1 copy", lines[0])
+    assert f"0 of them known from {kept}, 15 asked of now" in lines[1]
+    for name in ("cut", "empty", "other", "copy", "back", "gap"):
+        assert f"  r9/2022-01/{name}: " in said
+    assert re.search(r"r9/2022-01/back: from \d.* s on: time went back by .* on /odom", said)
+    assert "r9/2022-01/back: stamps of /cmd_vel go back in 1 place, by up to 0.225 s; " in said
+    worst = lines.index("the 10 bags that spent the most, and when:")
+    assert "robots with trouble: " in said
+    assert re.search(r"^r9 +7", said, re.MULTILINE)
+    assert [len(line) <= 80 for line in lines[worst : worst + 13]] == 13 * [True]
+    assert "\N{HORIZONTAL ELLIPSIS}" not in said, "nothing is cut"
+    _, again = fleet_command("monitor", *given, columns=80)
+    assert f"12 of them known from {kept}, 3 asked of now" in again[1]
+    assert [lines[0], *lines[2:]] == [again[0], *again[2:]]
+
+
+def test_a_table_of_groups_says_how_many_it_does_not_show(capsys: Any) -> None:
+    rows = tuple(
+        Judged(f"d{k}", "-", "unknown" if k < 35 else "inside", start=f"20{10 + k}-01-01T00:00")
+        for k in range(40)
+    )
+    fleet_cli._say_groups(
+        "days", FleetVerdict(rows, (), frozenset()).by("day"), ["unknown", "inside"], None
+    )
+    said = capsys.readouterr().out
+    assert "days with trouble: 35 of 40" in said
+    assert "and 5 more days with trouble, none with more; --out writes every bag" in said
+    assert said.count("-01-01") == 30
+
+
+def test_what_was_broken_is_said_and_not_all_that_is_assumed(design: Path, tmp_path: Path) -> None:
+    bags = named_bags([drive(tmp_path / "drive.mcap", samples=117)])
+    (row,) = monitor_fleet(
+        bags, design, documents.load_proved(design),
+        centre=Centre.COMMAND, definitions={}, workers=Workers(),
+    ).rows  # fmt: skip
+    assert row.verdict == "assumption violated"
+    assert row.reason.startswith(row.assumption.partition(" ...")[0])
+    assert not re.search(r"\d", row.assumption)
+
+
+def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
+    for k in range(2):
+        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, held=0.25)
+    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    assert status == 0
+    assert lines == [
+        "2 bags: 0 not read, 0 bad, 0 copies, 0 look, 2 good",
+        "no command moves in any bag that can be used: there is little to identify from",
+    ]
+
+
+def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -> None:
+    """The split of these names trials that are not here."""
+    drive(tmp_path / "bags" / "drive.mcap", samples=60)
+    (tmp_path / "bags" / "cut.mcap").write_bytes(b"no bag")
+    said = Console(file=io.StringIO(), width=80)
+    with pytest.raises(DataError, match="none of the bags is a test trial"):
+        fleet_cli.identify(
+            said, [tmp_path / "bags"], load_config(CONFIG), tmp_path / "out",
+            fleet_cli.Reading(Workers(), strict=False, patience=5.0),
+        )  # fmt: skip
+    lines = said.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0].startswith(
+        "2 bags: 1 used, 1 not read, 0 not usable, 0 copies; 0 of them known"
+    )
+    assert lines[1:3] == [
+        "left out, not read: 1 bag",
+        "  cut: is not an MCAP file: it starts with 6e 6f 20 62 61 67",
+    ]
 
 
 @pytest.mark.parametrize("verb", ["check", "monitor"])
@@ -273,7 +424,7 @@ def test_storage_that_fails_is_listed_once_and_the_rest_is_judged(
     with web_server(web, fault, bytes_per_s={"/slow.mcap": 2000.0}) as url:
         named = named_bags([Path(f"{url}/{file.name}") for file in web.iterdir()], patience=2.0)
         found: Sequence[Checked | Judged] = (
-            check_fleet(named, load_config(CONFIG), workers=Workers())
+            check_fleet(named, load_config(CONFIG), workers=Workers()).rows
             if verb == "check"
             else monitor_fleet(
                 named, design, documents.load_proved(design),

@@ -237,7 +237,8 @@ class Oracle:
         for i in range(self.m):
             gains = [bernstein([gain[i][j] for gain in K], s) for j in range(n)]
             u.append(bernstein([p[i] for p in u0], s) - dot(gains, e))
-        held = Fraction(0)
+        held, decay = Fraction(0), self.claim.get("decay")
+        own = 2 if decay else 0
         for place, (number, low, high) in enumerate(numbers(self.policy["limits"])):
             i, mode = int(number), piece["mode"][place]
             wanted = u[i]
@@ -246,7 +247,7 @@ class Oracle:
             else:
                 q = low - wanted if mode < 0 else wanted - high
                 u[i] = low if mode < 0 else high
-            tau = piece["tau"][place]
+            tau = piece["tau"][own + place]
             held += q * squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
         w = self.vertex(piece["vertex"])
         count = 1 if "kappa" in self.proof else 2 ** len(w)
@@ -255,20 +256,39 @@ class Oracle:
         Pe = [dot(row, e) for row in P]
         W, W_bend = dot(e, Pe), dot(e, [dot(row, e) for row in bend])
         growth = 2 * dot(Pe, [h * a - b for a, b in zip(f, motion, strict=True)]) + W_bend
+        if decay:
+            assert len(piece["tau"]) == 2 + len(self.policy["limits"])
+            assert "mu" not in piece
+            assert not {"margin", "multiplier"} & set(self.proof)
+            rate, floor = Fraction(decay["rate"]), Fraction(decay["floor"])
+            first, second = (
+                squares(self.proof["sides"], tau["columns"], tau["squares"], sigma, e)
+                for tau in piece["tau"][:2]
+            )
+            falls: Fraction = W * (rho1 - rho0) - rho * (growth + self.pushed(k, t0, Pe, u, w))
+            room = h * rate * rho * (floor * rho - W)
+            falls += room - first * (rho - W) - second * (W - floor * rho) - held
+            return falls
         mu = Fraction(0)
         lists = (piece["mu"][key] for key in ("shifts", "start", "end"))
         for row, shift, start, end in zip(self.proof["multiplier"], *lists, strict=True):
             mu += Fraction(2) ** shift * (start + (end - start) * sigma) * power(row, e)
-        pushed = Fraction(0)
+        pushed = self.pushed(k, t0, Pe, u, w)
+        margin = Fraction(self.proof["margin"])
+        total: Fraction = rho1 - rho0 - growth - margin * h * rho + mu * (rho - W) - held - pushed
+        return total
+
+    def pushed(self, k: int, t0: Fraction, Pe: list[Fraction], u: list[Fraction],
+               w: list[Fraction]) -> Fraction:  # fmt: skip
+        """Σ_j h r_j (κ_j (x̄'Pg_j)² + 1/κ_j), if the proof has kappa."""
+        total, h = Fraction(0), Fraction(self.funnel["t"][k + 1]) - t0
+        nowhere = [Fraction(0)] * self.n
         for j, kappa in enumerate(numbers(self.proof["kappa"][k]) if "kappa" in self.proof else []):
             low, high = numbers(self.field["uncertain"][j])
             one = [Fraction(int(i == j)) for i in range(len(w))]
-            zero = [Fraction(0)] * len(w)
-            still = self.rate(k, t0, nominal, u, zero)
-            g = [a - b for a, b in zip(self.rate(k, t0, nominal, u, one), still, strict=True)]
-            pushed += h * (high - low) / 2 * (kappa * dot(Pe, g) ** 2 + 1 / kappa)
-        margin = Fraction(self.proof["margin"])
-        total: Fraction = rho1 - rho0 - growth - margin * h * rho + mu * (rho - W) - held - pushed
+            still = self.rate(k, t0, nowhere, u, [Fraction(0)] * len(w))
+            g = [a - b for a, b in zip(self.rate(k, t0, nowhere, u, one), still, strict=True)]
+            total += h * (high - low) / 2 * (kappa * dot(Pe, g) ** 2 + 1 / kappa)
         return total
 
 
@@ -353,9 +373,12 @@ def makes_sense(oracle: "Oracle") -> bool:
         and len(limited) <= 3
         and len(set(limited)) == len(limited)
         and all(row[0] in range(m) and row[1] < row[2] for row in policy["limits"])
-        and set(claim) <= {"kind", "about", "goal", "hold", "error"}
+        and set(claim) <= {"kind", "about", "goal", "hold", "error", "decay"}
+        and 0 <= Fraction(claim.get("decay", {}).get("floor", 0)) < 1
+        and Fraction(claim.get("decay", {}).get("rate", 1)) > 0
+        and set(claim.get("decay", {"rate", "floor"})) == {"rate", "floor"}
         and (("kappa" not in proof) or (alone and w > 0))
-        and Fraction(proof["margin"]) > 0
+        and ("decay" in claim or Fraction(proof["margin"]) > 0)
         and ("hold" not in claim or claim["hold"] > 0)
         and min(claim.get("error", [0])) >= 0
         and (affine or not {"hold", "error"} & set(claim))

@@ -103,7 +103,13 @@ def random_claim(rng: np.random.Generator) -> Files:
         proof["kappa"] = rng.uniform(0.5, 2, (intervals, n_w)).tolist()
     modes = list(product((-1, 0, 1), repeat=limited))
     claimed = random_hold(rng, files=(field, policy), proof=proof)
-    held = 2**m if claimed else 1
+    moved = bool(claimed)
+    if rng.uniform() < 0.4:
+        floor = float(rng.choice([0.0, rng.uniform(0, 1)]))
+        claimed["decay"] = {"rate": abs(number(rng)) + 0.1, "floor": floor}
+        proof["sides"] = first
+        del proof["margin"], proof["multiplier"]
+    held = 2**m if moved else 1
     vertices = held if pushed else held * 2**n_w
     for k, mode, vertex in product(range(intervals), modes, range(vertices)):
         level = int(rng.integers(0, 2))
@@ -116,7 +122,8 @@ def random_claim(rng: np.random.Generator) -> Files:
         for k, mode, v, i, sign in product(range(intervals), modes, range(counts), range(m),
                                            (-1, 1)):  # fmt: skip
             if i >= limited or not mode[i]:
-                piece = random_piece(rng, proof, k, v, 0, 0, (0, *mode))
+                rated = proof | {"multiplier": []}
+                piece = random_piece(rng, rated, k, v, 0, 0, (0, *mode))
                 del piece["mu"]
                 piece |= {"input": i, "sign": sign, "mode": list(mode)}
                 if not mode:
@@ -160,18 +167,22 @@ def random_piece(
     mode: tuple[int, ...],
 ) -> Any:  # fmt: skip
     """A piece with random multipliers."""
-    size, count = len(proof["basis"]), len(proof["multiplier"])
+    size, count = len(proof["basis"]), len(proof.get("multiplier", []))
+    shell = 0 if "multiplier" in proof else 2
     mu = {"shifts": rng.integers(-9, 3, count), "start": rng.integers(-99, 100, count),
           "end": rng.integers(-99, 100, count)}  # fmt: skip
     squares = [
         {"columns": rng.integers(-3, 4, size).tolist(),
          "squares": {"unit": int(rng.integers(0, 9)),
                      "factors": rng.integers(-9, 10, (j + 1, 2, size)).tolist()}}
-        for j in range(1 + len(mode))
+        for j in range(1 + shell + len(mode))
     ]  # fmt: skip
     piece = {"interval": k, "vertex": vertex, "level": level, "index": index,
              "mu": {key: row.tolist() for key, row in mu.items()}, **squares[0]}  # fmt: skip
-    return piece | ({"mode": list(mode), "tau": squares[1:]} if mode else {})
+    if shell:
+        del piece["mu"]
+    piece |= {"mode": list(mode)} if mode else {}
+    return piece | ({"tau": squares[1:]} if mode or shell else {})
 
 
 def value(c: Polynomial, ring: Ring, s: Fraction, x: list[Fraction]) -> Fraction:
@@ -208,7 +219,9 @@ def test_the_kernel_rebuilds_exactly_what_the_page_says(
     verdict = proofs.decide(files[PROOF], files)
     proof = files[PROOF]["proof"]
     oracle = Oracle(files[FIELD], files[POLICY], files[FUNNEL], proof, files[PROOF]["claim"])
-    assert verdict.margin == Fraction(proof["margin"])
+    decay = files[PROOF]["claim"].get("decay")
+    stated = decay and Fraction(decay["rate"]) * (1 - Fraction(decay["floor"]))
+    assert verdict.margin == (stated or Fraction(proof["margin"]))
     pieces = [(oracle.c, piece) for piece in proof["pieces"]]
     pieces += [(oracle.rate_left, piece) for piece in proof.get("rate_pieces", [])]
     for (c, ring), (claimed, piece) in zip(seen, pieces, strict=True):

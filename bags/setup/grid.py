@@ -1,0 +1,186 @@
+"""The grid of a proposed configuration, from the responses' steps and the commands' ages."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.signal import welch
+
+from bags.recordings.definitions import Definition
+from bags.setup.proposal import Proposal, Signal
+from bags.signals.expressions import factors
+from bags.signals.reader import HEADER_STAMP, LOG_TIME, Samples, read_signals
+from bags.signals.timing import held
+from nlsid_core.errors import BagError
+from nlsid_core.running.grid import TOLERANCE
+
+ON_GRID: Final = 0.95  # of the steps near the period: samples are used as they come
+ROUND: Final = 0.002  # relative: a period this near a round number is that number
+FEW_GAPS: Final = 5.0  # periods: gaps up to here are filled in, longer ones cut out
+DYNAMICS: Final = 40.0  # samples in a period of the fastest motion that are enough
+LONG_HELD: Final = 20.0  # periods a command is held: lost ones are then noticed late
+
+
+@dataclass(frozen=True)
+class Paces:
+    """What the chosen signals of all bags show: the responses' steps, the commands' ages.
+
+    longest_tail: s of responses after the last command, where those have come to an end and the
+    last is not held.
+    """
+
+    period: float
+    on_grid: float
+    repeated: int
+    longest_gap: float
+    band: float
+    command_period: float
+    longest_held: float
+    longest_tail: float
+    u_ranges: tuple[tuple[float, float], ...]
+    topics: int
+
+
+def read_paces(
+    bags: Sequence[Path],
+    chosen: Mapping[str, Sequence[Signal]],
+    clock: str,
+    types: Mapping[str, Definition] | None,
+) -> Paces:
+    """The paces of the chosen signals over all bags; BagError where a period cannot be said."""
+    y_paths = [signal.path for signal in chosen["response"]]
+    drives = [factors(signal.path) for signal in chosen["excitation"]]
+    u_paths = list(dict.fromkeys(part for parts in drives for part in parts))
+    steps, commanded, bands, ranges, u_steps = [], [], [], [], []
+    repeated = 0
+    for path in bags:
+        read = read_signals(
+            path, [*y_paths, *u_paths], clock=HEADER_STAMP if clock == "header" else LOG_TIME,
+            sort=True, gaps_in=y_paths, definitions=types,
+        )  # fmt: skip
+        for name in y_paths:
+            diffs = np.diff(read[name].stamp_ns) / 1e9
+            repeated += int((diffs <= 0).sum())
+            steps.append(diffs[diffs > 0])
+            bands.append(_band(read[name]))
+        last = max(int(read[name].stamp_ns[-1]) for name in y_paths)
+        for name in u_paths:
+            stamps = read[name].stamp_ns
+            commanded.append(held(stamps, last))
+            u_steps.append(np.diff(stamps) / 1e9)
+        ranges.append([_range([read[name] for name in parts]) for parts in drives])
+    every, u_every = np.concatenate(steps), np.concatenate(u_steps)
+    if not len(every):
+        raise BagError(f"{y_paths[0]} has one sample a bag; a period needs two")
+    median = float(np.median(every))
+    near = np.abs(every / median - np.rint(every / median)) <= TOLERANCE
+    lows, highs = np.array(ranges).min(axis=0)[:, 0], np.array(ranges).max(axis=0)[:, 1]
+    return Paces(
+        period=_round(median),
+        on_grid=float(near.mean()),
+        repeated=repeated,
+        longest_gap=float(every.max()),
+        band=float(np.median([b for b in bands if b > 0] or [0.0])),
+        command_period=float(np.median(u_every)) if len(u_every) else math.inf,
+        longest_held=max(each.longest for each in commanded),
+        longest_tail=max(each.tail for each in commanded),
+        u_ranges=tuple(zip(lows.tolist(), highs.tolist(), strict=True)),
+        topics=len({name.partition(":")[0] for name in y_paths}),
+    )
+
+
+def _range(parts: Sequence[Samples]) -> tuple[float, float]:
+    """The least and the greatest that a product of signals can be."""
+    low, high = 1.0, 1.0
+    for part in parts:
+        ends = [x * y for x in (low, high) for y in (part.values.min(), part.values.max())]
+        low, high = float(min(ends)), float(max(ends))
+    return low, high
+
+
+def _band(samples: Samples) -> float:
+    """Hz below which a response has 99 % of its power; 0 if it cannot be said."""
+    steps = np.diff(samples.stamp_ns) / 1e9
+    if len(samples) < 64 or not (steps > 0).any() or not np.ptp(samples.values) > 0:
+        return 0.0
+    rate = 1.0 / float(np.median(steps[steps > 0]))
+    x = samples.values - samples.values.mean()
+    f, power = welch(x, fs=rate, nperseg=min(len(x), 4096))
+    return float(f[np.searchsorted(np.cumsum(power) / power.sum(), 0.99)])
+
+
+def _round(period: float) -> float:
+    """A round rate or period if one is near: 0.025 of 0.02498."""
+    for round_one in (
+        1.0 / max(round(1.0 / period), 1),
+        float(f"{period:.1g}"),
+        float(f"{period:.2g}"),
+    ):
+        if abs(round_one / period - 1.0) <= ROUND:
+            return float(f"{round_one:.6g}")
+    return float(f"{period:.4g}")
+
+
+def _up(value: float) -> float:
+    """The next number of two digits."""
+    digits = 1 - math.floor(math.log10(value))
+    return float(f"{math.ceil(value * 10**digits - 1e-9) / 10**digits:.2g}")
+
+
+def say_grid(proposal: Proposal, read: Paces) -> None:
+    """Period, resampling, gaps and holding of the configuration, and what follows from them."""
+    grid: dict[str, Any] = {"period": read.period}
+    why, walls = proposal.why, proposal.walls
+    why["period"] = f"the response's median step; {100 * read.on_grid:.0f} % of steps are near it"
+    regular = read.on_grid >= ON_GRID and read.topics == 1 and not read.repeated
+    factor = 1
+    if read.band > 0:
+        factor = max(int(1.0 / (DYNAMICS * read.band) / read.period), 1)
+    if factor > 1:
+        grid["period"] = float(f"{factor * read.period:.4g}")
+        why["period"] = (
+            f"{factor} times {read.period:g} s: 99 % of the response's power is below "
+            f"{read.band:.3g} Hz"
+        )
+        regular = False
+    if not regular:
+        grid["resample"] = "last" if factor > 1 and read.on_grid >= ON_GRID else "linear"
+        why["resample"] = (
+            "fewer samples than are recorded" if factor > 1
+            else "responses come from several topics" if read.topics > 1
+            else f"only {100 * read.on_grid:.0f} % of steps are near the period"
+        )  # fmt: skip
+    most = FEW_GAPS * read.period
+    grid["max_gap"] = _up(max(min(1.2 * read.longest_gap, most), 2.0 * grid["period"]))
+    why["max_gap"] = f"the longest step of a response is {read.longest_gap:.3g} s"
+    if read.longest_gap > grid["max_gap"]:
+        grid["split_gaps"] = True
+        why["split_gaps"] = "longer gaps end a trial and begin the next"
+        walls.append(
+            f"a response is missing for up to {read.longest_gap:.3g} s: trials are cut there, and "
+            "a monitor says unknown from there on"
+        )
+    if read.longest_held > grid["max_gap"]:
+        grid["hold"] = _up(1.1 * read.longest_held)
+        why["hold"] = f"one was held for {read.longest_held:.3g} s in these bags"
+        if read.longest_held > LONG_HELD * min(read.command_period, 1.0):
+            walls.append(
+                f"commands are held for up to {read.longest_held:.3g} s: a lost one is not noticed "
+                "before"
+            )
+    if read.longest_tail > grid.get("hold", grid["max_gap"]):
+        grid["split_gaps"] = True
+        why.setdefault("split_gaps", "what comes after the last command is not fitted")
+        walls.append(
+            f"commands end up to {read.longest_tail:.3g} s before the responses do: what the robot "
+            "does there is not fitted, as nothing says what it was told"
+        )
+    proposal.content["grid"] = grid
+    if read.repeated:
+        walls.append(
+            f"{read.repeated} stamps of the response repeat the one before, which identification "
+            "refuses; is the topic published twice?"
+        )

@@ -1,0 +1,331 @@
+"""From chosen signals to a whole configuration that the later steps take: each value with a reason.
+
+What is proposed is tried: the bags are read with it as identification reads them, and what is
+refused there is changed (gaps cut out, responses resampled) or said.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from bags.chain.steps import Trials, read_trials
+from bags.recordings.bag import Bag
+from bags.recordings.definitions import Definition
+from bags.recordings.folders import trial_name
+from bags.recordings.message_types import is_stamped, standard_types
+from bags.setup.candidates import Found, slope_window
+from bags.setup.grid import read_paces, say_grid
+from bags.setup.orders import followed, say_degree, say_lags
+from bags.setup.proposal import POOR, Proposal, Signal
+from bags.signals.columns import read_columns
+from bags.signals.delays import RELATED
+from bags.signals.expressions import Expression, factors, parse_factors
+from bags.signals.repeats import same_excitation
+from bags.signals.signal import SignalPath
+from nlsid_core.data.trajectory import Dataset, Trajectory
+from nlsid_core.errors import BagError, DataError
+from nlsid_core.progress import silent
+
+TEST_EVERY: Final = 5  # bags: every fifth only scores
+SHARE: Final = 0.25  # of every bag that only scores where there are few
+SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
+SIMULATED: Final = "/clock"
+ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
+
+
+def choose(
+    found: Found, responses: Sequence[str] = (), excitations: Sequence[str] = ()
+) -> tuple[list[str], list[str]]:
+    """The signals that were named, and for a side that was not the best that goes with the other.
+
+    Raises BagError if nothing goes with anything.
+    """
+    if responses and excitations:
+        return list(responses), list(excitations)
+    best = []
+    for response in responses or [""]:
+        pairs = [
+            pair
+            for pair in found.pairs
+            if (not response or _same(pair.response.text, response))
+            and (not excitations or _same(pair.command.text, excitations[0]))
+            and (pair.score > 0.0 or response or excitations)
+        ]
+        if not pairs:
+            what = f"{response} follows no command" if response else "no number follows another"
+            still = f"; always the same: {', '.join(found.still)}" if found.still else ""
+            raise BagError(
+                f"{what}; name them with --excitation and --response (nlsid bag signals lists what "
+                f"there is){still}"
+            )
+        best.append(pairs[0])
+    commands = dict.fromkeys(pair.command.text for pair in best)
+    return list(responses) or [best[0].response.text], list(excitations) or list(commands)
+
+
+def propose(
+    bags: Sequence[Path],
+    found: Found,
+    *,
+    responses: Sequence[str],
+    excitations: Sequence[str],
+    robot: str,
+    definitions: Sequence[Path] = (),
+    types: Mapping[str, Definition] | None = None,
+    widen: bool = False,
+) -> Proposal:
+    """A configuration of these signals for these bags, tried on them.
+
+    widen: where models of one excitation are poor, take those too that the response follows
+    besides, if that is better. Raises BagError and DataError if the bags cannot be read as any
+    configuration says.
+    """
+    texts = [*responses, *excitations]
+    if twice := next((text for text in texts if texts.count(text) > 1), None):
+        raise BagError(f"{twice} is named twice")
+    signals = _named_apart([_signal(found, text) for text in texts])
+    chosen = {"response": signals[: len(responses)], "excitation": signals[len(responses) :]}
+    proposal = Proposal({"robot": robot})
+    _say_signals(proposal, chosen, found)
+    if all(any(_unwrapped(s.path) for s in signals) for signals in chosen.values()):
+        proposal.walls.append(
+            "an angle drives and an angle answers: if a trial begins near half a turn, they may "
+            "begin a whole turn apart; leave such trials out, or take |derivative of both"
+        )
+    if definitions:
+        proposal.content["definitions"] = [str(path) for path in definitions]
+    with Bag(bags[0], definitions=types) as bag:
+        _say_clock(proposal, chosen, bag)
+    read = read_paces(bags, chosen, proposal.content["clock"], types)
+    say_grid(proposal, read)
+    _say_split(proposal, bags)
+    linear = len(responses) == len(excitations) == 1
+    section: dict[str, Any] = {"model": "linear", "lags": 4}
+    if not linear:
+        ranges = [[float(f"{low:.4g}"), float(f"{high:.4g}")] for low, high in read.u_ranges]
+        section = {"model": "state_affine", "lags": 2, "input_range": ranges}
+        proposal.why["input_range"] = "of each excitation in these bags; inputs are clipped to it"
+    if len(responses) > 1:
+        section["method"] = "sem_certified"
+        proposal.why["method"] = "steps among stable models, the quickest for several responses"
+    proposal.content["identification"] = section
+    trials = _tried(proposal, bags, definitions)
+    proposal.walls += trials.apart
+    if _say_motions(proposal, trials.every):
+        trials = _tried(proposal, bags, definitions)
+    if linear:
+        say_lags(proposal, trials.train, found)
+    else:
+        say_degree(proposal, trials.train)
+    _say_funnel(proposal)
+    others = [pair.command.text for pair in followed(proposal, found)]
+    if not (widen and proposal.error > POOR and others):
+        return proposal
+    wider = propose(
+        bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
+        definitions=definitions, types=types,
+    )  # fmt: skip
+    if not wider.error < proposal.error:
+        return proposal
+    without = f"; without it models are off by {proposal.error:.3g} %"
+    wider.why |= {text: wider.why[text] + without for text in others}
+    return wider
+
+
+def _unwrapped(text: str) -> bool:
+    """Whether it is an angle that goes on over a turn."""
+    return "|unwrap" in text and "|derivative" not in text
+
+
+def _same(candidate: str, named: str) -> bool:
+    return candidate == named or candidate.partition("|")[0] == named
+
+
+def _signal(found: Found, text: str) -> Signal:
+    known = next((c for c in found.candidates if c.text == text), None)
+    known = known or next((c for c in found.candidates if _same(c.text, text)), None)
+    if known is None:
+        path = text.partition("|")[0]
+        numbers = (
+            c for c in found.candidates if _same(c.text, path) and "|derivative" not in c.text
+        )
+        recorded = None if len(factors(text)) > 1 else next((c.unit for c in numbers), None)
+        unit = "" if recorded is None else Expression.parse(text).unit_of(recorded)
+        return Signal(_name(text), unit.partition(" or ")[0], text, "named by you")
+    unit = known.unit.partition(" or ")[0]
+    why = f"{known.low:.4g} to {known.high:.4g} {unit}".strip()
+    return Signal(_name(text), unit, text, f"{why} at {known.rate:.4g} Hz; {known.why}")
+
+
+def _named_apart(signals: Sequence[Signal]) -> list[Signal]:
+    """With a number behind a name that an earlier signal has."""
+    names = [signal.name for signal in signals]
+    counts = [names[: k + 1].count(name) for k, name in enumerate(names)]
+    return [
+        replace(signal, name=f"{signal.name} {count}") if count > 1 else signal
+        for signal, count in zip(signals, counts, strict=True)
+    ]
+
+
+def _name(text: str) -> str:
+    """A name for people: the joint or the last words of the path, and what is done to it."""
+    if len(parts := factors(text)) > 1:
+        return " times ".join(map(_name, parts))
+    path, *operations = text.split("|")
+    topic, _, fields = path.partition(":")
+    steps = [
+        step for step in fields.split(".") if step not in ("twist", "pose", "data", "transform")
+    ]
+    words = " ".join(steps[-2:])
+    words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
+    rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
+    return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
+
+
+def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], found: Found) -> None:
+    proposal.content["signals"] = {
+        role: [{"name": s.name, "unit": s.unit, "path": s.path} for s in signals]
+        for role, signals in chosen.items()
+    }
+    for signals in chosen.values():
+        for signal in signals:
+            proposal.why[signal.path] = signal.why
+    for y in chosen["response"]:
+        pairs = [p for p in found.best_for(y.path)
+                 if p.command.text in {u.path for u in chosen["excitation"]}]  # fmt: skip
+        if pairs:
+            best = pairs[0]
+            proposal.why[y.path] += f"; follows {best.command.text}: {best}"
+            if abs(best.correlation) < RELATED:
+                proposal.walls.append(
+                    f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
+                )
+            if best.response.is_position and not best.command.is_position:
+                proposal.walls.append(
+                    f"{y.path} is a position: if it adds up its command for ever, it is in no "
+                    f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"
+                )
+
+
+def _say_clock(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], bag: Bag) -> None:
+    unstamped: dict[str, str] = {}
+    for signals in chosen.values():
+        for expression in (e for signal in signals for e in parse_factors(signal.path)):
+            msgtype, types = bag.types_on(expression.path.topic)
+            expression.path.check(msgtype, types)
+            named = f"{expression.path.topic} ({msgtype})"
+            if not is_stamped(msgtype, types) and msgtype != "tf2_msgs/msg/TFMessage":
+                unstamped[named] = "has no header stamp"
+            elif _stamps_are_zero(bag, expression.path):
+                unstamped[named] = "has header stamps that are all 0"
+            if msgtype not in standard_types().fielddefs:
+                proposal.walls.append(
+                    f"{expression.path.topic} is of type {msgtype}: live, its package has to be "
+                    "installed beside the nodes"
+                )
+    proposal.content["clock"] = "log" if unstamped else "header"
+    if unstamped:
+        said = ", ".join(f"{name} {why}" for name, why in unstamped.items())
+        proposal.why["clock"] = said
+        proposal.walls.append(
+            f"{said}: samples are paired by the times of logging, live of "
+            "arrival, whose jitter becomes part of the model's error"
+        )
+        pace = _pace(bag)
+        if abs(pace - 1.0) > ONE_PACE:
+            proposal.walls.append(
+                f"simulated time on {SIMULATED} runs at {pace:.3g} times the pace of the times of "
+                "logging: the model is one by the wall's clock, and a live monitor with "
+                "use_sim_time goes by the simulated one; record with `ros2 bag record "
+                "--use-sim-time`, or give commands a header"
+            )
+
+
+def _stamps_are_zero(bag: Bag, path: SignalPath) -> bool:
+    """Whether the publisher of a signal does not fill its header stamps in."""
+    stamps = read_columns(bag, {str(path): path})[path.topic].stamp_ns
+    return stamps is not None and len(stamps) > 0 and not stamps.any()
+
+
+def _pace(bag: Bag) -> float:
+    """Simulated seconds in one of the times of logging; 1 without simulated time."""
+    if SIMULATED not in bag.topics:
+        return 1.0
+    paths = {part: SignalPath.parse(f"{SIMULATED}:clock.{part}") for part in ("sec", "nanosec")}
+    with suppress(BagError):  # of another type
+        columns = read_columns(bag, paths)[SIMULATED]
+        simulated = columns.values["sec"] + 1e-9 * columns.values["nanosec"]
+        logged = (columns.log_ns - columns.log_ns[:1]) / 1e9
+        if len(columns) > 1 and logged[-1] > 0.0:
+            return float((simulated[-1] - simulated[0]) / logged[-1])
+    return 1.0
+
+
+def _say_split(proposal: Proposal, bags: Sequence[Path]) -> None:
+    names = sorted(map(trial_name, bags))
+    if len(names) >= TEST_EVERY:
+        proposal.content["split"] = {"test": names[TEST_EVERY - 1 :: TEST_EVERY]}
+        proposal.why["test"] = f"every {TEST_EVERY}th of {len(names)} bags, by name"
+    elif len(names) > 1:
+        proposal.content["split"] = {"test": names[-1:]}
+        proposal.why["test"] = f"the last of {len(names)} bags"
+    else:
+        proposal.content["split"] = {"share": SHARE}
+        proposal.why["share"] = "there is one bag: its end scores what its beginning taught"
+        proposal.walls.append(
+            "one bag: a tube is designed on one trial and its level measured on another; record "
+            "more, or cut it: nlsid bag split BAG --out PART --every 5"
+        )
+
+
+def _say_motions(proposal: Proposal, trials: Dataset) -> bool:
+    """Spread repeated motions over training, calibration and test; whether there are any.
+
+    Bags by name often come motion after motion, or in turn: every fifth may be of one motion only.
+    """
+    motions: list[list[Trajectory]] = []
+    for trial in trials:
+        known = next((m for m in motions if same_excitation(m[0].u[:, 0], trial.u[:, 0])), None)
+        if known is None:
+            motions.append([trial])
+        else:
+            known.append(trial)
+    repeats = min(map(len, motions))
+    if proposal.content["split"].get("share") or repeats < TEST_EVERY:
+        return False
+    names = [trial.name for motion in motions for trial in motion]
+    tests, scales = names[TEST_EVERY - 1 :: TEST_EVERY], names[TEST_EVERY // 2 :: TEST_EVERY]
+    proposal.content["split"] = {"test": sorted(tests), "calibration": sorted(scales)}
+    what = f"{len(motions)} motions, each recorded {repeats} times or more"
+    proposal.why["test"] = f"{what}: every {TEST_EVERY}th of each"
+    proposal.why["calibration"] = f"{what}: another {TEST_EVERY}th sets the tube's level"
+    return True
+
+
+def _tried(proposal: Proposal, bags: Sequence[Path], definitions: Sequence[Path]) -> Trials:
+    """The trials as identification reads them; what it refuses is changed as it says."""
+    grid = proposal.content["grid"]
+    changes: list[tuple[str, Any, str]] = [
+        ("resample", "linear", "off a grid"),
+        ("split_gaps", True, "split_gaps"),
+        ("resample", "linear", "one stamp each sample"),
+    ]
+    while True:
+        try:
+            return read_trials(bags, proposal.config(definitions), progress=silent)
+        except DataError as error:
+            change = next(
+                (c for c in changes if c[2] in str(error) and grid.get(c[0]) != c[1]), None
+            )
+            if change is None:
+                raise
+            key, value, _ = change
+            grid[key] = value
+            proposal.why[key] = f"without it: {error}"[:120].rpartition(" ")[0]
+
+
+def _say_funnel(proposal: Proposal) -> None:
+    proposal.content["funnel"] = {"safety_factor": SAFETY}
+    proposal.why["safety_factor"] = "a wider tube raises fewer false alarms and catches less"
