@@ -612,10 +612,8 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     if "kappa" in proof:
         for row in matrix(proof["kappa"], "kappa", intervals, uncertain):
             need(min(row) > 0, "kappa > 0")
-    sizes = [
-        basis(proof["basis"], "basis", n),
-        len(monomials(proof["multiplier"], "multiplier", n)),
-    ]
+    terms = len(monomials(proof["multiplier"], "multiplier", n))
+    sizes = basis(proof["basis"], "basis", n), terms
     sides = basis(proof["sides"], "sides", n) if limits or held else 0
     modes = " mode tau" * (limits > 0)
     corners = 2**m if held or any(errors) else 1
@@ -645,9 +643,8 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
                 else:
                     wide(entry, name)
     if held:
-        need(
-            min(map(min, matrix(proof["rates"], "rates", intervals, m)), default=1) > 0, "rates > 0"
-        )
+        rates = matrix(proof["rates"], "rates", intervals, m)
+        need(all(rate > 0 for row in rates for rate in row), "rates > 0")
         for piece in listed(proof["rate_pieces"], "rate_pieces", 1, PIECES):
             names = "interval vertex level index columns squares input sign tau"
             members(piece, "rate piece", names + " mode" * (limits > 0))

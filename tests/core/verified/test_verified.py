@@ -288,6 +288,15 @@ WINDOW = "sha256:" + "0" * 63
 ASSUMED = "funnel.json tubes 0 assumption"
 
 
+def wide_window(files: Files) -> None:
+    """Four entries, and a monomial of degree 20 in each."""
+    model = files["model.json"]
+    model["window"] = [[0, 0], [0, 1], [0, 0], [0, 1]]
+    for table in (*model["G"], model["p"]):
+        table["exponents"] = [[*row, 0, 0] for row in table["exponents"]]
+    model["p"]["exponents"][0] = [20, 20, 20, 20]
+
+
 @pytest.mark.parametrize(
     ("name", "forge", "said"),
     [
@@ -347,6 +356,11 @@ ASSUMED = "funnel.json tubes 0 assumption"
         ("peak", at("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
         ("peak", at("claim.proof.json version", 2.0), "not of version 2"),
         ("peak", at("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
+        ("peak", at("claim.proof.json proof steps 0 tube squares scale", 1.0), "is allowed"),
+        ("lasting_split", at("funnel.json tubes 0 follows", {
+            "terms": [{"inputs": ["0"], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.5}],
+            "weights": [[1.0]]}), "0 to 0 is allowed"),
+        ("lasting_split", wide_window, "a degree above 63"),
         ("lasting_split", at("model.json p", {"exponents": [], "coefficients": []}),
          "p has no monomials"),
     ],
@@ -400,7 +414,7 @@ def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> Non
 @needs_coq
 @pytest.mark.coq
 def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path) -> None:
-    found = mutated(400, tmp_path / "mutant", program.parent / "second")
+    found = mutated(600, tmp_path / "mutant", program.parent / "second")
     assert found["differ"] == {}
     kinds = ("tube", "stability", "continuous_funnel", "sampled_funnel", "funnel_composition")
     for kind in kinds:
