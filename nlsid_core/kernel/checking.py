@@ -15,6 +15,8 @@ from .files import MAX_TOTAL, Node, Read, Rejected, digest, parse, plain, read_r
 # Each claim is a module of this package with a function `decide(claim, proof, read) -> Decision`.
 KINDS = (
     "stability",
+    "dissipation",
+    "small_gain",
     "tube",
     "stable_set",
     "sampled_funnel",

@@ -6,13 +6,18 @@ an equation,
 plus multiples of [1, 0] where the form has a ray. θ is what is not known: the input where the model
 is affine in its outputs, the slope of a nonlinearity elsewhere. A quadratic form that is positive
 at each of the matrices is so at every E(θ). docs/certificate_stability.md has the forms and why.
+
+Driven, the two solutions have inputs of their own: x̄ has the past inputs that the model remembers
+too, w̄ is the difference of the present ones, and its columns are the last of E, F and H.
+docs/certificate_dissipation.md.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise, product
 from math import comb, prod
+from typing import Any
 
 from . import text
 from .exact import MAX_ORDER, Matrix, combined, definite, transposed
@@ -33,6 +38,7 @@ MAX_SPLITS = 40  # of one box, one inside the other
 
 Box = list[tuple[Fraction, Fraction]]
 Terms = list[tuple[list[int], list[list[Fraction]]]]  # of a matrix polynomial: powers, coefficients
+Polynomial = list[tuple[tuple[int, ...], Fraction]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,8 @@ class Model:
     F: (n, m + n), H: (p, m + n) for m quantities ν. vertices: matrices E, each (m, m + n), whose
     convex hull holds E(θ) for θ in a box inside `box`, perhaps by stated ends. ray: E(θ) may have
     any multiple of [1, 0] added. inputs: for which inputs this is so, in words. whole: so many
-    entries of the box, the first, cannot be split.
+    entries of the box, the first, cannot be split. driven: so many columns more, those of w̄.
+    limits: none, `clip` or `refuse`, what the model does with inputs beyond its range.
     """
 
     period: Fraction
@@ -67,6 +74,8 @@ class Model:
     linear: Linear | None = None
     effort: int = 0  # of finding the vertices, in products
     whole: int = 0
+    driven: int = 0
+    limits: str = ""
 
     @property
     def states(self) -> int:
@@ -76,7 +85,7 @@ class Model:
     @property
     def unknowns(self) -> int:
         """m."""
-        return len(self.F[0]) - len(self.F)
+        return len(self.F[0]) - len(self.F) - self.driven
 
 
 def positive(
@@ -153,19 +162,22 @@ def _leaves(node: Node, box: Box, whole: int, depth: int) -> Iterator[tuple[Box,
         yield from _leaves(part, [*box[:i], half, *box[i + 1 :]], whole, depth + 1)
 
 
-def read_model(node: Node, bounds: Node | None = None) -> Model:
-    """The increment form of a model file's content.
+def read_model(node: Node, bounds: Node | None = None, *, driven: bool = False) -> Model:
+    """The increment form of a model file's content, of one input or, driven, of two.
 
-    bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form.
+    bounds: {y, u}, of the outputs and inputs of an implicit model that has no global form; {y} of a
+    driven state-affine one whose factors of the outputs depend on the inputs.
     """
     kind = node.kind()
     if kind not in (*_READERS, "implicit"):
         known = ", ".join([*_READERS, "implicit"])
         raise Rejected(f"{node.where}: kind is {kind!r}; known: {known}")
     if kind == "implicit":
-        model = _implicit(node, bounds)
+        model = _implicit(node, bounds, driven)
+    elif kind == "state_affine" and driven:
+        model = _state_affine(node, driven, bounds)
     elif bounds is None:
-        model = _READERS[kind](node)
+        model = _READERS[kind](node, driven)
     else:
         raise Rejected(f"a model of kind {kind} needs no box: its increments are known everywhere")
     if not 0 < model.states <= MAX_STATES:
@@ -173,7 +185,7 @@ def read_model(node: Node, bounds: Node | None = None) -> Model:
     return model
 
 
-def _difference_equation(node: Node) -> Model:
+def _difference_equation(node: Node, driven: bool) -> Model:
     """ŷ = x_1 + b_0 u + c, x⁺ = a ŷ + shift(x) + b_1..n u: no ν, F = A, H = [1, 0 ...]."""
     parts = _members(node, "y u a b c u_range")
     a = parts["a"].array(None)
@@ -184,18 +196,21 @@ def _difference_equation(node: Node) -> Model:
     if low > high:
         raise Rejected(f"{node.where} u_range is empty")
     A = [[a[i] if j == 0 else Fraction(int(j == i + 1)) for j in range(n)] for i in range(n)]
-    return Model(
+    B = [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)]
+    model = Model(
         _period(parts), (read_signal(parts["y"]),), (read_signal(parts["u"]),),
         A, [_unit(0, n)], "for every input", [], lambda _, __: [],
-        linear=Linear(
-            [b_i + a_i * direct for a_i, b_i in zip(a, b, strict=True)],
-            direct, [a_i * c for a_i in a], (low, high),
-        ),
+        linear=Linear(B, direct, [a_i * c for a_i in a], (low, high)),
     )  # fmt: skip
+    return _driven(model, [(0, 0)], [[b_i] for b_i in B], [[direct]]) if driven else model
 
 
-def _state_affine(node: Node) -> Model:
-    """0 = Σ_k G_k(w) ȳ(t-k) + p(w): x stacks ȳ(t-1) … ȳ(t-n), ν = ȳ(t), E = [G_0 … G_n](w)."""
+def _state_affine(node: Node, driven: bool, bounds: Node | None) -> Model:
+    """0 = Σ_k G_k(w) ȳ(t-k) + p(w): x stacks ȳ(t-1) … ȳ(t-n), ν = ȳ(t), E = [G_0 … G_n](w).
+
+    Driven, E is the mean of the equation's derivatives between two (ȳ, w), with ȳ in a box where
+    they depend on it.
+    """
     parts = _members(
         node,
         "y u window G p y_offset y_scale u_offset u_scale u_range on_out_of_range",
@@ -205,8 +220,7 @@ def _state_affine(node: Node) -> Model:
     window = parts["window"].wholes(None, 2)
     size = _size(p * (len(parts["G"].items(2)) - 1), parts["G"])
     G = [_polynomials(entry, len(window), p, p) for entry in parts["G"].items()]
-    whole = _side_by_side(G, p)
-    _polynomials(parts["p"], len(window), p)
+    drive: Any = _polynomials(parts["p"], len(window), p)  # of vectors
     parts["y_offset"].array(p)
     y_scale, u_scale = parts["y_scale"].array(p), parts["u_scale"].array(n_u)
     ranges, offsets = parts["u_range"].array(n_u, 2), parts["u_offset"].array(n_u)
@@ -217,16 +231,54 @@ def _state_affine(node: Node) -> Model:
     box = [tuple((end - offsets[i]) / u_scale[i] for end in ranges[i]) for i, _ in window]
     F = [_unit(i, p + size) for i in range(size)]  # x⁺ = [ν; all but the oldest of x]
     H = [[y_scale[i] * entry for entry in _unit(i, p + size)] for i in range(p)]
-    return Model(
-        _period(parts), y, u, F, H,
-        _inputs_in_range(parts["on_out_of_range"].text(), u, ranges),
-        [(low, high) for low, high in box],
-        lambda part, ends: _bernstein(whole, part) if ends is None else _between(G, part, ends),
-        effort=_effort(whole, [(low, high) for low, high in box]),
+    limits = parts["on_out_of_range"].text()
+    inputs = _inputs_in_range(limits, u, ranges)
+    if driven:
+        reach = None if bounds is None else bounds.members("y")["y"].array(p, 2)
+        if reach is not None and any(low >= high for low, high in reach):
+            raise Rejected(f"{node.where}: a range of the box is empty")
+        E = _with_inputs(G, drive, [u_scale[i] for i, _ in window])
+        if any(any(e[: p + size]) for e, _ in E) != (reach is not None):
+            raise Rejected(
+                f"{node.where}: for two inputs it needs a box of its outputs where the factors of "
+                "its outputs depend on its inputs, and none elsewhere"
+            )
+        if reach is None:
+            E = [(e[p + size :], block) for e, block in E]
+        else:
+            of = zip(reach, parts["y_offset"].array(p), y_scale, strict=True)
+            box = [tuple((end - o) / by for end in row) for row, o, by in of] * len(G) + box
+    else:
+        E = _side_by_side(G, p)
+
+    def vertices(part: Box, ends: Node | None) -> list[Matrix]:
+        if ends is not None and driven:
+            raise Rejected(f"{ends.where}: ends are for two solutions under one input")
+        return _bernstein(E, part) if ends is None else _between(G, part, ends)
+
+    model = Model(
+        _period(parts), y, u, F, H, inputs, [(low, high) for low, high in box], vertices,
+        effort=_effort(E, [(low, high) for low, high in box]),
+        whole=len(box) if driven and p > 1 else 0, limits=limits,
     )  # fmt: skip
+    return _driven(model, window) if driven else model
 
 
-def _block_cascade(node: Node) -> Model:
+def _with_inputs(G: list[Terms], drive: Any, scales: list[Fraction]) -> Terms:
+    """The derivatives of Σ G_k(w) ȳ_k + p(w) by ȳ and by the inputs behind w, in (ȳ, w)."""
+    p, size = len(G[0][0][1]), len(G[0][0][1]) * len(G)
+    rows: list[Polynomial] = [
+        [((*_powers(k * p + j, size), *e), c[i][j]) for k, g in enumerate(G) for e, c in g
+         for j in range(p)] + [((*[0] * size, *e), c[i]) for e, c in drive]
+        for i in range(p)
+    ]  # fmt: skip
+    per = [Fraction(1)] * size + [1 / scale for scale in scales]
+    found = _jacobian(rows, range(len(per)))
+    return [(e, [[c * by for c, by in zip(row, per, strict=True)] for row in block])
+            for e, block in found]  # fmt: skip
+
+
+def _block_cascade(node: Node, driven: bool) -> Model:
     """Two linear filters around a spline: ν_j = f(x_j) - f(x̂_j), E = [I, -diag(s_j) C_j, 0].
 
     x stacks v(t-1) … v(t-n₁) of the first filter and the observer form of the second. f' is a
@@ -263,19 +315,25 @@ def _block_cascade(node: Node) -> Model:
 
     def corners(_: Box, __: Node | None) -> list[Matrix]:
         return [
-            [_unit(j, M) + [-s[j] * entry for entry in C[j]] + [Fraction(0)] * n2 for j in range(M)]
+            [
+                _unit(j, M) + [-s[j] * entry for entry in C[j]] + [Fraction(0)] * n2
+                + [-s[j] * b1[j][0]] * driven
+                for j in range(M)
+            ]
             for s in product(sorted({least, most}), repeat=M)
-        ]
+        ]  # fmt: skip
 
     covered = f"[{text.below(least)}, {text.above(most)}]"
-    return Model(
+    model = Model(
         _period(parts), (read_signal(parts["y"]),), (read_signal(parts["u"]),), F, [H],
         f"for every input (the slopes of its nonlinearity are in {covered} everywhere)",
         [], corners,
     )  # fmt: skip
+    into = [[one] for one in _unit(0, n)] if n1 else None  # of u(t): v(t) is the first state
+    return _driven(model, [(0, 0)], into) if driven else model
 
 
-def _cell_network(node: Node) -> Model:
+def _cell_network(node: Node, driven: bool) -> Model:
     """ν_j = f_j(into_j·s), x⁺ = next·s, y = output·s with s = [ν, x, u, 1]: E = [I - S_ν, -S_x].
 
     S = diag(σ) into, σ_j between the least and the largest slope of f_j, linear between its knots
@@ -289,22 +347,61 @@ def _cell_network(node: Node) -> Model:
     width = m + n + len(u) + 1
     into = parts["into"].array(m, width)
     F, H = parts["next"].array(n, width), parts["output"].array(len(y), width)
+    known = m + n + len(u) * driven
     if any(any(row[j:m]) for j, row in enumerate(into)):
         raise Rejected(f"{node.where} into: a map should depend on earlier maps only")
 
     def corners(_: Box, __: Node | None) -> list[Matrix]:
         return [
             [
-                [one - slope * entry for one, entry in zip(_unit(j, m + n), into[j], strict=False)]
+                [one - slope * entry for one, entry in zip(_unit(j, known), into[j], strict=False)]
                 for j, slope in enumerate(slopes)
             ]
             for slopes in product(*ends)
         ]
 
-    return Model(
+    model = Model(
         _period(parts), y, u, [row[: m + n] for row in F], [row[: m + n] for row in H],
         "for every input", [], corners,
     )  # fmt: skip
+    present, direct = ([row[m + n : -1] for row in rows] for rows in (F, H))
+    return _driven(model, [(i, 0) for i in range(len(u))], present, direct) if driven else model
+
+
+def _driven(
+    model: Model,
+    window: Sequence[Sequence[int]],
+    F_w: Matrix | None = None,
+    H_w: Matrix | None = None,
+) -> Model:
+    """The form with past inputs in its state, and with w̄ behind it.
+
+    `model` is the form in which the window's entries, input i at delay d for each (i, d), are the
+    last columns of `vertices`; F_w and H_w are those of F and H, zero if they are not given.
+    """
+    inputs = range(len(model.u))
+    reach = [max((d for j, d in window if j == i), default=0) for i in inputs]
+    past = [(i, d) for i in inputs for d in range(1, reach[i] + 1)]
+    columns = [*past, *((i, 0) for i in inputs)]
+    chosen = [_unit(columns.index((i, d)), len(columns)) for i, d in window]
+
+    def wide(rows: Matrix, more: Matrix | None) -> Matrix:
+        if more is None:
+            return [row + [Fraction(0)] * len(columns) for row in rows]
+        return [row + of for row, of in zip(rows, times(more, chosen), strict=True)]
+
+    size = len(model.F[0])
+    shift = [[Fraction(0)] * size + _unit(columns.index((i, d - 1)), len(columns)) for i, d in past]
+    return replace(
+        model,
+        F=wide(model.F, F_w) + shift,
+        H=wide(model.H, H_w),
+        vertices=lambda part, ends: [
+            wide([row[:size] for row in E], [row[size:] for row in E])
+            for E in model.vertices(part, ends)
+        ],
+        driven=len(inputs),
+    )
 
 
 def _slope_range(node: Node) -> list[Fraction]:
@@ -319,7 +416,7 @@ def _slope_range(node: Node) -> list[Fraction]:
     return sorted({min(slopes), max(slopes)})
 
 
-def _monotone_equation(node: Node) -> Model:
+def _monotone_equation(node: Node, driven: bool) -> Model:
     """e(ȳ(t)) = affine in the past, ν = ȳ(t), E = [e', -a]: e' constant, or its least and a ray."""
     parts = _members(node, "y u e a b c window y_offset u_offset")
     first, second, third = parts["e"].array(3)
@@ -327,7 +424,7 @@ def _monotone_equation(node: Node) -> Model:
     n = _size(len(a), parts["a"])
     u = read_signals(parts["u"], "inputs")
     window = parts["window"].wholes(None, 2)
-    parts["b"].array(len(window))
+    b = parts["b"].array(len(window))
     parts["u_offset"].array(len(u))
     parts["c"].number()
     parts["y_offset"].number()
@@ -336,15 +433,16 @@ def _monotone_equation(node: Node) -> Model:
     if third < 0 or (third == 0 and second != 0):
         raise Rejected(f"{node.where} e is not increasing everywhere")
     least = first - second**2 / (3 * third) if third else first
-    E = [[least, *(-entry for entry in a)]]
+    E = [[least, *(-entry for entry in a), *(-entry for entry in b if driven)]]
     F = [_unit(i, n + 1) for i in range(n)]
-    return Model(
+    model = Model(
         _period(parts), (read_signal(parts["y"]),), u, F, [_unit(0, n + 1)],
         "for every input", [], lambda _, __: [E], ray=third > 0,
     )  # fmt: skip
+    return _driven(model, window) if driven else model
 
 
-def _implicit(node: Node, bounds: Node | None) -> Model:
+def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
     """0 = h(v, x, w), x⁺ = [v; ã(x, w)], y = v: ν = v - v̂, E = [∂h/∂v, ∂h/∂x] averaged between.
 
     Where h is linear in v and x, E is one matrix. Where h = e(v) - (affine in x), v one number and
@@ -360,18 +458,22 @@ def _implicit(node: Node, bounds: Node | None) -> Model:
     p, n = given.unknowns, given.states
     if len(y) != p or n % p or any(not (0 <= i < len(u) and d >= 0) for i, d in window):
         raise Rejected(f"{node.where}: outputs, states and window do not fit")
-    F = [_unit(i, p + n) for i in range(p)]
+    known = p + n + given.inputs * driven  # columns: v, x, and driven the window w
+    F = [_unit(i, known) for i in range(p)]
     for terms in given.shift:
-        if any(sum(e) > 1 and any(e[:n]) for e, _ in terms):
-            raise Rejected(f"{node.where}: the shift should be linear in the states")
-        row = [Fraction(0)] * (p + n)
+        if any(sum(e) > 1 and any(e[: known - p]) for e, _ in terms):
+            what = "the states and inputs" if driven else "the states"
+            raise Rejected(f"{node.where}: the shift should be linear in {what}")
+        row = [Fraction(0)] * known
         for e, c in terms:
-            if any(e[:n]):
+            if any(e[: known - p]):
                 row[p + e.index(1)] += c
         F.append(row)
-    E = _slopes(given)
+    E = _jacobian(given.h, range(known))
+    if not E:
+        raise Rejected("the model's equation does not depend on its output")
     constant = all(not any(e) for e, _ in E)
-    least = None if constant else _least_slope(given)
+    least = None if constant else _least_slope(given, driven)
     if bounds is None and not constant and least is None:
         raise Rejected(f"{node.where}: the increments of this model are known on a box only")
     box: Box = []
@@ -391,35 +493,37 @@ def _implicit(node: Node, bounds: Node | None) -> Model:
             raise Rejected(f"{ends.where}: ends are for state-affine models")
         return only or _bernstein(E, part)
 
-    return Model(
-        given.period, y, u, F, [_unit(i, p + n) for i in range(p)],
+    split = len(box) if driven else p + n
+    model = Model(
+        given.period, y, u, [row[: p + n] for row in F], [_unit(i, p + n) for i in range(p)],
         "for every input" if bounds is None else "while signals stay in the box", box,
         vertices, ray=least is not None, effort=0 if only else _effort(E, box),
-        whole=p + n if p > 1 and box else 0,
+        whole=split if p > 1 and box else 0,
     )  # fmt: skip
+    return _driven(model, window, [row[p + n :] for row in F]) if driven else model
 
 
-def _slopes(model: ImplicitModel) -> Terms:
-    """∂h/∂(v, x) as a matrix polynomial in (v, x, w)."""
-    p, size = model.unknowns, model.unknowns + model.states
+def _jacobian(rows: Sequence[Polynomial], of: range) -> Terms:
+    """The derivatives of polynomials by the variables `of`, as a matrix polynomial."""
     found: dict[tuple[int, ...], list[list[Fraction]]] = {}
-    if sum(map(len, model.h)) * p * size**2 > MAX_SLOPES:
+    if sum(map(len, rows)) * len(rows) * len(of) ** 2 > MAX_SLOPES:
         raise Rejected("the model has too many terms for its slopes to be written out")
-    for i, row in enumerate(model.h):
-        for j in range(size):
+    for i, row in enumerate(rows):
+        for j in of:
             for powers, c in derivative(row, j):
                 if max(powers, default=0) > MAX_POWER:
                     raise Rejected(f"powers should be from 0 to {MAX_POWER}")
-                entry = found.setdefault(powers, [[Fraction(0)] * size for _ in range(p)])
+                entry = found.setdefault(powers, [[Fraction(0)] * len(of) for _ in rows])
                 entry[i][j] += c
-    if not found:
-        raise Rejected("the model's equation does not depend on its output")
     return [(list(powers), found[powers]) for powers in sorted(found)]
 
 
-def _least_slope(model: ImplicitModel) -> Matrix | None:
-    """[min e', -a] of one equation e(v) = a'x + (terms in w), e an increasing cubic; else None."""
-    p, n = model.unknowns, model.states
+def _least_slope(model: ImplicitModel, driven: bool) -> Matrix | None:
+    """[min e', -a] of one equation e(v) = a'x + (terms in w), e an increasing cubic; else None.
+
+    Driven, the terms in w are linear too: [min e', -a, -b].
+    """
+    p, n = model.unknowns, model.states + model.inputs * driven
     if p != 1:
         return None
     E, e = [Fraction(0)] * (1 + n), [Fraction(0)] * 4
@@ -440,9 +544,9 @@ def _least_slope(model: ImplicitModel) -> Matrix | None:
     return [E]
 
 
-_READERS: dict[str, Callable[[Node], Model]] = {
+_READERS: dict[str, Callable[[Node, bool], Model]] = {
     "difference_equation": _difference_equation,
-    "state_affine": _state_affine,
+    "state_affine": lambda node, driven: _state_affine(node, driven, None),
     "block_cascade": _block_cascade,
     "cell_network": _cell_network,
     "monotone_equation": _monotone_equation,
@@ -451,7 +555,7 @@ _READERS: dict[str, Callable[[Node], Model]] = {
 
 def _side_by_side(G: Sequence[Terms], rows: int) -> Terms:
     """[G_0 … G_n] as one matrix polynomial."""
-    zeros = [[Fraction(0)] * rows for _ in range(rows)]
+    zeros = [[[Fraction(0)] * len(g[0][1][0])] * rows for g in G]
     found = [{tuple(powers): block for powers, block in g} for g in G]
     used = sorted({powers for g in found for powers in g})
     if len(used) > MAX_STATED:
@@ -459,7 +563,14 @@ def _side_by_side(G: Sequence[Terms], rows: int) -> Terms:
     return [
         (
             list(powers),
-            [[entry for g in found for entry in g.get(powers, zeros)[i]] for i in range(rows)],
+            [
+                [
+                    entry
+                    for g, none in zip(found, zeros, strict=True)
+                    for entry in g.get(powers, none)[i]
+                ]
+                for i in range(rows)
+            ],
         )
         for powers in used
     ]
@@ -613,6 +724,10 @@ def _size(n: int, node: Node) -> int:
 
 def _unit(i: int, size: int) -> list[Fraction]:
     return [Fraction(int(j == i)) for j in range(size)]
+
+
+def _powers(i: int, size: int) -> list[int]:
+    return [int(j == i) for j in range(size)]
 
 
 def _padded(values: list[Fraction], size: int) -> list[Fraction]:

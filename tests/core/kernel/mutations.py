@@ -23,6 +23,7 @@ from nlsid_core.kernel import Rejected
 from tests.core.kernel import (
     oracle_composition,
     oracle_continuous,
+    oracle_dissipation,
     oracle_falsification,
     oracle_polynomial,
     oracle_sampled,
@@ -38,6 +39,8 @@ ORACLES: dict[str, Callable[[Json, Mapping[str, Json]], bool]] = {
     "region_of_attraction": oracle_polynomial.agrees,
     "stable_set": oracle_polynomial.agrees,
     "stability": oracle_stability.agrees,
+    "dissipation": oracle_dissipation.agrees,
+    "small_gain": oracle_dissipation.agrees,
     "tube": oracle_tube.agrees,
     "sampled_funnel": oracle_sampled.agrees,
     "continuous_funnel": oracle_continuous.agrees,

@@ -18,6 +18,12 @@ FALSE = {  # a claim that is false, by one number of it: part, path, value
     "stable_set/linear": ("delta", 10.0),
     "stability/linear": ("rate", 0.6),  # the slowest pole is at 0.68
     "stability/cascade": ("rate", 0.7071),  # the slowest pole is at √½
+    "dissipation/linear": ("supply", {"kind": "gain", "number": 1.1256}),  # the peak is 1.12562…
+    "dissipation/short": (
+        "supply",
+        {"kind": "passivity", "number": -0.2328},
+    ),  # min Re is -0.23287…
+    "dissipation/integrator": ("discount", 1.0),  # an integrator has no gain
 }
 
 
