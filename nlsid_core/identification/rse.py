@@ -68,6 +68,7 @@ class Bound:
         G_m = rows.eye if theta_m is None else rows.G(theta_m)
         self.H = rows.weighed(G_m)
         self._H = sparse(self.H)
+        self._Ht = self._H.T
         self._constant = -0.5 * symmetric_product(G_m, self.H, rows.bandwidth)
 
     def at(self, theta: FloatArray) -> Point:
@@ -82,7 +83,7 @@ class Bound:
 
     def slopes(self, x: FloatArray) -> FloatArray:
         """(N, n_g): K_i x, K_i = G_i H' + H G_i', of every left parameter i."""
-        rows, ahead = self.rows, self._H.T @ x
+        rows, ahead = self.rows, self._Ht @ x
         columns, behind = np.empty_like(rows.weights), np.empty(rows.weights.shape)
         for D, group, weights in rows.groups:
             columns[:, group] = weights * shift(ahead, D)[:, None]
