@@ -28,8 +28,8 @@ from nlsid_core.design import design
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
 from tests.core.kernel import mutations
+from tests.core.kernel.held_claims import claim
 from tests.core.kernel.sampled_claims import one_step
-from tests.core.kernel.test_held_inputs import claim
 from tests.falling_pendulum import tracking
 from tests.forged_held import HELD_FORGERIES, forged_held
 from tests.forged_tracking import FORGERIES, forged
