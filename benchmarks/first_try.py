@@ -1,27 +1,35 @@
 """Eleven problems written as a user writes them from the docs: default settings, no tuning.
 
-    python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N]
+    python -m benchmarks.first_try [--json] [--only NAME ...] [--starts N] [--limit S] [--out FILE]
 
 Each function is all that a user writes. A refusal is reported, not hidden. Starts on the boundary
 at t0 and at a later knot follow the true equations; w is at random corners of its box. Each is then
 designed for a computer: `hold="largest"`, states measured wrong by up to a hundredth of the goal;
 and simulated so, with samples a half to all of the hold apart.
+
+A design that takes more than --limit of processor time is stopped and reported as not proved. What
+became of each problem is printed, and written to --out, when it is known.
 """
 
 import argparse
 import ast
 import inspect
 import json
+import signal
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.machine import describe
 from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
+from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -36,6 +44,7 @@ from nlsid_core.proofs import check
 
 Written = tuple[Callable[..., Any], ContinuousTracking]
 SUBSTEPS = 10
+LIMIT = 60.0  # s of processor time for one design
 WRONG = 0.01  # of the goal's half-widths: what a state is measured wrong by
 
 
@@ -225,22 +234,56 @@ def lines_of(problem: Callable[..., Any]) -> int:
     return sum(bool(line.strip()) for line in source.splitlines()[first - 1 :])
 
 
-def run(name: str, starts: int) -> dict[str, Any]:
-    """What became of one problem at the first try, and of its policy on a computer."""
-    used = time.process_time()
-    lines = {"lines": lines_of(PROBLEMS[name])}
+class OutOfTimeError(Exception):
+    """A design took more than its processor time."""
+
+
+@contextmanager
+def stopped_after(seconds: float) -> Iterator[None]:
+    """Raise OutOfTimeError in what runs inside once it has used this much processor time."""
+
+    def stop(*_: object) -> None:
+        raise OutOfTimeError(f"stopped: not ended after {seconds:g} s of processor time")
+
+    before = signal.signal(signal.SIGPROF, stop)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
     try:
-        function, problem = PROBLEMS[name]()
-        found = design(problem)
-    except NlsidError as refusal:
-        used = time.process_time() - used
-        return {"proved": False, "seconds": used, "said": str(refusal)} | lines
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.signal(signal.SIGPROF, before)
+
+
+def designed(
+    make: Callable[[], ContinuousTracking], limit: float
+) -> tuple[FunnelDesign | None, dict[str, Any]]:
+    """The design if it is proved, and what is told; what `make` takes counts."""
+    used, found, said = time.process_time(), None, {}
+    try:
+        with stopped_after(limit):
+            found = design(make())
+    except (NlsidError, OutOfTimeError) as refusal:
+        said = {"said": str(refusal)}
     seconds = time.process_time() - used
+    return found, {"proved": found is not None, "seconds": seconds} | said
+
+
+def run(name: str, starts: int, limit: float) -> dict[str, Any]:
+    """What became of one problem at the first try, and of its policy on a computer."""
+    lines = {"lines": lines_of(PROBLEMS[name])}
+    written: list[Written] = []
+
+    def first() -> ContinuousTracking:
+        written.append(PROBLEMS[name]())
+        return written[0][1]
+
+    found, told = designed(first, limit)
+    if found is None:
+        return told | lines
+    function, problem = written[0]
     given = 0 if problem.uncertain is None else len(np.asarray(problem.uncertain))
     t, later = found.funnel.t, len(found.funnel.t) // 2
-    told = {
-        "proved": True,
-        "seconds": seconds,
+    told |= {
         "states": found.funnel.n,
         "knots": len(t),
         "pieces": len(found.found.proved.pieces),
@@ -249,14 +292,10 @@ def run(name: str, starts: int) -> dict[str, Any]:
     }
     told |= judged(function, found, given, starts)
     if found.model.m:  # without an input there is nothing to hold
-        used = time.process_time()
         error = WRONG * np.asarray(problem.goal, dtype=np.float64)
-        try:
-            held = design(replace(problem, hold="largest", error=error))
-            computed = {"proved": True} | judged(function, held, given, starts)
-        except NlsidError as refusal:
-            computed = {"proved": False, "said": str(refusal)}
-        told["held"] = {"seconds": time.process_time() - used} | computed
+        held, told["held"] = designed(lambda: replace(problem, hold="largest", error=error), limit)
+        if held is not None:
+            told["held"] |= judged(function, held, given, starts)
     return told | lines
 
 
@@ -301,32 +340,59 @@ def show(results: dict[str, Any], indent: str = "") -> None:
         print(f"{name:26} {value:.5g}" if isinstance(value, float) else f"{name:26} {value}")
 
 
+def line(name: str, told: dict[str, Any]) -> str:
+    """One row of the table: what was proved and how long it took, without and with a hold."""
+    row = f"{name:14}"
+    for key, part in (("", told), ("held ", told.get("held"))):
+        if part is None:
+            continue
+        row += f" {key}{'proved' if part['proved'] else 'not proved'} in {part['seconds']:.1f} s"
+        if part["proved"]:
+            row += f", {part['left']} of {part['starts']} left;"
+    return row
+
+
+def summary(results: dict[str, Any]) -> dict[str, Any]:
+    """The figures over all problems that were tried, and what became of each."""
+    held = [told["held"] for told in results.values() if "held" in told]
+    return {
+        "proved_first_try": sum(told["proved"] for told in results.values()),
+        "of": len(results),
+        "left": sum(told.get("left", 0) for told in results.values()),
+        "proved_held": sum(told["proved"] for told in held),
+        "left_held": sum(told.get("left", 0) for told in held),
+        "most_lines": max(told["lines"] for told in results.values()),
+        "most_seconds": max(told["seconds"] for told in results.values()),
+        "most_seconds_held": max((told["seconds"] for told in held), default=0.0),
+    } | results
+
+
 def main() -> None:
     """Print what became of each, and with --json one JSON object as the last line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--only", nargs="+", choices=list(PROBLEMS), default=list(PROBLEMS))
     parser.add_argument("--starts", type=int, default=4000)
+    parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a design")
+    parser.add_argument("--out", type=Path, help="a file for the results, as they come")
     arguments = parser.parse_args()
-    print(describe())
-    results = {}
+    print(describe(), flush=True)
+    results: dict[str, Any] = {}
     for name in arguments.only:
-        results[name] = run(name, arguments.starts)
+        results[name] = run(name, arguments.starts, arguments.limit)
         print(f"\n{name}")
         show(results[name])
-    held = [found["held"] for found in results.values() if "held" in found]
-    whole = {
-        "proved_first_try": sum(found["proved"] for found in results.values()),
-        "of": len(results),
-        "left": sum(found.get("left", 0) for found in results.values()),
-        "proved_held": sum(found["proved"] for found in held),
-        "left_held": sum(found.get("left", 0) for found in held),
-        "most_lines": max(found["lines"] for found in results.values()),
-        "most_seconds": max(found["seconds"] for found in results.values()),
-    }
-    print(f"\n{whole}")
+        sys.stdout.flush()
+        if arguments.out is not None:
+            written = json.dumps(summary(results), indent=1) + "\n"
+            files.write_atomically(arguments.out, written.encode())
+    print()
+    for name, told in results.items():
+        print(line(name, told))
+    whole = summary(results)
+    print({key: value for key, value in whole.items() if key not in results})
     if arguments.json:
-        print(json.dumps(whole | results))
+        print(json.dumps(whole))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nlsid_core.arrays import FloatArray
+from nlsid_core.arrays import ArrayLike, FloatArray
 from nlsid_core.dynamics.piecewise import PiecewisePolynomial
 from nlsid_core.dynamics.taylor import Rates
 from nlsid_core.dynamics.vector_field import VectorField
@@ -35,6 +35,10 @@ class Nominal:
     def t(self) -> FloatArray:
         """(K,) knots in s."""
         return self.x.t
+
+    def halved(self, chosen: ArrayLike) -> "Nominal":
+        """The same motion with a knot more in the middle of the chosen (K-1,) intervals."""
+        return Nominal(self.x.halved(chosen), self.u.halved(chosen))
 
     def defect(self, field: VectorField | Rates) -> tuple[float, float, int]:
         """The largest |f(t, x₀, u₀) - ẋ₀| over fine samples, when (s), and in which state."""

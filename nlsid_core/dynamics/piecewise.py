@@ -82,6 +82,27 @@ class PiecewisePolynomial:
         """(K, *shape) values at the knots, exact; the last from the left."""
         return np.concatenate([self.control[:, 0], self.control[-1:, -1]])
 
+    def halved(self, chosen: ArrayLike) -> "PiecewisePolynomial":
+        """The same function, but for rounding, with a knot more in the middle of chosen pieces.
+
+        chosen: (K-1,) True for those pieces. Source: de Casteljau's algorithm.
+        """
+        marked: list[bool] = np.asarray(chosen, dtype=bool).tolist()
+        t, pieces = [float(self.t[0])], []
+        for k, (control, half) in enumerate(zip(self.control, marked, strict=True)):
+            if half:
+                points, first, last = control, [control[0]], [control[-1]]
+                while len(points) > 1:
+                    points = (points[:-1] + points[1:]) / 2
+                    first.append(points[0])
+                    last.append(points[-1])
+                t.append(float(self.t[k] + self.t[k + 1]) / 2)
+                pieces += [np.array(first), np.array(last[::-1])]
+            else:
+                pieces.append(control)
+            t.append(float(self.t[k + 1]))
+        return PiecewisePolynomial(np.array(t), np.array(pieces))
+
     def is_continuous(self) -> bool:
         """True if every piece begins exactly where the one before ends."""
         return bool((self.control[1:, 0] == self.control[:-1, -1]).all())

@@ -681,7 +681,7 @@ def _extreme(E: list[Matrix]) -> list[Matrix]:
 
 def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
     parts = node.members("exponents coefficients")
-    exponents = parts["exponents"].monomials(variables, MAX_POWER * variables)
+    exponents = parts["exponents"].monomials(variables)
     coefficients = parts["coefficients"].array(len(exponents), *shape)
     if not exponents or any(power > MAX_POWER for row in exponents for power in row):
         raise Rejected(f"{node.where} should have monomials, with powers from 0 to {MAX_POWER}")

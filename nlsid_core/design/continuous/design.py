@@ -19,7 +19,8 @@ from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
-from nlsid_core.design.continuous.setting import Goal, Setting, prepare
+from nlsid_core.design.continuous.reachable import reached
+from nlsid_core.design.continuous.setting import Goal, Setting, final_level, prepare
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape, validity_caps
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
@@ -32,6 +33,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
+HALVINGS = 6  # of intervals where P is far from linear
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
 KIND = "continuous_funnel"
@@ -88,10 +90,11 @@ def design_funnel(
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
     started = time.perf_counter()
-    setting = prepare(
-        dynamics, nominal, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
+    prepared = partial(
+        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
         uncertain=uncertain, hold=hold, error=error, decay=decay,
     )  # fmt: skip
+    setting = prepared(nominal)
     if decay is not None:
         refuse_decay(setting.steps)
     if shape == "P":
@@ -101,7 +104,8 @@ def design_funnel(
     seconds = {"policy": time.perf_counter() - started}
     started = time.perf_counter()
     try:
-        setting, funnel, proved, margin = _found(setting, progress)
+        again = prepared if policy is None else None
+        setting, funnel, proved, margin = _tried(setting, again, progress)
         if decay is not None:
             proved = prove_decay(setting.steps, setting.policy, funnel)
     except Infeasible as refusal:
@@ -173,6 +177,40 @@ def _simulated(setting: Setting) -> str:
             return f". {try_to_miss(setting)}"
     except (ArithmeticError, ValueError, RuntimeError):  # the equations may end away from a motion
         return ""
+
+
+def _tried(
+    setting: Setting, again: Callable[[Nominal], Setting] | None, progress: Progress
+) -> _Found:
+    """ρ for the cost-to-go; where w stops that, for what the pushed linear loop reaches."""
+    try:
+        return _found(setting, progress)
+    except NoFunnel as refusal:
+        pushed = _pushed(setting, again) if refusal.diagnosis.dominant == "disturbance" else None
+        if pushed is None:
+            raise
+        with suppress(Infeasible):
+            return _found(pushed, progress)
+        raise
+
+
+def _pushed(setting: Setting, again: Callable[[Nominal], Setting] | None) -> Setting | None:
+    """The setting with P(t) of what a pushed linear loop reaches; None if that misses the goal.
+
+    again: the same problem around a motion with more knots, if it can have more.
+    """
+    for _ in range(HALVINGS):
+        found, policy, steps = reached(setting), setting.policy, setting.steps
+        if found is None:
+            return None
+        if found.size < 1:
+            steps.tightness = found.tightness
+            rho, _ = final_level(steps, policy, found.P, setting.goal, setting.expansion)
+            return replace(setting, P=found.P, rho_final=rho)
+        if again is None or not found.coarse.any():
+            return None
+        setting = again(Nominal(policy.x, policy.u).halved(found.coarse))
+    return None
 
 
 def _found(setting: Setting, progress: Progress) -> _Found:
@@ -247,7 +285,7 @@ def _held(
         outer = ContinuousFunnel(policy.x, P, scale * free, policy.vector_field, "")
         held = LSteps(
             field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-            widths=np.zeros((len(P) - 1, field.m)), decay=steps.decay,
+            widths=np.zeros((len(P) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
         )  # fmt: skip
         rates, widths = fastest(held, policy, outer, hold)
         held.widths = widths
@@ -313,7 +351,7 @@ def _expanded(
     field = field_of(found.cubics, policy.t)
     policy = replace(policy, vector_field=files.digest(field.document()))
     proving = LSteps(field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
-                     decay=steps.decay)  # fmt: skip
+                     tightness=steps.tightness, decay=steps.decay)  # fmt: skip
     proving.kappa = steps.kappa
     return replace(setting, steps=proving, policy=policy), found.rho, found.ends
 

@@ -20,9 +20,9 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 ROOM = 1 + 1e-6  # of the box over the funnel: the checker decides in rationals
-NEAR = 1.01  # of the largest ρ: closer is not worth another expansion
-STEP = 1.3  # of ρ, while the largest is bracketed
-FALL = 0.98  # of ρ, squared at each further try
+NEAR = 0.05  # of ρ over the whole motion: what intervals may stay below the largest, together
+STEP = 1.02  # of ρ, squared at each further step, while the largest is bracketed
+FALL = 0.998  # of ρ, squared at each further try
 MAX_TRIES = 10  # of exact L-steps a knot
 BACK, MAX_BACK = 0.8, 40  # of ρ, where the interval before cannot take it; how often
 BETWEEN = np.linspace(
@@ -217,15 +217,15 @@ class _Interval:
         raise NoFunnel(self.diagnosis(known))
 
     def bracketed(self, rho: float, known: Ends, most: float) -> float:
-        """The largest ρ ≤ most, to 1 %, at which the bound leaves the margin; or 0."""
-        step = STEP
+        """The largest ρ ≤ most, nearly, at which the bound leaves the margin; or 0."""
+        step, near = STEP, 1 + NEAR / len(self.P)
         if self.predicted(rho, known) >= 0:
             low = rho
             while low < most:
                 rho = min(low * step, most)
                 if self.predicted(rho, known) < 0:
                     break
-                low = rho
+                low, step = rho, min(step * step, 10.0)
             high = rho
         else:
             high, low = rho, rho / step
@@ -234,7 +234,7 @@ class _Interval:
                     return 0.0
                 step = min(step * step, 10.0)
                 high, low = low, low / step
-        while high / low > NEAR:
+        while high / low > near:
             middle = float(np.sqrt(low * high))
             low, high = (middle, high) if self.predicted(middle, known) >= 0 else (low, middle)
         return low

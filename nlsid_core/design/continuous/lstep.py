@@ -107,8 +107,8 @@ class LSteps:
     nonlinear: the states that the programs take as such, the field's or more. pushed: whether what
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
     field's `is_pushed`). decay: 1/s, the rate of V̇ that every margin is above. kappa: (intervals,
-    n_w), if it is bounded. local: what the dynamics are on an interval, where a search expands
-    them anew; else they are the field.
+    n_w), if it is bounded; tightness: the same over 1/max|x̄'Pg| (None: 1). local: what the dynamics
+    are on an interval, where a search expands them anew; else they are the field.
     """
 
     def __init__(
@@ -120,6 +120,7 @@ class LSteps:
         pushed: bool | None = None,
         tolerance: float = 1e-5,
         widths: FloatArray | None = None,
+        tightness: FloatArray | None = None,
         decay: float = 0.0,
     ) -> None:
         refuse_degree(field)
@@ -133,6 +134,7 @@ class LSteps:
         self.limits = np.zeros((0, 3)) if policy is None else policy.limits
         self.modes: IntArray = np.zeros((1, 0), dtype=int) if policy is None else policy.modes()
         self.widths = widths
+        self.tightness = tightness
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
         reduced = len(self.limits) == 0 and widths is None
@@ -158,13 +160,15 @@ class LSteps:
     def bound_pushes(self, section: Section, rho: float) -> None:
         """If w only pushes: κ of the section's interval, for what w does where W = ρ.
 
-        κ near 1/max|x̄'Pg| makes the bound tight where the push hurts most.
+        κ near 1/max|x̄'Pg| makes the bound tight where the push is largest; where the funnel is long
+        along another axis, a larger one (`tightness`) makes it tight where V falls least.
         """
         if self.kappa is None:
             return
         G = self.pushes(section)
         largest = np.sqrt(rho * np.einsum("ij,ik,kj->j", G, section.P, G))
-        digits, power = np.frexp(1 / np.maximum(largest, NO_PUSH))
+        times = 1.0 if self.tightness is None else self.tightness[section.interval]
+        digits, power = np.frexp(times / np.maximum(largest, NO_PUSH))
         self.kappa[section.interval] = np.ldexp(np.round(digits * FINENESS) / FINENESS, power)
 
     def rate(self, section: Section, X: FloatArray, U: FloatArray, w: FloatArray) -> FloatArray:

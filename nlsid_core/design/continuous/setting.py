@@ -141,7 +141,7 @@ def prepare(
     steps = LSteps(field, policy, nonlinear=nonlinear, pushed=pushed, decay=decay or 0.0)
     if held is not None:
         held.refuse(field, policy)
-    rho_final, target = _final(steps, policy, S, wanted, expansion)
+    rho_final, target = final_level(steps, policy, S, wanted, expansion)
     return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held)
 
 
@@ -315,7 +315,7 @@ def _kept(
     return min(s.m for s in steps.solve(section, rho)) > 0
 
 
-def _final(
+def final_level(
     steps: LSteps,
     policy: ContinuousPolicy,
     S: FloatArray,

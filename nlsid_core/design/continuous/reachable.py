@@ -1,0 +1,184 @@
+"""P(t) from the sets that a pushed linear closed loop reaches: ellipsoids that hold all of it.
+
+For ẋ = Ax + Σ g_j w_j, |w_j| ≤ r_j, and any κ_j > 0 the ellipsoids {x : x'X⁻¹x ≤ 1} with
+Ẋ = AX + XA' + Σ r_j(κ_j g_j g_j' + X/κ_j) hold every solution that starts in one of them: it is the
+claim's own bound of a push. κ(t) and the start are those with which the end is small beside the
+goal. Nothing here is trusted: the sweep decides how much of it the dynamics keep.
+Source: Kurzhanski and Vályi, Ellipsoidal Calculus for Estimation and Control, 1997, Section 2.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.setting import GOAL_ROOM, Setting
+
+PARTS = 4  # of an interval, for the integration
+SLACK = 0.24  # of log ρ over the motion: room for what is not linear
+START = 0.1  # of the end's size, that is due to where solutions start
+SHARPNESS = (
+    4  # p of the norm tr(M^p)^(1/p) that is minimised in the place of the largest eigenvalue
+)
+SPREAD = 0.1  # of the mean: what every direction of the start counts at least
+ROUNDS, STEPS = 8, 6  # of what is lost between knots; of κ in each
+FAR = 3.0  # times the goal: it does not come back from there
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """P (K, n, n), which shrinks and grows with ρ where the funnel should keep its size.
+
+    size: of the end, over the goal's. tightness: (K-1, n_w) κ over 1/max|x̄'Pg|. coarse: (K-1,) True
+    where much of the end's size is due to P being linear between knots.
+    """
+
+    P: FloatArray
+    size: float
+    tightness: FloatArray
+    coarse: NDArray[np.bool_]
+
+
+def reached(setting: Setting) -> Reached | None:
+    """The ellipsoids along the motion of a setting; None if w does more than push."""
+    loop = _Loop.of(setting)
+    if loop is None:
+        return None
+    lost = np.zeros(len(loop.h))
+    slack = SLACK / float(loop.h.sum())
+    state = _Choice(np.ones((len(loop.h), loop.G.shape[2])), START**2 * loop.goal_inverse)
+    least = np.inf
+    for _ in range(ROUNDS):
+        state, X = loop.improved(state, slack + lost)
+        size = loop.size(X[-1])
+        least = min(least, size)
+        scale = np.linalg.det(X) ** (1 / X.shape[1])
+        scale /= scale[-1]
+        P = scale[:, None, None] * np.linalg.inv(X)
+        P = (P + P.transpose(0, 2, 1)) / 2
+        if not size < FAR:
+            break
+        lost = np.maximum(lost + slack - loop.margins(P, scale, state.kappa), 0.0)
+    along = np.einsum("kij,kil,klj->kj", loop.G, P[1:] / scale[1:, None, None], loop.G)
+    tightness = np.ones((len(P) - 1, len(setting.steps.field.uncertain)))
+    tightness[:, : along.shape[1]] = state.kappa * np.sqrt(along)
+    coarse = (lost > slack) | (not size < FAR)  # but if nothing was lost, more knots are no help
+    return Reached(GOAL_ROOM * size**2 * P, size, tightness, coarse & (least < 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """kappa: (K-1, n_w). start: (n, n) X(t₀)."""
+
+    kappa: FloatArray
+    start: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Loop:
+    """h: (K-1,) s. across: (K-1, PARTS, n, n). ends: (K-1, 2, n, n) A at both ends of an interval.
+
+    G: (K-1, n, n_w) what pushes. r: (n_w,). goal, goal_inverse: (n, n).
+    """
+
+    h: FloatArray
+    across: FloatArray
+    ends: FloatArray
+    G: FloatArray
+    r: FloatArray
+    goal: FloatArray
+    goal_inverse: FloatArray
+
+    @classmethod
+    def of(cls, setting: Setting) -> "_Loop | None":
+        """The closed loop along the motion, linear."""
+        field, policy, expansion = setting.steps.field, setting.policy, setting.expansion
+        t = policy.t
+        own = len(field.uncertain) if expansion is None else len(expansion.rates.uncertain)
+        found = [field.pushes(field.span(float(s))) for s in t[:-1]]
+        pushes = [g[:, :own] for g in found if g is not None]
+        if not own or len(pushes) < len(found):
+            return None
+
+        def closed(k: int, s: float) -> FloatArray:
+            when = float(t[k] + np.clip(s, 1e-9, 1 - 1e-9) * (t[k + 1] - t[k]))
+            A, B = field.jacobians(when, policy.x(when), policy.u(when))
+            return np.asarray(A - B @ policy.K(when))
+
+        identity, h = np.eye(field.n), np.diff(t)
+        across = np.empty((len(h), PARTS, field.n, field.n))
+        for k in range(len(h)):
+            for i in range(PARTS):
+                step = h[k] / PARTS / 2 * closed(k, (i + 0.5) / PARTS)
+                across[k, i] = np.linalg.solve(identity - step, identity + step)
+        ends = np.array([[closed(k, 0.0), closed(k, 1.0)] for k in range(len(h))])
+        goal = setting.goal.P
+        radius = np.ptp(field.uncertain[:own], axis=1) / 2
+        return cls(h, across, ends, np.array(pushes), radius, goal, np.linalg.inv(goal))
+
+    def size(self, X: FloatArray) -> float:
+        """The smallest copy of the goal that holds {x'X⁻¹x ≤ 1}."""
+        L = np.linalg.cholesky(self.goal)
+        return float(np.sqrt(np.linalg.eigvalsh(L.T @ X @ L)[-1]))
+
+    def forward(self, chosen: _Choice, slack: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """X (K, n, n) at the knots, and (K-1, PARTS, n, n) where each part begins."""
+        step = self.h / PARTS
+        growth = np.exp(step * ((self.r / chosen.kappa).sum(axis=1) + slack))
+        added = np.einsum("kij,kj,klj->kil", self.G, step[:, None] * self.r * chosen.kappa, self.G)
+        X, knots = chosen.start, [chosen.start]
+        begins = np.empty_like(self.across)
+        for k, parts in enumerate(self.across):
+            for i, F in enumerate(parts):
+                begins[k, i] = X
+                X = growth[k] * F @ X @ F.T + added[k]
+            knots.append(X)
+        return np.array(knots), begins
+
+    def improved(self, chosen: _Choice, slack: FloatArray) -> tuple[_Choice, FloatArray]:
+        """κ and a start with which the end is smaller, and X there.
+
+        By the adjoint Λ of the end's norm: r(κ g'Λg + tr(ΛX)/κ) is least at κ² = tr(ΛX)/g'Λg, and
+        of all starts with the same tr(ΛX) that with X ∝ Λ⁻¹ is the largest.
+        """
+        L = np.linalg.cholesky(self.goal)
+        step = self.h / PARTS
+        for _ in range(STEPS):
+            X, begins = self.forward(chosen, slack)
+            growth = np.exp(step * ((self.r / chosen.kappa).sum(axis=1) + slack))
+            values, vectors = np.linalg.eigh(L.T @ X[-1] @ L)
+            turned = L @ vectors
+            end = (turned * (values / values[-1]) ** (SHARPNESS - 1)) @ turned.T
+            adjoint, after = end, np.empty_like(self.across)
+            for k in range(len(self.h) - 1, -1, -1):
+                for i in range(PARTS - 1, -1, -1):
+                    after[k, i] = adjoint
+                    F = self.across[k, i]
+                    adjoint = growth[k] * F.T @ adjoint @ F
+            kept = np.einsum("kpij,kpij->k", after, begins)
+            pushed = np.einsum("kij,kpil,klj->kj", self.G, after, self.G)
+            kappa = np.sqrt(chosen.kappa * np.sqrt(kept[:, None] / pushed))
+            n = len(self.goal)
+            least = SPREAD / n * np.trace(adjoint @ self.goal_inverse)
+            start = START / n * np.trace(end @ X[-1]) * np.linalg.inv(adjoint + least * self.goal)
+            start = (chosen.start + (start + start.T) / 2) / 2
+            chosen = replace(chosen, kappa=kappa, start=start)
+        return chosen, self.forward(chosen, slack)[0]
+
+    def margins(self, P: FloatArray, scale: FloatArray, kappa: FloatArray) -> FloatArray:
+        """(K-1,) what V falls by at least on its boundary, in 1/s, with P and ρ = scale linear."""
+        least = np.full(len(self.h), np.inf)
+        turning = np.diff(P, axis=0) / self.h[:, None, None]
+        growth = np.diff(scale) / self.h
+        for end in (0, 1):
+            rho, here = scale[end : len(scale) - 1 + end], P[end : len(P) - 1 + end]
+            PG = here @ self.G
+            bound = PG @ ((self.r * kappa / rho[:, None])[..., None] * PG.transpose(0, 2, 1))
+            along = here @ self.ends[:, end]
+            falls = -(along + along.transpose(0, 2, 1) + turning + bound)
+            inverse = np.linalg.inv(np.linalg.cholesky(here))
+            values = np.linalg.eigvalsh(inverse @ falls @ inverse.transpose(0, 2, 1))[:, 0]
+            taken = (self.r / kappa).sum(axis=1)
+            least = np.minimum(least, values - taken + growth / rho)
+        return least

@@ -1,0 +1,91 @@
+"""Funnels that a disturbance shapes: P(t) from what the pushed linear closed loop reaches."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.first_try import Truth, dubins
+from benchmarks.thesis.soundness import simulate_boundary
+from nlsid_core.arrays import FloatArray
+from nlsid_core.design import ContinuousTracking, FunnelDesign, design, plan_motion
+from nlsid_core.dynamics import Nominal
+from nlsid_core.errors import Infeasible
+
+WIND = 0.8  # m/s across a vehicle at 5 m/s: more than the cost-to-go's P(t) can hold
+
+
+def drifting(x: Any, u: Any, w: Any) -> Any:
+    """Across in m and heading in rad, at 5 m/s in wind."""
+    return [5 * np.sin(x[1]) + w[0], u[0]]
+
+
+def lane_change() -> Nominal:
+    def still(x: Any, u: Any) -> Any:
+        return drifting(x, u, np.zeros(1))
+
+    return plan_motion(still, start=[0, 0], end=[1, 0], seconds=2, m=1)
+
+
+def level(found: FunnelDesign, t: float, X: FloatArray) -> FloatArray:
+    """V at (N, n) states, from the numbers of the funnel's document."""
+    knots = found.funnel.t
+    k = int(np.clip(np.searchsorted(knots, t, side="right") - 1, 0, len(knots) - 2))
+    s = (t - knots[k]) / (knots[k + 1] - knots[k])
+    P = (1 - s) * found.funnel.P[k] + s * found.funnel.P[k + 1]
+    rho = (1 - s) * found.funnel.rho[k] + s * found.funnel.rho[k + 1]
+    gap = X - found.funnel.x(t)
+    return np.asarray(np.einsum("ni,ij,nj->n", gap, P, gap) / rho)
+
+
+def test_wind_that_no_cost_to_go_holds_is_held_by_what_it_can_reach() -> None:
+    motion = lane_change()
+    problem = ContinuousTracking(drifting, motion, goal=[1, 0.3], uncertain=[[-WIND, WIND]])
+    found = design(problem)
+    assert len(found.funnel.t) > len(motion.t)  # P is far from linear somewhere
+    assert found.funnel.widths(0.0)[0] > 0.5
+    # From the boundary, with the wind that pushes outward at every instant.
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    inside = np.linalg.cholesky(found.funnel.rho[0] * np.linalg.inv(found.funnel.P[0]))
+    X = found.funnel.x(0.0) + circle @ inside.T
+    times, most = np.linspace(0, 2, 4001), 0.0
+    for t, after in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        U = found.policy.u(t) - (X - found.policy.x(t)) @ found.policy.K(t).T
+        up = X + np.array([1e-6, 0.0])
+        wind = np.where(level(found, t, up) > level(found, t, X), WIND, -WIND)
+        middle = X + (after - t) / 2 * np.array(drifting(X.T, U.T, wind[None])).T
+        U = found.policy.u((t + after) / 2)
+        U = U - (middle - found.policy.x((t + after) / 2)) @ found.policy.K((t + after) / 2).T
+        X = X + (after - t) * np.array(drifting(middle.T, U.T, wind[None])).T
+        most = max(most, float(level(found, after, X).max()))
+    assert 0.5 < most <= 1.0  # it is pushed hard, and stays
+    assert (((X - motion.x(2.0)) / [1, 0.3]) ** 2).sum(axis=1).max() <= 1.0
+
+
+def test_a_wind_that_ends_outside_the_goal_is_refused_with_the_first_reason() -> None:
+    problem = ContinuousTracking(drifting, lane_change(), goal=[1, 0.3], uncertain=[[-2, 2]])
+    with pytest.raises(Infeasible, match="Because of the disturbance w"):
+        design(problem)
+
+
+def test_a_motion_with_more_knots_is_the_same_motion() -> None:
+    motion = lane_change()
+    finer = motion.halved(np.arange(len(motion.t) - 1) % 2 == 0)
+    assert len(finer.t) == len(motion.t) + len(motion.t) // 2
+    assert set(motion.t) < set(finer.t)
+    times = np.linspace(0, 2, 301)
+    for before, after in ((motion.x, finer.x), (motion.u, finer.u)):
+        np.testing.assert_allclose(after(times), before(times), atol=1e-14)
+
+
+@pytest.mark.slow
+def test_an_airplane_in_half_a_metre_per_second_of_wind_is_proved_at_the_first_try() -> None:
+    rate, problem = dubins(0.5)
+    found = design(problem)
+    run = simulate_boundary(
+        Truth(rate, found, 3), found.policy, found.funnel, starts=1000,
+        rng=np.random.default_rng(0), substeps=10,
+    )  # fmt: skip
+    assert run.violations == 0
+    assert found.funnel.widths(0.0)[0] > 0.1
