@@ -5,9 +5,11 @@ python -m benchmarks.fleet [--bags 200] [--kills 4] [--endpoint URL] [--json]
 The bags are made of the shipped F1TENTH trials with noise of their own on the speed, and with eight
 more topics, among them a camera: 1.9 MB each, chunks of 768 KiB without compression, as `ros2 bag
 record` writes them. Wanted are speed and command. The server is moto's, in a process of its own on
-the same cores. By hand is what one writes with s3fs, rosbags and Dask: fetch the file, decode the
-two topics, interpolate. With --endpoint the bags go to a server that runs already (credentials in
-the environment), which may spend less of these cores on a request than moto's.
+the same cores, which keeps its objects on the disk: 2.1 MB a bag, in the cache folder until it
+ends. What is done is said on standard error. By hand is what one writes with s3fs, rosbags and
+Dask: fetch the file, decode the two topics, interpolate. With --endpoint the bags go to a server
+that runs already (credentials in the environment), which may spend less of these cores on a request
+than moto's.
 """
 
 import argparse
@@ -17,6 +19,7 @@ import multiprocessing
 import os
 import random
 import resource
+import shutil
 import signal
 import socket
 import subprocess
@@ -24,7 +27,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import cycle, islice
@@ -48,6 +51,7 @@ from bags.recordings.remote import place
 from bags.samples import f1tenth
 from bags.signals.expressions import factors
 from bags.signals.reader import bag_origin, read_signals
+from benchmarks.cache import cache_folder
 
 BUCKET = "fleet"
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "f1tenth.yaml"
@@ -57,7 +61,35 @@ CHUNK = 768 * 2**10
 NOISE = 1e-3  # m/s
 MANY = 1000  # bags, at most, that one worker reads, and that are read by hand
 BLOB = "std_msgs/msg/ByteMultiArray"
+BAG_BYTES = 2_200_000  # at most, on the disk
+FILES = 1000  # that are open besides those of the server, one an object
 SPEED, COMMAND = "/odom:twist.twist.linear.x", "/cmd_vel:twist.linear.x"
+
+
+def say(what: str) -> None:
+    """What is done, and when, for who waits."""
+    print(f"{time.strftime('%H:%M:%S')} {what}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def scratch(bags: int) -> Iterator[Path]:
+    """A folder for the server's objects and everything else, which is gone at the end.
+
+    Raises OSError if there is no room for so many bags, or if too few files may be open at a time.
+    """
+    free = shutil.disk_usage(cache_folder()).free
+    if free < bags * BAG_BYTES:
+        raise OSError(
+            f"{bags} bags need {bags * BAG_BYTES / 1e9:.1f} GB, {free / 1e9:.1f} are free"
+        )
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < bags + FILES:
+        raise OSError(f"{bags} bags are as many open files of the server; {hard} are allowed")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, bags + FILES), hard))
+    with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="fleet-") as name:
+        os.environ |= {"TMPDIR": name, "MOTO_S3_DEFAULT_KEY_BUFFER_SIZE": "1"}
+        tempfile.tempdir = name
+        yield Path(name)
 
 
 def made_bag(trial: Path, seed: int, compression: CompressionType = CompressionType.NONE) -> bytes:
@@ -148,6 +180,8 @@ def fill(client: Any, count: int, folder: str, compression: CompressionType) -> 
             client.put_object(Bucket=BUCKET, Key=key, Body=content)
             sizes[key] = len(content)
         size += sizes[key]
+        if (k + 1) % max(1, count // 10) == 0:
+            say(f"{k + 1} of {count} bags made in {folder}")
     return size
 
 
@@ -167,12 +201,18 @@ class Read:
 def read(bags: Mapping[str, Path], workers: int, manifest: Path | None = None) -> Read:
     """What a command that keeps a row for each bag reads of them."""
     came: list[float] = []
+
+    def note(what: str, part: float) -> None:
+        came.append(time.monotonic())
+        if len(came) % max(1, len(bags) // 10) == 0:
+            say(f"  {what} ({part:.0%})")
+
     answers: list[Answer] = []
     said, sent = hashlib.sha256(), 0
     with Manifest(manifest) as kept:
         for answer in ask(
             ReadTrials(load_config(CONFIG)), bags, Workers(workers), kept,
-            progress=lambda *_: came.append(time.monotonic()),
+            progress=note,
         ):  # fmt: skip
             if answer.reason:
                 raise RuntimeError(f"{answer.name}: {answer.reason}")
@@ -304,6 +344,7 @@ def killed(pattern: str, wanted: str, rounds: int, folder: Path) -> int:
     """In how many rounds a run that is killed, client or worker, ends as one that is not."""
     good = 0
     for number in range(rounds):
+        say(f"killing a {'client' if number % 2 else 'worker'}: {number + 1} of {rounds}")
         manifest = folder / f"killed_{number}.sqlite"
         command = [sys.executable, "-m", "benchmarks.fleet", "--once", pattern, str(manifest)]
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -353,23 +394,35 @@ def _rows(manifest: Path) -> int:
 
 def measured(count: int, kills: int, endpoint: str) -> dict[str, Any]:
     """Everything, by the keys of the JSON."""
-    with tempfile.TemporaryDirectory() as name, s3_server(Path(name), endpoint) as client:
-        folder = Path(name)
+    few = min(100, max(10, count // 10))
+    with ExitStack() as stack:
+        folder = stack.enter_context(scratch(0 if endpoint else count + few))
+        client = stack.enter_context(s3_server(folder, endpoint))
         size = fill(client, count, "plain", CompressionType.NONE)
-        few = min(100, max(10, count // 10))
         zipped = fill(client, few, "zstd", CompressionType.ZSTD)
         pattern = f"s3://{BUCKET}/plain/*/drive_*.mcap"
         bags = named_bags([Path(pattern)])
         some = dict(islice(bags.items(), few))
         many = dict(islice(bags.items(), MANY))
         tenth = f"s3://{BUCKET}/plain/robot_0/drive_*.mcap"
-        fewer, here = alone(_ours, tenth), alone(_ours, pattern)
-        one, two = read(many, 1).bags_per_s, read(bags, 2)
+        say("a tenth of the bags by one process")
+        fewer = alone(_ours, tenth)
+        say("all bags by one process")
+        here = alone(_ours, pattern)
+        say(f"{len(many)} bags by one worker")
+        one = read(many, 1).bags_per_s
+        say("all bags by two workers")
+        two = read(bags, 2)
+        say("compressed bags")
         compressed = read(named_bags([Path(f"s3://{BUCKET}/zstd/*/drive_*.mcap")]), 0).answers
-        hand, hand_cpu = by_hand(many, 2), alone(_theirs, tenth).cpu_ms
+        say(f"{len(many)} bags by hand, by two workers of Dask")
+        hand = by_hand(many, 2)
+        say("a tenth of the bags by hand, by one process")
+        hand_cpu = alone(_theirs, tenth).cpu_ms
         part_of_all = f"s3://{BUCKET}/plain/robot_[0-3]/drive_000*.mcap"
         wanted = read(named_bags([Path(part_of_all)]), 0).digest
         good = killed(part_of_all, wanted, kills, folder)
+        say("which part of the time is reading")
         return {
             "bags": count,
             "megabytes": round(size / 1e6, 1),
@@ -406,6 +459,7 @@ def main() -> None:
         pattern, manifest = options.once
         print(read(named_bags([Path(pattern)]), 2, Path(manifest)).digest)
         return
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))  # so that nothing stays behind
     found = measured(options.bags, options.kills, options.endpoint)
     if options.json:
         print(json.dumps(found))

@@ -266,19 +266,21 @@ def _say_groups(
     if list(groups) == ["-"]:
         return  # the bags' names have no folders
     troubled = {name: rows for name, rows in groups.items() if trouble_in(rows)}
-    console.print(f"{title} with trouble: {len(set(troubled) - {''})} of {len(set(groups) - {''})}")
-    if not troubled:
+    named = [name for name in troubled if name]  # the others are listed as not read
+    console.print(f"{title} with trouble: {len(named)} of {len(set(groups) - {''})}")
+    if not named:
         return
     shown = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     shown.add_column(title.removesuffix("s"), overflow="fold")
     for head in ("bags", *(_VERDICTS[word] for word in words)):
         shown.add_column(head, justify="right")
-    for name, rows in list(troubled.items())[:ROWS]:
+    for name in named[:ROWS]:
+        rows = troubled[name]
         counts = Counter(row.verdict for row in rows)
         cells = (str(counts[word] or "") for word in words)
-        shown.add_row(_plain(name) or "unknown", str(len(rows)), *cells)
+        shown.add_row(_plain(name), str(len(rows)), *cells)
     console.print(shown)
-    if (more := len(troubled) - ROWS) > 0:
+    if (more := len(named) - ROWS) > 0:
         rest = "--out writes every bag" if table is None else f"every bag is in {table}"
         console.print(f"and {more} more {title} with trouble, none with more; {rest}")
 

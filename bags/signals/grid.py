@@ -316,8 +316,12 @@ def read_dataset(
     paths = [place(bag) for bag in bags]
     names = list(map(trial_name, paths)) if names is None else names
     if len(set(names)) < len(names):
-        twice = {name for name in names if names.count(name) > 1}
-        raise DataError(f"two bags are called '{min(twice)}'; trials are told apart by name")
+        name = min(name for name in names if names.count(name) > 1)
+        own = [str(path) for path, called in zip(paths, names, strict=True) if called == name]
+        raise DataError(
+            f"two bags are called '{name}': {own[0]} and {own[1]}; trials are told apart by name "
+            "(with --workers 1 `nlsid identify` and `select` take their folders into the name)"
+        )
     options = {
         "period": period,
         "max_gap": max_gap,

@@ -22,6 +22,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.banded import Factor, Rows, shift, sparse, symmetric_product
 from nlsid_core.identification.newton import Point, minimise, project
 
+WORK = 5e10  # rows times squared left parameters, of all Newton steps together: a minute
+
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
@@ -41,23 +43,33 @@ def robust_simulation_error(
     start: FloatArray | None = None,
     iterations: int = 40,
     tolerance: float = 1e-6,
+    steps: int | None = None,
+    exact_first: bool = False,
 ) -> Iterator[Iterate]:
     """Yield the minimiser of each bound, first to last.
 
     start: left parameters at which the first bound is exact (None: the first bound is that of
     G_m = I). Stops after `iterations` bounds or when J falls by less than `tolerance` of itself.
+    steps: of Newton's method for each bound, at most (None: to its minimum): J goes down all the
+    same, as each bound is exact where it begins. exact_first: the first one to its minimum.
     Raises SolverError if Newton's method cannot go on.
     """
     linearised_at = start
     previous = float("inf")
-    for _ in range(iterations):
+    for number in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at
-        found = minimise(Bound(rows, linearised_at), start)
+        limit = None if exact_first and number == 0 else steps
+        found = minimise(Bound(rows, linearised_at), start, steps=limit)
         point = found.point
         yield Iterate(point.theta, point.p, point.J, found.on_boundary)
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:
             return
         linearised_at, previous = point.theta, point.J
+
+
+def affordable_steps(rows: Rows) -> int:
+    """Newton steps that `WORK` is enough for."""
+    return int(WORK / (len(rows) * len(rows.offsets) ** 2))
 
 
 class Bound:
@@ -68,6 +80,7 @@ class Bound:
         G_m = rows.eye if theta_m is None else rows.G(theta_m)
         self.H = rows.weighed(G_m)
         self._H = sparse(self.H)
+        self._Ht = self._H.T
         self._constant = -0.5 * symmetric_product(G_m, self.H, rows.bandwidth)
 
     def at(self, theta: FloatArray) -> Point:
@@ -82,7 +95,7 @@ class Bound:
 
     def slopes(self, x: FloatArray) -> FloatArray:
         """(N, n_g): K_i x, K_i = G_i H' + H G_i', of every left parameter i."""
-        rows, ahead = self.rows, self._H.T @ x
+        rows, ahead = self.rows, self._Ht @ x
         columns, behind = np.empty_like(rows.weights), np.empty(rows.weights.shape)
         for D, group, weights in rows.groups:
             columns[:, group] = weights * shift(ahead, D)[:, None]

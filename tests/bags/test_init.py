@@ -340,7 +340,7 @@ def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     assert whole_way(folder, config, tmp_path / "out").count("inside") >= 6
 
 
-def thrusters(folder: Path, *, trials: int = 6) -> Path:
+def thrusters(folder: Path, *, trials: int = 4) -> Path:
     """Two unstamped thrusters of which the sum is the speed's command, and the noise is small."""
     kind = "std_msgs/msg/Float64"
     number = standard_types().types[kind]
@@ -348,7 +348,7 @@ def thrusters(folder: Path, *, trials: int = 6) -> Path:
         rng = np.random.default_rng(trial)
         thrust, speed = np.zeros(2), 0.0
         with BagWriter(folder / f"run_{trial}") as writer:
-            for k in range(300):
+            for k in range(200):
                 thrust = rng.uniform(0.0, 1.0, 2) if k % 15 == 0 else thrust
                 speed += 0.15 * (float(thrust.sum()) - speed)
                 read = speed + 0.005 * rng.standard_normal()

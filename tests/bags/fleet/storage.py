@@ -11,6 +11,7 @@ from threading import Thread
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
+from bags.recordings.part import CUSTOM_DATA
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -41,11 +42,13 @@ def drive(
     without: Container[int] = (),
     back_from: int | None = None,
     odom: str = ODOM,
+    lost: int | None = None,
 ) -> Path:
     """An MCAP file of a car's speed that follows commands, in chunks, with images between.
 
     held: the command throughout. without: samples of the speed that are not there. back_from: the
     sample from which on stamps, not log times, are ten samples earlier. odom: the speed's topic.
+    lost: messages of it that the recorder says it lost.
     """
     from bags.recordings.definitions import standard_definition
 
@@ -74,6 +77,8 @@ def drive(
                 writer.add_message(channels[odom], at, odometry(stamp, speed), at)
             if image_bytes:
                 writer.add_message(channels[IMAGE], at, b"\0\1\0\0" + rng.bytes(image_bytes), at)
+        if lost is not None:
+            writer.add_metadata(CUSTOM_DATA, {f"{odom} lost": str(lost)})
         writer.finish()  # type: ignore[no-untyped-call]
     return file
 

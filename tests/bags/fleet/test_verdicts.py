@@ -381,6 +381,28 @@ def test_a_fleet_in_which_no_command_moves_is_said(tmp_path: Path) -> None:
     ]
 
 
+def test_messages_that_a_recorder_lost_are_a_column_where_they_were_counted(
+    tmp_path: Path,
+) -> None:
+    for k, lost in enumerate((3, 0, None)):
+        drive(tmp_path / f"d{k}.mcap", samples=60, seed=k, lost=lost)
+    status, lines = fleet_command("check", str(tmp_path), "--config", str(CONFIG))
+    assert status == 0
+    assert lines[0] == "3 bags: 0 not read, 0 bad, 0 copies, 1 look, 2 good"
+    assert lines[1].split() == [
+        "bag",
+        "verdict",
+        "start",
+        "(UTC)",
+        "lost",
+        "what",
+        "to",
+        "look",
+        "at",
+    ]
+    assert re.fullmatch(r"d0 +look +2\S+ \S+ +3 its recorder lost 3 messages *", lines[3])
+
+
 def test_an_identification_that_fails_says_first_what_was_read(tmp_path: Path) -> None:
     """The split of these names trials that are not here."""
     drive(tmp_path / "bags" / "drive.mcap", samples=60)
