@@ -55,18 +55,18 @@ def shared_stretch(
     codes = [np.floor(part / cell + SHIFT).astype(np.int64) for part in values]
     hashes, starts, owners = [], [], []
     for index, (trial, code) in enumerate(zip(every, codes, strict=True)):
-        found, at = _windows(code, trial.y.shape[1])
+        found, rows = _windows(code, trial.y.shape[1])
         hashes.append(found)
-        starts.append(at)
-        owners.append(np.full(len(at), index))
-    window, start, owner = (np.concatenate(part) for part in (hashes, starts, owners))
+        starts.append(rows)
+        owners.append(np.full(len(rows), index))
+    window, begin, owner = (np.concatenate(part) for part in (hashes, starts, owners))
     order = np.argsort(window, kind="stable")  # of equal windows the calibration trials come last
-    window, start, owner = window[order], start[order], owner[order]
+    window, begin, owner = window[order], begin[order], owner[order]
     twice = (window[1:] == window[:-1]) & (owner[1:] != owner[:-1]) & (owner[1:] >= first)
-    for i in np.flatnonzero(twice):
+    for i in np.flatnonzero(twice).tolist():
         one, two = int(owner[i + 1]), int(owner[i])
-        own, at = int(start[i + 1]), int(start[i])
-        back = min(own, at)
+        own, at = int(begin[i + 1]), int(begin[i])
+        back: int = min(own, at)
         before = _same(codes[one][own - back : own][::-1], codes[two][at - back : at][::-1])
         samples = before + _same(codes[one][own:], codes[two][at:])
         if samples >= LEAST:

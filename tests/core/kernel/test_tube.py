@@ -52,7 +52,8 @@ def test_the_sentences_are_those_of_the_page() -> None:
     peak = rounded(tubes(funnel)["peak"]["level"], "ROUND_FLOOR")
     largest = rounded(tubes(funnel)["peak"]["measured"], "ROUND_CEILING")
     assert said[3] == (
-        f"  assuming (1) innovation peak of its own observer, {BESIDE}: e^2 <= {peak} (m/s)^2 at every "
+        f"  assuming (1) innovation peak of its own observer, {BESIDE}: "
+        f"e^2 <= {peak} (m/s)^2 at every "
         f"sample (largest of 5 distinct trials, each taken whole, {largest}, safety factor 1.5 in "
         "amplitude; a next trial that is exchangeable with them exceeds their largest with "
         "probability at most 1/6)"
