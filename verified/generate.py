@@ -160,7 +160,7 @@ class Writer:
     def upper(self, P: list[list[Any]], what: str) -> str:
         """The upper triangle of a symmetric matrix."""
         if any(number(P[i][j]) != number(P[j][i]) for i in range(len(P)) for j in range(i)):
-            raise NotCovered(f"{what} is not symmetric")
+            raise Refused(f"{what} is not symmetric")
         return self.to.listed(self.nums(row[i:]) for i, row in enumerate(P))
 
     def squares(self, stated: dict[str, Any]) -> str:
