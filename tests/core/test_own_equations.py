@@ -88,7 +88,7 @@ def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
 
 
 def test_a_motion_is_planned_for_the_centre_of_what_is_uncertain() -> None:
-    ends = {"start": [0.0, 0.0], "end": [1.0, 0.0], "seconds": 1}
+    ends: dict[str, Any] = {"start": [0.0, 0.0], "end": [1.0, 0.0], "seconds": 1}
     pushed = lambda x, u, w: [x[1], u[0] + w[0]]  # noqa: E731
     found = plan_motion(pushed, **ends, m=1, uncertain=[[1.0, 3.0]])
     alone = plan_motion(lambda x, u: [x[1], u[0] + 2.0], **ends, m=1)
@@ -105,7 +105,7 @@ def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
     box = [[0.0, 0.0]]
     motion = plan_motion(rate, start=[0, 0], end=[1, 0], seconds=2, m=1, uncertain=box)
     found = design(ContinuousTracking(rate, motion, goal=[0.2, 0.2], uncertain=box))
-    assert found.verdict.is_proved
+    assert found.verdict.margin > 0
 
 
 def test_inputs_share_what_they_do_by_the_square_of_their_scale() -> None:
