@@ -234,7 +234,7 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
         for lags in ORDERS:
             yield FeedbackClass(lags), CertifiedSem(STEPS)
     if one:
-        yield BlockCascadeClass((3, 3), phases=(1, 2), intervals=(12, 24, 48)), Sem()
+        yield BlockCascadeClass((3, 3), phases=(1, 2, 3), intervals=(12, 24, 48)), Sem()
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +260,7 @@ def best_of(
         def simulator(
             few: Dataset, model_class: Any = model_class, method: Method = method
         ) -> Simulator:
-            model = fitted(few, None, model_class, method, proved=proved).model
+            model = fitted(case, few, model_class, method, proved=proved).model
             return lambda trials: simulate_trials(model, trials.trajectories)
 
         error = crossed(case, simulator, both)
@@ -272,10 +272,8 @@ def best_of(
             f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {describe(model_class)}", flush=True
         )
     for error, model_class, method in sorted(found, key=lambda entry: entry[0]):
-        knots = isinstance(model_class, BlockCascadeClass)  # validation data choose its knots
-        made, chosen_by = (train, validation) if knots else (both, None)
         try:
-            fit = fitted(made, chosen_by, model_class, method, proved=proved)
+            fit = fitted(case, both, model_class, method, proved=proved)
         except NlsidError:
             continue
         with np.errstate(over="ignore", invalid="ignore"):
@@ -321,11 +319,11 @@ def folds(data: Dataset) -> list[Dataset]:
 
 
 def fitted(
-    train: Dataset, validation: Dataset | None, model_class: Any, method: Method, *, proved: bool
+    case: PublicSet, train: Dataset, model_class: Any, method: Method, *, proved: bool
 ) -> Fit[Any]:
     """A fit; NlsidError if there is none, or none with a proof where one is asked for."""
     return identify(
-        train, model_class, method=method, comparators=(), validation=validation,
+        train, model_class, method=method, comparators=(), transient=case.skipped,
         allow_unproved=not proved,
     )  # fmt: skip
 

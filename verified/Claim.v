@@ -110,3 +110,30 @@ Definition in_goal (d : problem) (x : list (R -> R)) : Prop :=
       let z := zip Rminus (at_time x (finish d)) (map val centre) in
       form (map (map val) B) z z <= 1
   end.
+
+(* A policy that is held, late, or measures with an error: the input at t is the policy's of some
+   time tau at most [period] before, not before [since], for the state then, which is measured wrong
+   by at most so much. At a knot it is the policy's on either side. *)
+Definition was_applied (d : problem) (period : num) (errors : list num) (x : list (R -> R))
+  (since t : R) (u : list R) : Prop :=
+  exists g tau e, In g (segments d) /\ begins g <= tau <= ends g /\
+    since <= tau /\ t - val period <= tau <= t /\
+    Forall2 (fun v most => Rabs v <= val most) e errors /\
+    u = input d g (place g tau) (zip Rplus (at_time x tau) e).
+(* x starts at [since] and is continuous from then on; between knots its derivative is what the
+   equations give under u, for some w in its box. *)
+Definition held_solution (d : problem) (period : num) (errors : list num) (since : R)
+  (x : list (R -> R)) (u : R -> list R) : Prop :=
+  Forall (fun g => length x = length (nominal g)) (segments d) /\
+  (forall t, since <= t <= finish d -> Forall (fun f => continuity_pt f t) x) /\
+  (forall g t, In g (segments d) -> begins g < t < ends g ->
+    (since <= t -> was_applied d period errors x since t (u t)) /\
+    (since < t -> exists w, in_box w (box d) /\
+      Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (u t) w))).
+(* The state within its bounds at every time, the input that is applied between knots. *)
+Definition held_in_bounds (d : problem) (x : list (R -> R)) (u : R -> list R) (t : R) : Prop :=
+  forall g b, In g (segments d) -> In b (bounds g) ->
+  (begins g <= t <= ends g -> (fst b < length (nominal g))%nat ->
+    val (fst (snd b)) <= nth (fst b) (at_time x t) 0 <= val (snd (snd b))) /\
+  (begins g < t < ends g ->
+    val (fst (snd b)) <= nth (fst b) (at_time x t ++ u t) 0 <= val (snd (snd b))).

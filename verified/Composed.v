@@ -83,11 +83,11 @@ Proof.
   unfold ends, begins in *. rewrite Hk in T1. lra.
 Qed.
 
-Lemma enters_inside d e w w' lambda x : check d w = true -> check e w' = true ->
-  (0 < length (segments d))%nat -> solution d x -> solution e x -> enters d e lambda = true ->
+Lemma enters_inside d e w w' lambda x : checked d w -> checked e w' ->
+  (0 < length (segments d))%nat -> solution d x -> enters d e lambda = true ->
   inside d x (finish d) -> inside e x (begin e) /\ finish d = begin e.
 Proof.
-  intros Cd Ce Hne Sd Se H Hin. unfold enters in H.
+  intros Cd Ce Hne Sd H Hin. unfold enters in H.
   destruct (rev (segments d)) as [|h hs] eqn:Er; [discriminate|].
   destruct (segments e) as [|g gs] eqn:Eg; [discriminate|].
   apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [H0 H1].
@@ -97,19 +97,19 @@ Proof.
   assert (Fin : finish d = begin e).
   { unfold finish, begin. rewrite Es, map_app, Eg. cbn. rewrite last_last. unfold ends, begins. now rewrite H0. }
   split; auto.
-  pose proof (goal_reached (aimed d g) w lambda Cd H2 Hne x Sd Hin) as G.
+  assert (Ca : checked (aimed d g) w) by (destruct Cd; constructor; assumption).
+  pose proof (goal_reached (aimed d g) w lambda Ca H2 Hne x (solution_length d w x Cd Hne Sd) Hin) as G.
   unfold in_goal in G. cbn [goal aimed] in G. unfold starting in G.
   change (finish (aimed d g)) with (finish d) in G. rewrite Fin in G.
-  destruct (checked_segments e w' Ce) as [Hok _].
+  destruct Ce as [_ _ Hl Hok Ht _].
   assert (Hg : In g (segments e)) by (rewrite Eg; now left).
   pose proof Hok as Hok'. rewrite Forall_forall in Hok. pose proof (Hok g Hg) as Okg.
   destruct (segment_facts e g (first_size e) Okg) as [_ _ _ _ C T R0 _ [S0 S1] _].
   intros g' Hg' Hr.
   assert (g' = g).
   { apply (first_only (segments e) g' g gs Eg).
-    - unfold check in Ce. apply andb_prop in Ce as [Ce _]. apply andb_prop in Ce as [Ce _].
-      now apply andb_prop in Ce as [_ Ce].
-    - apply Forall_forall. intros k Hk. now destruct (segment_facts e k (first_size e) (Hok k Hk)).
+    - exact Hl.
+    - exact Ht.
     - exact Hg'.
     - unfold begin in Hr. rewrite Eg in Hr. lra. }
   subst g'. assert (B : begin e = begins g) by (unfold begin; now rewrite Eg). rewrite B in *.
@@ -124,25 +124,18 @@ Proof.
   pose proof (Rmult_le_compat_r (val (level (start g))) _ _ (Rlt_le _ _ R0) G). lra.
 Qed.
 
-Lemma stage_checked s w : stage_ok s w = true -> check (stated_by s) w = true /\
+Lemma stage_checked s w : stage_ok s w = true -> checked (stated_by s) w /\
   (0 < length (segments (stated_by s)))%nat.
 Proof.
   unfold stage_ok, files_ok. cbn zeta. intros H. apply andb_prop in H as [_ H].
   apply andb_prop in H as [H _]. apply andb_prop in H as [H _]. unfold funnel_ok in H.
   apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [H1 _]. apply andb_prop in H2 as [H2 _].
-  apply Nat.ltb_lt in H2. auto.
+  apply Nat.ltb_lt in H2. split; auto. exact (check_facts _ _ _ H1).
 Qed.
-Lemma ordered d w : check d w = true -> (0 < length (segments d))%nat -> begin d <= finish d.
+Lemma ordered d w : checked d w -> (0 < length (segments d))%nat -> begin d <= finish d.
 Proof.
-  intros H Hne. destruct (checked_segments d w H) as [Hok _]. unfold begin, finish.
-  assert (Hl : linked (segments d) = true).
-  { unfold check in H. apply andb_prop in H as [H _]. apply andb_prop in H as [H _].
-    now apply andb_prop in H as [_ H]. }
-  assert (Ht : Forall (fun g => begins g < ends g) (segments d)).
-  { apply Forall_forall. intros g Hg. rewrite Forall_forall in Hok.
-    now destruct (segment_facts d g (first_size d) (Hok g Hg)). }
-  destruct (segments d) as [|g gs]; [cbn in Hne; lia|].
-  destruct (last_end (g :: gs) g (or_introl eq_refl) Hl Ht) as [_ A]. inversion Ht; subst. lra.
+  intros [_ _ _ _ Ht Range] Hne. destruct (segments d) as [|g gs] eqn:E; [cbn in Hne; lia|].
+  destruct (Range g (or_introl eq_refl)). inversion Ht; subst. lra.
 Qed.
 
 Theorem composed_theorem gs : forall ws lambdas, composed_ok gs ws lambdas = true ->
@@ -168,7 +161,7 @@ Proof.
       apply andb_prop in HJ as [J1 J2].
       cbn [combine forallb fst snd] in W2. pose proof W2 as W2'. apply andb_prop in W2' as [W3 _].
       destruct (stage_checked s2 w2 W3) as [C2 _]. inversion S2 as [|? ? S3 _]; subst.
-      destruct (enters_inside _ _ w w2 l x C C2 N S1 S3 J1 Hend) as [Hin _].
+      destruct (enters_inside _ _ w w2 l x C C2 N S1 J1 Hend) as [Hin _].
       destruct (IH (w2 :: ws) lambdas x L W2 J2 S2) as [_ F]. exact (F _ _ eq_refl Hin). }
     assert (Tail : carried (map stated_by gs) x).
     { destruct gs as [|s2 gs]; [exact Logic.I|]. destruct lambdas as [|l lambdas]; [discriminate|].

@@ -39,6 +39,10 @@ Fixpoint held (limits : list (option (num * num))) (mode : list side) (us : list
   | _, _, _ => []
   end.
 
+(* What is off by delta; by nothing, if delta is empty. *)
+Definition moved (delta us : list R) : list R :=
+  match delta with [] => us | _ => zip Rplus us delta end.
+
 (* h (dx/dt - dx0/dt), the slope of P, and dW/ds - drho/ds along the segment *)
 Definition relative (g : segment) (s : R) (x u w : list R) : list R :=
   zip (fun f d => duration g * f - d) (field g (line s (time (start g)) (time (stop g))) x u w)
@@ -50,10 +54,10 @@ Definition growth (g : segment) (s : R) (x u w : list R) : R :=
   let z := deviation g s x in
   form (P' g) z z + 2 * form (P g s) z (relative g s x u w) - rho' g.
 Definition condition (margin : num) (limits : list (option (num * num))) (mode : list side)
-  (vertex : list num) (g : segment) (s : R) (x : list R) (mu : R) (taus : list R) : R :=
+  (delta vertex : list num) (g : segment) (s : R) (x : list R) (mu : R) (taus : list R) : R :=
   let z := deviation g s x in
   let us := wanted g s z in
-  -1 * growth g s x (applied limits mode us) (map val vertex)
+  -1 * growth g s x (moved (map val delta) (applied limits mode us)) (map val vertex)
     - val margin * (duration g * rho g s)
     + mu * (rho g s - form (P g s) z z)
     - dot taus (held limits mode us).
@@ -138,20 +142,31 @@ Fixpoint fheld (limits : list (option (num * num))) (mode : list side) (us : lis
   | _, _, _ => []
   end.
 
-Definition fcondition (margin : num) (limits : list (option (num * num))) (mode : list side)
-  (vertex : list num) (g : segment) (depth index : Z) (mu : F) (taus : list F) : F :=
+Definition fmoved (delta : list num) (us : list F) : list F :=
+  match delta with [] => us | _ => zip fadd us (map fnum delta) end.
+
+(* h (dx/dt - dx0/dt) *)
+Definition frelative (limits : list (option (num * num))) (mode : list side)
+  (delta vertex : list num) (g : segment) (depth index : Z) : list F :=
   let B := fbernstein (fplace depth index) (fremaining depth index) in
   let z := fdeviation g in
-  let P := fshape B g in
   let h := fsub (fnum (time (stop g))) (fnum (time (start g))) in
   let x := zip fadd (map (fun c => fcurve B (map fnum c)) (nominal g)) z in
   let us := fwanted B g in
   let t := fcurve B [fnum (time (start g)); fnum (time (stop g))] in
-  let values := t :: x ++ fapplied limits mode us ++ map fnum vertex in
+  let values := t :: x ++ fmoved delta (fapplied limits mode us) ++ map fnum vertex in
   let table := ftable values (highest (equations g)) in
   let f := map (fun e => frate e table) (equations g) in
   let dx0 := map (fun c => fcurve' B (map fnum c)) (nominal g) in
-  let v := zip (fun f d => fsub (fmul h f) d) f dx0 in
+  zip (fun f d => fsub (fmul h f) d) f dx0.
+Definition fcondition (margin : num) (limits : list (option (num * num))) (mode : list side)
+  (delta vertex : list num) (g : segment) (depth index : Z) (mu : F) (taus : list F) : F :=
+  let B := fbernstein (fplace depth index) (fremaining depth index) in
+  let z := fdeviation g in
+  let P := fshape B g in
+  let h := fsub (fnum (time (stop g))) (fnum (time (start g))) in
+  let us := fwanted B g in
+  let v := frelative limits mode delta vertex g depth index in
   let P' := zip (zip (fun a b => fsub (fnum b) (fnum a))) (shape (start g)) (shape (stop g)) in
   let rho := flevel B g in
   let rho' := fsub (fnum (level (stop g))) (fnum (level (start g))) in
@@ -320,7 +335,7 @@ Qed.
 
 Section Segment.
 Variables (margin : num) (limits : list (option (num * num))) (mode : list side)
-  (vertex : list num) (g : segment) (x : list R).
+  (delta vertex : list num) (g : segment) (x : list R).
 Hypothesis Hz : z = deviation g s x.
 Hypothesis Hx : length x = length (nominal g).
 
@@ -367,13 +382,31 @@ Proof.
     intros [= H]. rewrite IH by auto. f_equal. ring.
 Qed.
 
+Lemma means_moved us vs : Forall2 means us vs -> Forall2 means (fmoved delta us) (moved (map val delta) vs).
+Proof.
+  intros H. destruct delta as [|e l]; auto. cbn [fmoved moved map].
+  eapply Forall2_zip; [|exact H|apply (Forall2_map2 means fnum val (e :: l)), means_fnum].
+  intros. now apply means_add.
+Qed.
+
+Lemma means_duration : means (fsub (fnum (time (stop g))) (fnum (time (start g)))) (duration g).
+Proof. apply means_sub; apply means_fnum. Qed.
+Lemma means_relative : Forall2 means (frelative limits mode delta vertex g depth index)
+  (relative g s x (moved (map val delta) (applied limits mode (wanted g s z))) (map val vertex)).
+Proof.
+  unfold frelative, relative. eapply Forall2_zip.
+  2:{ unfold field. apply Forall2_map2. intros e. apply means_frate, means_ftable.
+      constructor; [apply means_line|]. apply Forall2_app; [apply means_x|].
+      apply Forall2_app; [apply means_moved, means_applied, means_wanted|]. apply Forall2_map2, means_fnum. }
+  2:{ apply Forall2_map2. intros c. apply means_curve'. apply Forall2_map2, means_fnum. }
+  intros a a' b b' Ha Hb. apply means_sub; auto. apply means_mul; auto. apply means_duration.
+Qed.
 Lemma means_condition mu m taus ts : means mu m -> Forall2 means taus ts ->
-  means (fcondition margin limits mode vertex g depth index mu taus)
-    (condition margin limits mode vertex g s x m ts).
+  means (fcondition margin limits mode delta vertex g depth index mu taus)
+    (condition margin limits mode delta vertex g s x m ts).
 Proof.
   intros Hmu Htau. pose proof means_deviation as Hd.
-  assert (Hh : means (fsub (fnum (time (stop g))) (fnum (time (start g)))) (duration g)).
-  { apply means_sub; apply means_fnum. }
+  pose proof means_duration as Hh.
   unfold fcondition, condition, growth. rewrite <- Hz.
   apply means_sub; [apply means_add; [apply means_sub|]|].
   - apply (means_scale _ _ (-1)).
@@ -383,12 +416,7 @@ Proof.
       intros a ? b ? <- <-. eapply Forall2_zip; [|apply Forall2_same|apply Forall2_same].
       intros u ? v ? <- <-. apply means_sub; apply means_fnum.
     + apply (means_scale _ _ 2). apply means_fform; auto; [apply means_shape|].
-      unfold relative. eapply Forall2_zip.
-      2:{ unfold field. apply Forall2_map2. intros e. apply means_frate, means_ftable.
-          constructor; [apply means_line|]. apply Forall2_app; [apply means_x|].
-          apply Forall2_app; [apply means_applied, means_wanted|]. apply Forall2_map2, means_fnum. }
-      2:{ apply Forall2_map2. intros c. apply means_curve'. apply Forall2_map2, means_fnum. }
-      intros a a' b b' Ha Hb. apply means_sub; auto. now apply means_mul.
+      apply means_relative.
     + apply means_sub; apply means_fnum.
   - apply means_mul; [apply means_fnum|]. apply means_mul; auto. apply means_level.
   - apply means_mul; auto. apply means_sub; [apply means_level|].

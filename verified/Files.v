@@ -88,7 +88,7 @@ Context {K : Ints}.
 Definition files_ok f p u g (w : witness) : bool :=
   let d := stated f p u g in
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
-    (andb (andb (funnel_ok d w) (bounds_ok d))
+    (andb (andb (funnel_ok d (unmoved d) w) (bounds_ok d (unmoved d)))
       (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
        else true)).
 
@@ -103,7 +103,8 @@ Proof.
   unfold files_ok. cbn zeta. set (d := stated f p u g). intros H x Hx ta Hta Hin.
   apply andb_prop in H as [_ H]. apply andb_prop in H as [H _]. apply andb_prop in H as [H Hb].
   destruct (funnel_proved d w H x Hx ta Hta Hin) as [S G]. split; auto.
-  intros t Ht. split; auto. apply (valid_kept d w x t); auto; [|lra].
-  unfold funnel_ok in H. apply andb_prop in H as [H _]. now apply andb_prop in H as [H _].
+  unfold funnel_ok in H. apply andb_prop in H as [H Hne]. apply andb_prop in H as [H _].
+  apply andb_prop in Hne as [Hne _]. apply Nat.ltb_lt in Hne. pose proof (check_facts _ _ _ H) as C.
+  intros t Ht. split; auto. apply (valid_kept d w x t); auto; [|lra]. now apply (solution_length d w).
 Qed.
 End Files.

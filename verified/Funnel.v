@@ -21,6 +21,12 @@ Record witness := Witness {
 Definition corners (w : witness) (box : list (num * num)) : list (list num) :=
   if pushed w then [map middle box] else vertices box.
 
+(* What the inputs are off by at most, at its corners, and w at its own; nothing is off: []. *)
+Definition around (off : list num) : list (num * num) := map (fun e => (nopp e, e)) off.
+Definition cases (w : witness) (box : list (num * num)) (off : list num)
+  : list (list num * list num) :=
+  flat_map (fun delta => map (pair delta) (corners w box)) (vertices (around off)).
+
 Definition num_eqb (a b : num) : bool :=
   andb (Z.eqb (fst a) (fst b)) (Pos.eqb (snd a) (snd b)).
 Definition num_ltb (a b : num) : bool := (fst a * Zpos (snd b) <? fst b * Zpos (snd a))%Z.
@@ -54,14 +60,14 @@ Fixpoint all_expanded (rows : list mono) (l : list (list Z * squares)) : option 
 Definition kappa_ok (d : problem) (g : segment) (p : piece) (skipped : nat) : bool :=
   andb (forallb (pushes_only skipped) (equations g))
     (andb (Nat.eqb (length (kappa p)) (length (box d))) (forallb (num_ltb (0%Z, xH)) (kappa p))).
-Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (p : piece)
-  : bool :=
-  match nth_error (corners w (box d)) (vertex p), nth_error (modes (limits d)) (mode p),
+Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (off : list num)
+  (p : piece) : bool :=
+  match nth_error (cases w (box d) off) (vertex p), nth_error (modes (limits d)) (mode p),
     all_expanded (sides w) (tau p) with
-  | Some v, Some m, Some taus =>
+  | Some (delta, v), Some m, Some taus =>
       let f := fmu (multiplier w) (mu p) in
       let skipped := (1 + length (nominal g) + length (limits d))%nat in
-      let c := fcondition (margin w) (limits d) m v g (depth p) (index p) f taus in
+      let c := fcondition (margin w) (limits d) m delta v g (depth p) (index p) f taus in
       andb (andb (andb (0 <=? depth p)%Z (ipos (den f)))
              (if pushed w then kappa_ok d g p skipped else true))
         (is_positive (basis w) products (columns p) (gram_factors p)
@@ -79,9 +85,9 @@ Fixpoint reached (v m : nat) (sofar : Z) (ps : list piece) : Z :=
       then reached v m (Z.max sofar ((index p + 1) * 2 ^ (16 - depth p))) ps'
       else reached v m sofar ps'
   end.
-Definition covered (d : problem) (w : witness) (ps : list piece) : bool :=
+Definition covered (d : problem) (w : witness) (off : list num) (ps : list piece) : bool :=
   forallb (fun v => forallb (fun m => (2 ^ 16 <=? reached v m 0 ps)%Z)
-    (seq 0 (length (modes (limits d))))) (seq 0 (length (corners w (box d)))).
+    (seq 0 (length (modes (limits d))))) (seq 0 (length (cases w (box d) off))).
 
 Fixpoint triangle_ok {A : Type} (k : nat) (M : list (list A)) : bool :=
   match k, M with
@@ -99,6 +105,14 @@ Definition segment_ok (n : nat) (d : problem) (g : segment) : bool :=
     (andb (andb (num_ltb (0%Z, xH) (level (start g))) (num_ltb (0%Z, xH) (level (stop g))))
       (forallb (forallb (fun t => forallb (fun k => Nat.leb k 1) (skipn (1 + n + m) (fst t))))
          (equations g)))).
+(* Inputs that are off need equations that are affine in each. *)
+Definition off_ok (n : nat) (d : problem) (g : segment) (off : list num) : bool :=
+  match off with
+  | [] => true
+  | _ => andb (Nat.eqb (length off) (length (limits d)))
+      (forallb (forallb (fun t => forallb (fun k => Nat.leb k 1) (skipn (1 + n) (fst t))))
+        (equations g))
+  end.
 Definition last_of (c : list num) : num := last c (0%Z, xH).
 Definition first_of (c : list num) : num := hd (0%Z, xH) c.
 Fixpoint linked (gs : list segment) : bool :=
@@ -109,15 +123,20 @@ Fixpoint linked (gs : list segment) : bool :=
   | _ => true
   end.
 
-Definition check (d : problem) (w : witness) : bool :=
+(* [offs]: by segment, what the inputs are off by at most. *)
+Definition check (d : problem) (offs : list (list num)) (w : witness) : bool :=
   let n := match segments d with [] => O | g :: _ => length (nominal g) end in
   let products := products (basis w) in
   andb (andb (andb (num_ltb (0%Z, xH) (margin w)) (linked (segments d)))
          (forallb (fun l => match l with Some (a, b) => num_ltb a b | None => true end) (limits d)))
-    (andb (Nat.eqb (length (pieces w)) (length (segments d)))
-      (forallb (fun e => andb (andb (segment_ok n d (fst e)) (covered d w (snd e)))
-                          (forallb (piece_ok d w products (fst e)) (snd e)))
-        (combine (segments d) (pieces w)))).
+    (andb (andb (Nat.eqb (length (pieces w)) (length (segments d)))
+        (Nat.eqb (length offs) (length (segments d))))
+      (forallb (fun e => let '(g, off, ps) := e in
+          andb (andb (andb (segment_ok n d g) (off_ok n d g off)) (covered d w off ps))
+            (forallb (piece_ok d w products g off) ps))
+        (combine (combine (segments d) offs) (pieces w)))).
+(* Nothing is off. *)
+Definition unmoved (d : problem) : list (list num) := map (fun _ => []) (segments d).
 
 (* Why. *)
 Lemma num_eqb_eq a b : num_eqb a b = true -> a = b.
@@ -255,6 +274,33 @@ Proof.
     clear. induction (equations g) as [|e es IH]; intros [|d ds]; cbn; auto.
 Qed.
 
+(* The same of what is added to the inputs: they come before w. *)
+Lemma zip_split a : forall pre, (exists b b0 c, forall y post,
+    zip Rplus a (pre ++ y :: post) = b ++ (b0 + y) :: zip Rplus c post) \/
+  (exists b, forall y post, zip Rplus a (pre ++ y :: post) = b).
+Proof.
+  induction a as [|a0 a IH]; intros [|p pre]; cbn [app zip].
+  - right. now exists [].
+  - right. now exists [].
+  - left. now exists [], a0, a.
+  - destruct (IH pre) as [[b [b0 [c H]]]|[b H]].
+    + left. exists (a0 + p :: b), b0, c. intros y post. now rewrite H.
+    + right. exists (a0 + p :: b). intros y post. now rewrite H.
+Qed.
+Lemma growth_affine_inputs n g s x a v : Forall (linear_beyond (1 + n)) (equations g) ->
+  length x = n -> affine (fun delta => growth g s x (zip Rplus a delta) v).
+Proof.
+  intros He Hx. assert (A : affine (growth g s x [])).
+  { apply (growth_affine (1 + n)); auto. rewrite app_nil_r. cbn. congruence. }
+  assert (E : forall u, growth g s x u v = growth g s x [] (u ++ v)) by reflexivity.
+  intros pre post p q l. cbn beta. rewrite !E.
+  destruct (zip_split a pre) as [[b [b0 [c H]]]|[b H]].
+  - rewrite !H, <- !app_assoc. cbn [app].
+    replace (b0 + ((1 - l) * p + l * q)) with ((1 - l) * (b0 + p) + l * (b0 + q)) by ring.
+    rewrite (A b (zip Rplus c post ++ v)). reflexivity.
+  - rewrite !H. ring.
+Qed.
+
 (* Pieces cover every place. *)
 Definition holds (p : piece) (s : R) : Prop :=
   IZR (index p) <= s * IZR (2 ^ depth p) <= IZR (index p) + 1.
@@ -336,12 +382,13 @@ Qed.
 (* The heart: outside the funnel, W grows relative to rho by less than a bounded multiple of the
    excess. *)
 Section Segment.
-Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
+Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
 Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
-Hypothesis Hcov : covered d w ps = true.
-Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
+Hypothesis Hoff : off_ok n d g off = true.
+Hypothesis Hcov : covered d w off ps = true.
+Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g off) ps = true.
 
 Record facts : Prop := {
   f_nominal : length (nominal g) = n;
@@ -387,7 +434,7 @@ Proof.
   pose proof (Rmult_le_pos s (val (level (stop g))) ltac:(lra) ltac:(lra)). lra.
 Qed.
 
-Lemma piece_at v m s : 0 <= s <= 1 -> (v < length (corners w (box d)))%nat ->
+Lemma piece_at v m s : 0 <= s <= 1 -> (v < length (cases w (box d) off))%nat ->
   (m < length (modes (limits d)))%nat ->
   exists p, In p ps /\ vertex p = v /\ mode p = m /\ holds p s.
 Proof.
@@ -396,7 +443,7 @@ Proof.
   specialize (Hcov m ltac:(apply in_seq; lia)). apply Z.leb_le in Hcov.
   destruct (reached_covers v m (s * 65536) ps 0) as [p Hp].
   - apply Forall_forall. intros p Hp. rewrite forallb_forall in Hps. specialize (Hps p Hp).
-    unfold piece_ok in Hps. destruct (nth_error _ _); [|discriminate].
+    unfold piece_ok in Hps. destruct (nth_error _ _) as [[? ?]|]; [|discriminate].
     destruct (nth_error _ _); [|discriminate]. destruct (all_expanded _ _); [|discriminate].
     apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _]. apply andb_prop in X as [X _].
     now apply Z.leb_le in X.
@@ -405,28 +452,33 @@ Proof.
   - exists p. replace (s * 65536 / 65536) with s in Hp by field. exact Hp.
 Qed.
 
-Lemma growth_bounded s x w0 : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
+(* u is what the policy applies, or off by at most so much. *)
+Definition within_off (a u : list R) : Prop :=
+  match off with [] => u = a | _ => exists delta, in_box delta (around off) /\ u = zip Rplus a delta end.
+
+Lemma growth_bounded s x u w0 : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
+  within_off (input d g s x) u ->
   let z := deviation g s x in
   0 < form (P g s) z z - rho g s ->
-  growth g s x (input d g s x) w0
+  growth g s x u w0
     < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s).
 Proof.
-  intros Hs Hx Hw z Hgap. destruct segment_facts.
+  intros Hs Hx Hw Hu z Hgap. destruct segment_facts.
   set (us := wanted g s z).
   assert (Hus : length us = length (limits d)).
   { unfold us, wanted. rewrite zip_length; congruence. }
   destruct (mode_exists (limits d) Hlimits us Hus) as [m [Hm [Happ Hheld]]].
   assert (Hin : input d g s x = applied (limits d) m us) by (unfold input; now rewrite Happ).
-  rewrite Hin.
+  rewrite Hin in Hu.
   assert (Lapp : length (applied (limits d) m us) = length (limits d)).
   { rewrite Happ. rewrite zip_length; congruence. }
   apply In_nth_error in Hm as [im Him].
-  assert (At : forall iv v, nth_error (corners w (box d)) iv = Some v -> exists p,
+  assert (At : forall iv delta v, nth_error (cases w (box d) off) iv = Some (delta, v) -> exists p,
     (pushed w = true -> kappa_ok d g p (1 + n + length (limits d)) = true) /\
-    growth g s x (applied (limits d) m us) (map val v)
+    growth g s x (moved (map val delta) (applied (limits d) m us)) (map val v)
       + (if pushed w then cost (kappa p) (box d) g s z (1 + n + length (limits d)) else 0)
       < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s)).
-  { intros iv v Hiv. destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
+  { intros iv delta v Hiv. destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
     { apply nth_error_Some. congruence. } { apply nth_error_Some. congruence. }
     exists p. rewrite forallb_forall in Hps. specialize (Hps p Hp). unfold piece_ok in Hps.
     rewrite Ev, Em, Hiv, Him in Hps.
@@ -440,15 +492,15 @@ Proof.
     assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (mu_at (multiplier w) p s z)).
     { split; auto. unfold mu_at. fold r0. field. lra. }
     pose proof (means_condition s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring) (margin w)
-      (limits d) m v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
+      (limits d) m delta v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
     assert (Hall : means r0 (env z)
       (if pushed w
-       then fsub (fcondition (margin w) (limits d) m v g (depth p) (index p)
+       then fsub (fcondition (margin w) (limits d) m delta v g (depth p) (index p)
               (fmu (multiplier w) (mu p)) taus)
               (fpushed (kappa p) (box d) g (depth p) (index p) skipped)
-       else fcondition (margin w) (limits d) m v g (depth p) (index p)
+       else fcondition (margin w) (limits d) m delta v g (depth p) (index p)
               (fmu (multiplier w) (mu p)) taus)
-      (condition (margin w) (limits d) m v g s x (mu_at (multiplier w) p s z) ts
+      (condition (margin w) (limits d) m delta v g s x (mu_at (multiplier w) p s z) ts
         - (if pushed w then cost (kappa p) (box d) g s z skipped else 0))).
     { destruct (pushed w).
       - apply means_sub; [exact Hc|]. apply means_fpushed; auto; try congruence.
@@ -466,20 +518,55 @@ Proof.
     pose proof (mu_bound_above (multiplier w) ps p s z Hp) as Hab.
     pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hgap) Hab) as Hab'.
     set (cst := if pushed w then _ else 0) in *. nra. }
-  unfold corners in At. destruct (pushed w).
-  - destruct (At O _ eq_refl) as [p [Hk Hg]]. specialize (Hk eq_refl). unfold kappa_ok in Hk.
-    apply andb_prop in Hk as [K1 K2]. apply andb_prop in K2 as [K2 K3]. apply Nat.eqb_eq in K2.
-    eapply Rle_lt_trans; [|exact Hg].
-    apply (below_pushed g s z (duration g)); auto.
-    + unfold duration. lra.
-    + apply Forall_forall. intros k Hk'. rewrite forallb_forall in K3. specialize (K3 k Hk').
-      apply num_ltb_lt in K3. now rewrite val_zero in K3.
-    + intros pre y c post. apply growth_push; try congruence.
-      * apply Forall_forall. intros e He. rewrite forallb_forall in K1. now apply K1.
-      * rewrite app_length, Lapp. lia.
-  - apply (below_on_box (box d)); auto.
-    { apply (growth_affine (1 + n + length (limits d))); auto. rewrite app_length, Lapp. lia. }
-    intros v Hv. apply In_nth_error in Hv as [iv Hiv]. destruct (At iv v Hiv) as [p [_ Hg]]. lra.
+  (* at a corner of what the inputs are off by, for every w *)
+  assert (Corner : forall delta, In delta (vertices (around off)) ->
+    growth g s x (moved (map val delta) (applied (limits d) m us)) w0
+      < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s)).
+  { intros delta Hd.
+    assert (Case : forall v, In v (corners w (box d)) -> exists iv,
+      nth_error (cases w (box d) off) iv = Some (delta, v)).
+    { intros v Hv. apply In_nth_error. unfold cases. apply in_flat_map. exists delta.
+      split; auto. now apply in_map. }
+    assert (Lmov : length (moved (map val delta) (applied (limits d) m us)) = length (limits d)).
+    { destruct delta as [|e l] eqn:Ed; auto. cbn [moved map]. rewrite zip_length; auto.
+      rewrite Lapp. unfold off_ok in Hoff. destruct off as [|o os]; [destruct Hd as [|[]]; discriminate|].
+      apply andb_prop in Hoff as [L _]. apply Nat.eqb_eq in L. rewrite <- L.
+      assert (V : forall b v, In v (vertices b) -> length v = length b).
+      { clear. induction b as [|[p q] b IH]; cbn; intros v [<-|[]] || intros v H; auto.
+        apply in_app_or in H as [H|H]; apply in_map_iff in H as [v' [<- H]]; cbn; auto. }
+      pose proof (V _ _ Hd) as Lv. unfold around in Lv. rewrite map_length in Lv.
+      cbn [length] in *. rewrite map_length. congruence. }
+    set (um := moved (map val delta) (applied (limits d) m us)) in *.
+    unfold corners in Case. destruct (pushed w).
+    - destruct (Case _ (or_introl eq_refl)) as [iv Hiv].
+      destruct (At iv _ _ Hiv) as [p [Hk Hg]]. specialize (Hk eq_refl). unfold kappa_ok in Hk.
+      apply andb_prop in Hk as [K1 K2]. apply andb_prop in K2 as [K2 K3]. apply Nat.eqb_eq in K2.
+      eapply Rle_lt_trans; [|exact Hg].
+      apply (below_pushed g s z (duration g)); auto.
+      + unfold duration. lra.
+      + apply Forall_forall. intros k Hk'. rewrite forallb_forall in K3. specialize (K3 k Hk').
+        apply num_ltb_lt in K3. now rewrite val_zero in K3.
+      + intros pre y c post. apply growth_push; try congruence.
+        * apply Forall_forall. intros e He. rewrite forallb_forall in K1. now apply K1.
+        * rewrite app_length. fold um. rewrite Lmov. lia.
+    - apply (below_on_box (box d)); auto.
+      { apply (growth_affine (1 + n + length (limits d))); auto. rewrite app_length.
+        fold um. rewrite Lmov. lia. }
+      intros v Hv. destruct (Case v Hv) as [iv Hiv]. destruct (At iv _ _ Hiv) as [p [_ Hg]].
+      fold um in Hg. lra. }
+  unfold within_off in Hu. destruct off as [|o os] eqn:Eo.
+  - subst u. exact (Corner [] (or_introl eq_refl)).
+  - destruct Hu as [delta [Hd ->]]. unfold off_ok in Hoff. apply andb_prop in Hoff as [_ Ha].
+    apply (below_on_box (around (o :: os))
+      (fun delta => growth g s x (zip Rplus (applied (limits d) m us) delta) w0)); auto.
+    + apply (growth_affine_inputs n); auto. apply Forall_forall. intros e He.
+      unfold linear_beyond. rewrite forallb_forall in Ha. specialize (Ha e He).
+      apply Forall_forall. intros t Ht. rewrite forallb_forall in Ha. specialize (Ha t Ht).
+      apply Forall_forall. intros k Hk. rewrite forallb_forall in Ha. specialize (Ha k Hk).
+      now apply Nat.leb_le in Ha.
+    + intros v Hv. specialize (Corner v Hv). destruct v as [|e l]; [|exact Corner].
+      exfalso. cbn [around map vertices] in Hv. apply in_app_or in Hv as [H|H];
+        apply in_map_iff in H as [? [? _]]; discriminate.
 Qed.
 End Segment.
 End Funnel.

@@ -91,12 +91,13 @@ Definition goal_ok (d : problem) (lambda : num) : bool :=
 Definition shapes_ok (d : problem) : bool :=
   andb match goal d with Some (_, B) => semidefinite true B | None => true end (forallb (fun g => andb (semidefinite true (shape (start g))) (semidefinite true (shape (stop g))))
     (segments d)).
-Definition funnel_ok (d : problem) (w : witness) : bool :=
-  andb (andb (check d w) (shapes_ok d))
+Definition funnel_ok (d : problem) (offs : list (list num)) (w : witness) : bool :=
+  andb (andb (check d offs w) (shapes_ok d))
     (andb (Nat.ltb 0 (length (segments d))) (goal_ok d (goal_multiplier w))).
 
-Theorem goal_reached d w lambda : check d w = true -> goal_ok d lambda = true ->
-  (0 < length (segments d))%nat -> forall x, solution d x -> inside d x (finish d) -> in_goal d x.
+Theorem goal_reached d w lambda : checked d w -> goal_ok d lambda = true ->
+  (0 < length (segments d))%nat -> forall x, length x = first_size d -> inside d x (finish d) ->
+  in_goal d x.
 Proof.
   intros Hc Hg Hne x Hx S. unfold in_goal, goal_ok in *. destruct (goal d) as [[centre B]|]; auto.
   destruct (rev (segments d)) as [|g gs] eqn:Er; [discriminate|].
@@ -106,7 +107,7 @@ Proof.
   apply andb_prop in G2 as [G2 G4]. apply Nat.eqb_eq in G1. apply triangle_ok_is in G3.
   apply Z.leb_le, IZR_le in G2.
   set (n := length (nominal g)) in *.
-  destruct (checked_segments d w Hc) as [Hok _].
+  pose proof (c_segments d w Hc) as Hok.
   assert (Hin_g : In g (segments d)) by (rewrite Es; apply in_or_app; right; now left).
   assert (Fin : finish d = ends g).
   { unfold finish. rewrite Es, map_app. cbn. now rewrite last_last. }
@@ -114,9 +115,7 @@ Proof.
   set (n0 := first_size d) in *.
   destruct (segment_facts d g n0 Okg) as [Ln Le _ _ C T _ Hrho [S0 S1] _].
   fold n in Ln.
-  assert (Lx : length x = n).
-  { destruct Hx as [_ Dx]. destruct (Dx g ((begins g + ends g) / 2) Hin_g ltac:(lra)) as [w0 [_ F]].
-    apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence. }
+  assert (Lx : length x = n) by congruence.
   pose proof (S g Hin_g ltac:(rewrite Fin; lra)) as I.
   rewrite Fin in *. unfold inside_segment in I. rewrite (place_end g T) in I.
   unfold P, rho in I. rewrite line_1, (zip_line n0 1 line_1 _ _ S0 S1) in I.
@@ -156,7 +155,7 @@ Proof.
   apply (Rmult_le_reg_l rh); auto.
   pose proof (Rmult_le_compat_l la _ _ Lam I). lra.
 Qed.
-Theorem funnel_proved d w : funnel_ok d w = true -> forall x, solution d x ->
+Theorem funnel_proved d w : funnel_ok d (unmoved d) w = true -> forall x, solution d x ->
   forall ta, begin d <= ta <= finish d -> inside d x ta ->
   (forall t, ta <= t <= finish d -> inside d x t) /\ in_goal d x.
 Proof.
@@ -164,7 +163,8 @@ Proof.
   apply andb_prop in H as [H1 H2]. apply andb_prop in H1 as [Hc _].
   apply andb_prop in H2 as [Hne Hg]. apply Nat.ltb_lt in Hne.
   assert (S : forall t, ta <= t <= finish d -> inside d x t).
-  { intros t Ht. apply (stays d w Hc x Hx ta t); auto; lra. }
-  split; auto. apply (goal_reached d w _ Hc Hg Hne x Hx). apply S. lra.
+  { intros t Ht. apply (stays d w Hc Hne x Hx ta t); auto; lra. }
+  pose proof (check_facts _ _ _ Hc) as C.
+  split; auto. apply (goal_reached d w _ C Hg Hne x (solution_length d w x C Hne Hx)). apply S. lra.
 Qed.
 End Goal.

@@ -43,20 +43,24 @@ Proof.
 Qed.
 
 Section Segment.
-Variables (d : problem) (w : witness) (g : segment) (ps : list piece) (n : nat).
+Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
 Hypothesis Hmargin : 0 < val (margin w).
 Hypothesis Hok : segment_ok n d g = true.
-Hypothesis Hcov : covered d w ps = true.
-Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g) ps = true.
+Hypothesis Hoff : off_ok n d g off = true.
+Hypothesis Hcov : covered d w off ps = true.
+Hypothesis Hps : forallb (piece_ok d w (products (basis w)) g off) ps = true.
 Let F := segment_facts d g n Hok.
 
-Variable x : list (R -> R).
+(* between lo and hi, under the input act *)
+Variables (x : list (R -> R)) (act : R -> list R) (lo hi : R).
 Hypothesis Hx : length x = n.
-Hypothesis Cx : forall t, begins g <= t <= ends g -> Forall (fun f => continuity_pt f t) x.
-Hypothesis Dx : forall t, begins g < t < ends g -> exists w, in_box w (box d) /\
-  Forall2 (fun f v => derivable_pt_lim f t v) x
-    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w).
+Hypothesis Cx : forall t, begins g <= t <= ends g -> lo <= t <= hi ->
+  Forall (fun f => continuity_pt f t) x.
+Definition moves (t : R) : Prop := exists w, in_box w (box d) /\
+  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) (act t) w).
+Hypothesis Dx : forall t, begins g < t < ends g -> lo < t < hi ->
+  within_off off (input d g (place g t) (at_time x t)) (act t) /\ moves t.
 
 Definition dev (t : R) : list R := deviation g (place g t) (at_time x t).
 Definition gap (t : R) : R := form (P g (place g t)) (dev t) (dev t) - rho g (place g t).
@@ -96,9 +100,10 @@ Lemma dev_length t : length (dev t) = n.
 Proof.
   destruct F. unfold dev, deviation. rewrite zip_length; rewrite ?map_length, at_time_length; auto.
 Qed.
-Lemma dev_continuous t : begins g <= t <= ends g -> forall i, continuity_pt (fun u => env (dev u) i) t.
+Lemma dev_continuous t : begins g <= t <= ends g -> lo <= t <= hi ->
+  forall i, continuity_pt (fun u => env (dev u) i) t.
 Proof.
-  intros Ht i. unfold env, dev, deviation. pose proof (Cx t Ht) as C.
+  intros Ht Hr i. unfold env, dev, deviation. pose proof (Cx t Ht Hr) as C.
   destruct F as [_ _ _ _ Hcv _ _ _ _ _].
   assert (DA : forall c, (0 < length c <= 4)%nat ->
     continuity_pt (fun u => along (place g u) c) t).
@@ -113,13 +118,11 @@ Proof.
   - apply IH; auto.
 Qed.
 
-Lemma d_dev t : begins g < t < ends g -> forall w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x
-    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w0) ->
-  slopes dev t (map (fun v => v * / duration g)
-    (relative g (place g t) (at_time x t) (input d g (place g t) (at_time x t)) w0)).
+Lemma d_dev t : begins g < t < ends g -> forall ut w0,
+  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
+  slopes dev t (map (fun v => v * / duration g) (relative g (place g t) (at_time x t) ut w0)).
 Proof.
-  intros Ht w0 Hd. unfold relative. rewrite line_place.
+  intros Ht ut w0 Hd. unfold relative. rewrite line_place.
   set (vs := field g t _ _ _) in *. clearbody vs. destruct F as [_ _ _ _ Hcv _ _ _ _ _].
   exists (zip (fun f c u => f u - along (place g u) c) x (nominal g)). split.
   - intros u. unfold dev, deviation. generalize (nominal g).
@@ -160,13 +163,11 @@ Proof.
   induction M as [|[|a b] M IH]; intros [|y0 y] [|z0 z]; cbn; try ring.
   rewrite IH, !dot_scaled. ring.
 Qed.
-Lemma d_gap t : begins g < t < ends g -> forall w0,
-  Forall2 (fun f v => derivable_pt_lim f t v) x
-    (field g t (at_time x t) (input d g (place g t) (at_time x t)) w0) ->
-  derivable_pt_lim gap t
-    (growth g (place g t) (at_time x t) (input d g (place g t) (at_time x t)) w0 * / duration g).
+Lemma d_gap t : begins g < t < ends g -> forall ut w0,
+  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
+  derivable_pt_lim gap t (growth g (place g t) (at_time x t) ut w0 * / duration g).
 Proof.
-  intros Ht w0 Hd. pose proof (d_dev t Ht w0 Hd) as Hdev.
+  intros Ht ut w0 Hd. pose proof (d_dev t Ht ut w0 Hd) as Hdev.
   pose proof (d_form _ _ _ _ _ _ _ (d_P t) Hdev Hdev) as D.
   eapply limit_equal.
   { unfold gap. apply (d_minus (fun u => form (P g (place g u)) (dev u) (dev u))
@@ -195,18 +196,18 @@ Proof.
     + now apply (means_deviation (place g t) (place g t) (dev t) g (at_time x t)).
   - apply (means_level (place g t) (place g t) (dev t) 0 0); auto. lia.
 Qed.
-Lemma gap_continuous t : begins g <= t <= ends g -> continuity_pt gap t.
+Lemma gap_continuous t : begins g <= t <= ends g -> lo <= t <= hi -> continuity_pt gap t.
 Proof.
-  intros Ht. destruct means_gap as [p Hp].
+  intros Ht Hr. destruct means_gap as [p Hp].
   apply (continuous_same (fun u => pval (place g u) (env (dev u)) (Polynomials.num p) * / r (den p))).
   { intros u. destruct (Hp u) as [D V]. rewrite V. field. lra. }
   apply (c_mult (fun u => pval (place g u) (env (dev u)) (Polynomials.num p))); [|apply c_const].
   apply c_pval; [apply place_continuous|now apply dev_continuous].
 Qed.
-Lemma bound_continuous t : begins g <= t <= ends g ->
+Lemma bound_continuous t : begins g <= t <= ends g -> lo <= t <= hi ->
   continuity_pt (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g) t.
 Proof.
-  intros Ht. apply (c_mult (fun u => mu_bound (multiplier w) ps (place g u) (dev u)));
+  intros Ht Hr. apply (c_mult (fun u => mu_bound (multiplier w) ps (place g u) (dev u)));
     [|apply c_const].
   clear Hcov Hps. induction ps as [|p l IH]; cbn [mu_bound]; [apply c_const|].
   assert (C : continuity_pt (fun u => mu_at (multiplier w) p (place g u) (dev u)) t).
@@ -223,27 +224,28 @@ Proof.
   now apply (c_mult (fun u => mu_at (multiplier w) p (place g u) (dev u))).
 Qed.
 
-Lemma segment_stays ta t : begins g <= ta -> ta <= t <= ends g ->
+Lemma segment_stays ta t : begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
   inside_segment g x ta -> inside_segment g x t.
 Proof.
-  intros Ha Ht H. assert (G : gap t <= 0); [|unfold gap, dev in G; unfold inside_segment; lra].
+  intros Ha Hlo Ht Hhi H. assert (G : gap t <= 0); [|unfold gap, dev in G; unfold inside_segment; lra].
   apply (barrier gap (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g)
-    ta (ends g)); auto.
-  - intros u Hu. apply gap_continuous. lra.
-  - intros u Hu. apply bound_continuous. lra.
-  - intros u Hu. destruct (Dx u ltac:(lra)) as [w0 [Hw Hd]].
-    eexists. split; [apply (d_gap u ltac:(lra) w0 Hd)|]. intros Hpos.
-    pose proof (growth_bounded d w g ps n Hlimits Hmargin Hok Hcov Hps (place g u) (at_time x u) w0
-      (place_in u ltac:(lra)) (at_time_length u) Hw Hpos) as B.
+    ta t); auto; try lra.
+  - intros v Hv. apply gap_continuous; lra.
+  - intros v Hv. apply bound_continuous; lra.
+  - intros v Hv. destruct (Dx v ltac:(lra) ltac:(lra)) as [Hu [w0 [Hw Hd]]].
+    eexists. split; [apply (d_gap v ltac:(lra) (act v) w0 Hd)|]. intros Hpos.
+    pose proof (growth_bounded d w g off ps n Hlimits Hmargin Hok Hoff Hcov Hps (place g v)
+      (at_time x v) (act v) w0 (place_in v ltac:(lra)) (at_time_length v) Hw Hu Hpos) as B.
     pose proof (Rinv_0_lt_compat _ duration_pos) as D.
-    apply (Rmult_lt_compat_r _ _ _ D) in B. unfold gap. fold (dev u) in B. nra.
+    apply (Rmult_lt_compat_r _ _ _ D) in B. unfold gap. fold (dev v) in B. nra.
   - unfold gap, dev. unfold inside_segment in H. lra.
 Qed.
 End Segment.
 
 (* Segments joined. *)
-Definition member_stays (x : list (R -> R)) (g : segment) : Prop :=
-  forall ta t, begins g <= ta -> ta <= t <= ends g -> inside_segment g x ta -> inside_segment g x t.
+Definition member_stays (x : list (R -> R)) (lo hi : R) (g : segment) : Prop :=
+  forall ta t, begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
+  inside_segment g x ta -> inside_segment g x t.
 Lemma place_start g : place g (begins g) = 0.
 Proof. unfold place. unfold Rdiv. ring. Qed.
 Lemma place_end g : begins g < ends g -> place g (ends g) = 1.
@@ -305,14 +307,14 @@ Proof.
   rewrite (zip_line n 1 line_1 _ _ S0 S), (zip_line_left n 0 line_0 _ _ S' S''), Hk. auto.
 Qed.
 
-Lemma chain n d x gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
-  Forall (member_stays x) gs ->
+Lemma chain n d x lo hi gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
+  Forall (member_stays x lo hi) gs ->
   forall g0, In g0 gs ->
-  forall ta t, (match gs with g :: _ => begins g | [] => ta end) <= ta <= t ->
+  forall ta t, (match gs with g :: _ => begins g | [] => ta end) <= ta <= t -> lo <= ta -> t <= hi ->
   (forall g, In g gs -> begins g <= ta <= ends g -> inside_segment g x ta) ->
   begins g0 <= t <= ends g0 -> inside_segment g0 x t.
 Proof.
-  induction gs as [|g gs IH]; intros Hok Hl Hs g0 H0 ta t Ht Hin Hg0; [destruct H0|].
+  induction gs as [|g gs IH]; intros Hok Hl Hs g0 H0 ta t Ht Hlo Hhi Hin Hg0; [destruct H0|].
   inversion Hok as [|? ? Hok1 Hok2]; subst. inversion Hs as [|? ? Hs1 Hs2]; subst.
   destruct H0 as [<-|H0].
   { apply (Hs1 ta t); try lra. apply Hin; [now left|]. lra. }
@@ -361,32 +363,51 @@ Qed.
 
 Definition first_size (d : problem) : nat :=
   match segments d with [] => O | g :: _ => length (nominal g) end.
-Lemma checked_segments d w : check d w = true ->
+Lemma checked_segments d offs w : check d offs w = true ->
   Forall (fun g => segment_ok (first_size d) d g = true) (segments d) /\
-  forall g, In g (segments d) -> exists ps, covered d w ps = true /\
-    forallb (piece_ok d w (products (basis w)) g) ps = true.
+  length offs = length (segments d) /\
+  forall g off, In (g, off) (combine (segments d) offs) -> exists ps,
+    off_ok (first_size d) d g off = true /\ covered d w off ps = true /\
+    forallb (piece_ok d w (products (basis w)) g off) ps = true.
 Proof.
   intros H. unfold check in H. fold (first_size d) in H.
-  apply andb_prop in H as [_ H]. apply andb_prop in H as [Hlen H].
-  apply Nat.eqb_eq in Hlen.
-  assert (Each : forall g, In g (segments d) -> exists ps, segment_ok (first_size d) d g = true /\
-    covered d w ps = true /\ forallb (piece_ok d w (products (basis w)) g) ps = true).
-  { intros g Hg. rewrite forallb_forall in H.
-    assert (G : exists ps, In (g, ps) (combine (segments d) (pieces w))).
-    { clear - Hg Hlen. revert Hg Hlen. generalize (pieces w).
-      induction (segments d) as [|g1 gs IH]; intros [|p ps] Hg Hlen; cbn in *; try tauto;
-        try discriminate. destruct Hg as [->|Hg]; [eauto|]. destruct (IH ps Hg) as [q Hq]; eauto. }
-    destruct G as [ps G]. specialize (H _ G). cbn [fst snd] in H.
-    apply andb_prop in H as [A B]. apply andb_prop in A as [A1 A2]. eauto. }
-  split.
-  - apply Forall_forall. intros g Hg. destruct (Each g Hg) as [ps [A _]]. exact A.
-  - intros g Hg. destruct (Each g Hg) as [ps [_ A]]. eauto.
+  apply andb_prop in H as [_ H]. apply andb_prop in H as [Hlen H]. apply andb_prop in Hlen as [Hlen Lo].
+  apply Nat.eqb_eq in Hlen, Lo.
+  assert (Each : forall g off, In (g, off) (combine (segments d) offs) -> exists ps,
+    segment_ok (first_size d) d g = true /\ off_ok (first_size d) d g off = true /\
+    covered d w off ps = true /\ forallb (piece_ok d w (products (basis w)) g off) ps = true).
+  { intros g off Hg. rewrite forallb_forall in H.
+    assert (G : exists ps, In (g, off, ps) (combine (combine (segments d) offs) (pieces w))).
+    { assert (L : length (combine (segments d) offs) = length (pieces w)).
+      { rewrite combine_length, Lo, Nat.min_id. auto. }
+      clear - Hg L. revert Hg L. generalize (pieces w).
+      induction (combine (segments d) offs) as [|g1 gs IH]; intros [|p ps] Hg Hlen; cbn in *;
+        try tauto; try discriminate. destruct Hg as [->|Hg]; [eauto|].
+      destruct (IH ps Hg) as [q Hq]; eauto. }
+    destruct G as [ps G]. specialize (H _ G). cbn beta iota in H.
+    apply andb_prop in H as [A B]. apply andb_prop in A as [A1 A2]. apply andb_prop in A1 as [A1 A3].
+    eauto 6. }
+  split; [|split]; auto.
+  - apply Forall_forall. intros g Hg.
+    assert (G : exists off, In (g, off) (combine (segments d) offs)).
+    { clear - Hg Lo. revert Hg Lo. generalize offs. induction (segments d) as [|g1 gs IH];
+        intros [|o os] Hg L; cbn in *; try tauto; try discriminate. destruct Hg as [->|Hg]; [eauto|].
+      destruct (IH os Hg) as [q Hq]; eauto. }
+    destruct G as [off G]. destruct (Each g off G) as [ps [A _]]. exact A.
+  - intros g off Hg. destruct (Each g off Hg) as [ps [_ A]]. eauto.
 Qed.
 
-Theorem stays d w : check d w = true -> forall x, solution d x ->
-  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+(* What the other theorems read of a funnel that was decided. *)
+Record checked (d : problem) (w : witness) : Prop := {
+  c_margin : 0 < val (margin w);
+  c_limits : Forall proper (limits d);
+  c_linked : linked (segments d) = true;
+  c_segments : Forall (fun g => segment_ok (first_size d) d g = true) (segments d);
+  c_times : Forall (fun g => begins g < ends g) (segments d);
+  c_range : forall g, In g (segments d) -> begin d <= begins g /\ ends g <= finish d }.
+Lemma check_facts d offs w : check d offs w = true -> checked d w.
 Proof.
-  intros H x [Cx Dx] ta t Ha Ht Hin. destruct (checked_segments d w H) as [Hok Each].
+  intros H. destruct (checked_segments d offs w H) as [Hok _].
   unfold check in H. apply andb_prop in H as [H1 _]. apply andb_prop in H1 as [H1 H3].
   apply andb_prop in H1 as [Hm Hl]. apply num_ltb_lt in Hm. rewrite val_zero in Hm.
   set (n := first_size d) in *.
@@ -395,20 +416,59 @@ Proof.
     destruct l as [[a b]|]; cbn; auto. now apply num_ltb_lt. }
   assert (Times : Forall (fun g => begins g < ends g) (segments d)).
   { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
-  assert (Range : forall g, In g (segments d) -> begin d <= begins g /\ ends g <= finish d).
-  { intros g Hg. destruct (last_end (segments d) g Hg Hl Times) as [A B]. split; auto.
-    unfold begin. destruct (segments d); [destruct Hg|]. exact A. }
-  intros g Hg Hgt. apply (chain n d x (segments d) Hok Hl) with (ta := ta); auto.
-  2:{ unfold begin in Ha. destruct (segments d); lra. }
-  apply Forall_forall. intros h Hh. destruct (Each h Hh) as [ps [B C]].
+  constructor; auto.
+  intros g Hg. destruct (last_end (segments d) g Hg Hl Times) as [A B]. split; auto.
+  unfold begin. destruct (segments d); [destruct Hg|]. exact A.
+Qed.
+(* By segment: x is a list of functions that are continuous, and between knots obey the equations
+   under an input that is off by so much. *)
+Definition follows (d : problem) (offs : list (list num)) (x : list (R -> R))
+  (u : segment -> R -> list R) (lo hi : R) : Prop :=
+  length x = first_size d /\
+  (forall t, lo <= t <= hi -> Forall (fun f => continuity_pt f t) x) /\
+  forall g off t, In (g, off) (combine (segments d) offs) -> begins g < t < ends g -> lo < t < hi ->
+    within_off off (input d g (place g t) (at_time x t)) (u g t) /\ moves d g x (u g) t.
+
+Theorem stays_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
+  follows d offs x u lo hi -> forall ta t, lo <= ta -> ta <= t <= hi -> inside d x ta -> inside d x t.
+Proof.
+  intros H x u lo hi Hb [Lx [Cx Dx]] ta t Ha Ht Hin. destruct (checked_segments d offs w H) as [Hok [Lo Each]].
+  destruct (check_facts d offs w H) as [Hm Hlim Hl _ Times Range]. set (n := first_size d) in *.
+  intros g Hg Hgt. apply (chain n d x lo hi (segments d) Hok Hl) with (ta := ta); auto; try lra.
+  2:{ unfold begin in Hb. destruct (segments d); lra. }
+  apply Forall_forall. intros h Hh.
+  assert (G : exists off, In (h, off) (combine (segments d) offs)).
+  { clear - Hh Lo. revert Hh Lo. generalize offs. induction (segments d) as [|g1 gs IH];
+      intros [|o os] Hg L; cbn in *; try tauto; try discriminate. destruct Hg as [->|Hg]; [eauto|].
+    destruct (IH os Hg) as [q Hq]; eauto. }
+  destruct G as [off G]. destruct (Each h off G) as [ps [O [B C]]].
   assert (A : segment_ok n d h = true) by (rewrite Forall_forall in Hok; auto).
   destruct (Range h Hh) as [R1 R2].
-  assert (Hx : length x = n).
-  { pose proof (segment_facts d h n A) as [_ E _ _ _ T _ _ _ _].
-    destruct (Dx h ((begins h + ends h) / 2) Hh ltac:(lra)) as [w0 [_ F]].
-    apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence. }
-  intros ta' t' Ha' Ht' Hin'.
-  apply (segment_stays d w h ps n Hlim Hm A B C x Hx) with (ta := ta'); auto.
-  intros u Hu. apply Cx. lra.
+  intros ta' t' Ha' Hlo Ht' Hhi Hin'.
+  apply (segment_stays d w h off ps n Hlim Hm A O B C x (u h) lo hi Lx) with (ta := ta'); auto.
+Qed.
+
+Lemma solution_length d w x : checked d w -> (0 < length (segments d))%nat -> solution d x ->
+  length x = first_size d.
+Proof.
+  intros C Hne [_ Dx]. destruct (segments d) as [|g gs] eqn:E; [cbn in Hne; lia|].
+  assert (Hg : In g (segments d)) by (rewrite E; now left).
+  pose proof (c_segments d w C) as Hok. rewrite Forall_forall in Hok.
+  pose proof (segment_facts d g _ (Hok g Hg)) as [_ El _ _ _ T _ _ _ _].
+  destruct (Dx g ((begins g + ends g) / 2) ltac:(rewrite <- E; exact Hg) ltac:(lra)) as [w0 [_ F]].
+  apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence.
+Qed.
+Theorem stays d w : check d (unmoved d) w = true -> (0 < length (segments d))%nat ->
+  forall x, solution d x ->
+  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+Proof.
+  intros H Hne x Hx ta t Ha Ht. pose proof (check_facts _ _ _ H) as C.
+  pose proof (solution_length d w x C Hne Hx) as Lx. destruct Hx as [Cx Dx].
+  apply (stays_until d (unmoved d) w H x (fun g v => input d g (place g v) (at_time x v))
+    (begin d) (finish d)); try lra.
+  split; [|split]; auto. intros g off v Hg Hv _.
+  assert (Eo : off = []).
+  { apply in_combine_r in Hg. unfold unmoved in Hg. apply in_map_iff in Hg as [? [<- _]]. reflexivity. }
+  subst off. split; [reflexivity|]. apply in_combine_l in Hg. exact (Dx g v Hg Hv).
 Qed.
 End Stays.

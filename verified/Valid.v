@@ -31,18 +31,24 @@ Definition entry (d : problem) (g : segment) (j : nat)
   let n := length (nominal g) in
   if Nat.ltb j n then (nth j (nominal g) [], [unit_row n j], None)
   else (nth (j - n) (feed g) [], rows_of (nth (j - n) (gains g) []), nth (j - n) (limits d) None).
-Definition bound_ok (d : problem) (g : segment) (b : nat * (num * num)) : bool :=
+(* What it is off by at most: only inputs are. *)
+Definition slack (n : nat) (off : list num) (j : nat) : num :=
+  if Nat.ltb j n then nzero else nth (j - n) off nzero.
+Definition bound_ok (d : problem) (g : segment) (off : list num) (b : nat * (num * num)) : bool :=
   let n := length (nominal g) in
   let '(j, (low, high)) := b in
   let '(centre, rows, limit) := entry d g j in
+  let least_wanted := nadd low (slack n off j) in
+  let most_wanted := nsub high (slack n off j) in
   let need_low := match limit with Some (least, _) => num_ltb least low | None => true end in
   let need_high := match limit with Some (_, most) => num_ltb high most | None => true end in
-  let rooms := (if need_low then map (fun c => nsub c low) centre else [])
-    ++ (if need_high then map (fun c => nsub high c) centre else []) in
+  let rooms := (if need_low then map (fun c => nsub c least_wanted) centre else [])
+    ++ (if need_high then map (fun c => nsub most_wanted c) centre else []) in
   andb (andb (Nat.ltb j (n + length (limits d)))
     (andb (Nat.ltb 0 (length centre)) (Nat.leb (length centre) 4)))
   (andb match limit with
-    | Some (least, most) => andb (num_leb low most) (num_leb least high)
+    | Some (least, most) => andb (if need_low then num_leb least_wanted most else true)
+        (if need_high then num_leb least most_wanted else true)
     | None => true end
   match rooms with
   | [] => true
@@ -56,8 +62,9 @@ Definition even_gains (g : segment) : bool :=
   forallb (fun row => andb (Nat.eqb (length row) (length (nominal g)))
     (forallb (fun c => andb (Nat.eqb (length c) (length (hd [] row)))
        (andb (Nat.ltb 0 (length c)) (Nat.leb (length c) 4))) row)) (gains g).
-Definition bounds_ok (d : problem) : bool :=
-  forallb (fun g => andb (even_gains g) (forallb (bound_ok d g) (bounds g))) (segments d).
+Definition bounds_ok (d : problem) (offs : list (list num)) : bool :=
+  forallb (fun e => andb (even_gains (fst e)) (forallb (bound_ok d (fst e) (snd e)) (bounds (fst e))))
+    (combine (segments d) offs).
 
 (* Why. *)
 Lemma num_leb_le a b : num_leb a b = true -> val a <= val b.
@@ -275,17 +282,27 @@ Proof.
   apply IH; lia.
 Qed.
 
-Lemma bound_kept s x b : Forall proper (limits d) -> even_gains g = true ->
-  bound_ok d g b = true -> 0 <= s <= 1 -> length x = n ->
+Definition limit_of (j : nat) : option (num * num) :=
+  if Nat.ltb j n then None else nth (j - n) (limits d) None.
+(* An entry that is off by at most the slack, and within its limits. *)
+Lemma bound_kept off s x b got : Forall proper (limits d) -> even_gains g = true ->
+  bound_ok d g off b = true -> 0 <= s <= 1 -> length x = n ->
   (let z := deviation g s x in form (P g s) z z <= rho g s) ->
-  val (fst (snd b)) <= nth (fst b) (x ++ input d g s x) 0 <= val (snd (snd b)).
+  Rabs (got - nth (fst b) (x ++ input d g s x) 0) <= val (slack n off (fst b)) ->
+  match limit_of (fst b) with Some (least, most) => val least <= got <= val most | None => True end ->
+  val (fst (snd b)) <= got <= val (snd (snd b)).
 Proof.
-  intros Hp He Hb Hs Hx HW. destruct F as [Ln _ Lf Lg Hc _ _ _ _ _].
-  destruct b as [j [low high]]. cbn [fst snd]. unfold bound_ok in Hb. rewrite Ln in Hb.
+  intros Hp He Hb Hs Hx HW Hgot Hclip. destruct F as [Ln _ Lf Lg Hc _ _ _ _ _].
+  destruct b as [j [low high]]. cbn [fst snd] in *. unfold bound_ok in Hb. rewrite Ln in Hb.
   set (z := deviation g s x) in *. cbn zeta in HW.
   assert (Lz : length z = n).
   { unfold z, deviation. rewrite zip_length; rewrite ?map_length; congruence. }
-  destruct (entry d g j) as [[centre rows] limit] eqn:E.
+  assert (El : snd (entry d g j) = limit_of j).
+  { unfold entry, limit_of. rewrite Ln. now destruct (Nat.ltb j n). }
+  destruct (entry d g j) as [[centre rows] limit] eqn:E. cbn [snd] in El. rewrite <- El in Hclip.
+  set (e := slack n off j) in *. set (low' := nadd low e) in *. set (high' := nsub high e) in *.
+  assert (Vl : val low' = val low + val e) by apply val_add.
+  assert (Vh : val high' = val high - val e) by apply val_sub.
   assert (Room : forall room gv, 0 <= val room -> In gv rows ->
     forallb (fun g' => andb (fits n room (start g) g') (fits n room (stop g) g')) rows = true ->
     - val room <= dot (map val gv) z <= val room).
@@ -337,23 +354,25 @@ Proof.
         rewrite (zip_nth _ [] []) by lia. fold row. fold z. ring.
       + rewrite Forall_forall in Hp. assert (Hin : In (nth i (limits d) None) (limits d)) by (apply nth_In; lia).
         specialize (Hp _ Hin). destruct (nth i (limits d) None) as [[a b]|]; auto. }
-  destruct Mid as [y [Hy [-> Hl]]].
+  destruct Mid as [y [Hy [Ey Hl]]]. rewrite Ey in Hgot.
+  pose proof (Rle_abs (got - clip limit (along s centre + y))) as V1.
+  pose proof (Rle_abs (- (got - clip limit (along s centre + y)))) as V2. rewrite Rabs_Ropp in V2.
   apply andb_prop in Hb as [Hb1 Hb2]. apply andb_prop in Hb1 as [_ Hb1].
   apply andb_prop in Hb1 as [C1 C2]. apply Nat.ltb_lt in C1. apply Nat.leb_le in C2.
   apply andb_prop in Hb2 as [Hb2 Hb3].
   assert (Sides : forall (nl nh : bool),
-    match (if nl then map (fun c => nsub c low) centre else [])
-      ++ (if nh then map (fun c => nsub high c) centre else []) with
+    match (if nl then map (fun c => nsub c low') centre else [])
+      ++ (if nh then map (fun c => nsub high' c) centre else []) with
     | [] => true
     | first :: rest =>
         let room := fold_right nmin first rest in
         andb (num_leb nzero room)
           (forallb (fun g' => andb (fits n room (start g) g') (fits n room (stop g) g')) rows)
     end = true ->
-    (nl = true -> val low <= along s centre + y) /\ (nh = true -> along s centre + y <= val high)).
+    (nl = true -> val low' <= along s centre + y) /\ (nh = true -> along s centre + y <= val high')).
   { intros nl nh.
-    destruct ((if nl then map (fun c => nsub c low) centre else [])
-      ++ (if nh then map (fun c => nsub high c) centre else [])) as [|first rest] eqn:Er; intros H.
+    destruct ((if nl then map (fun c => nsub c low') centre else [])
+      ++ (if nh then map (fun c => nsub high' c) centre else [])) as [|first rest] eqn:Er; intros H.
     { split; intros ->.
       - apply app_eq_nil in Er as [Er _]. clear - C1 Er. destruct centre; cbn in *; [lia|discriminate].
       - apply app_eq_nil in Er as [_ Er]. clear - C1 Er. destruct centre; cbn in *; [lia|discriminate]. }
@@ -366,37 +385,52 @@ Proof.
     - apply (side' room); auto. intros c Hin. apply Least. apply in_or_app. right.
       apply in_map_iff. now exists c. }
   destruct limit as [[least most]|].
-  - apply andb_prop in Hb2 as [M1 M2]. apply num_leb_le in M1, M2.
-    destruct (Sides _ _ Hb3) as [A B]. cbn [clip]. set (v := along s centre + y) in *.
+  - apply andb_prop in Hb2 as [M1 M2].
+    destruct (Sides _ _ Hb3) as [A B]. cbn [clip] in *. set (c := along s centre + y) in *.
     split.
-    + destruct (num_ltb least low) eqn:E1.
-      * apply Rle_trans with (Rmin (val most) v); [|apply Rmax_r]. apply Rmin_glb; auto.
-      * apply num_ltb_not in E1. apply Rle_trans with (val least); auto. apply Rmax_l.
-    + apply Rmax_lub; auto. destruct (num_ltb high most) eqn:E2.
-      * apply Rle_trans with v; auto. apply Rmin_r.
-      * apply num_ltb_not in E2. apply Rle_trans with (val most); auto. apply Rmin_l.
-  - destruct (Sides true true Hb3) as [A B]. cbn [clip]. auto.
+    + destruct (num_ltb least low) eqn:E1; [|apply num_ltb_not in E1; lra].
+      apply num_leb_le in M1. specialize (A eq_refl).
+      pose proof (Rmax_r (val least) (Rmin (val most) c)). pose proof (Rmin_glb _ _ _ M1 A). lra.
+    + destruct (num_ltb high most) eqn:E2; [|apply num_ltb_not in E2; lra].
+      apply num_leb_le in M2. specialize (B eq_refl).
+      pose proof (Rmin_r (val most) c). pose proof (Rmax_lub (val least) (Rmin (val most) c) (val high')).
+      lra.
+  - destruct (Sides true true Hb3) as [A B]. cbn [clip] in *. specialize (A eq_refl).
+    specialize (B eq_refl). lra.
 Qed.
 End Segment.
 
-Theorem valid_kept d w x t : check d w = true -> bounds_ok d = true -> solution d x ->
+Lemma clip_within l u : proper l ->
+  match l with Some (least, most) => val least <= clip l u <= val most | None => True end.
+Proof.
+  destruct l as [[a b]|]; auto. cbn. intros H. split; [apply Rmax_l|]. apply Rmax_lub; [lra|].
+  apply Rmin_l.
+Qed.
+
+Theorem valid_kept d w x t : checked d w -> bounds_ok d (unmoved d) = true -> length x = first_size d ->
   begin d <= t <= finish d -> inside d x t -> in_bounds d x t.
 Proof.
-  intros Hc Hb Hx Ht Hin g b Hg Hgt Hbg.
-  destruct (checked_segments d w Hc) as [Hok _]. rewrite Forall_forall in Hok.
+  intros Hc Hb Lx Ht Hin g b Hg Hgt Hbg.
+  destruct Hc as [_ Hlim _ Hok _ _]. rewrite Forall_forall in Hok.
   pose proof (Hok g Hg) as Okg. set (n := first_size d) in *.
-  destruct (segment_facts d g n Okg) as [_ Le _ _ _ T _ _ _ _].
-  assert (Lx : length x = n).
-  { destruct Hx as [_ Dx]. destruct (Dx g ((begins g + ends g) / 2) Hg ltac:(lra)) as [w0 [_ G]].
-    apply Condition.Forall2_length in G. unfold field in G. rewrite map_length in G. congruence. }
-  unfold bounds_ok in Hb. rewrite forallb_forall in Hb. specialize (Hb g Hg).
+  destruct (segment_facts d g n Okg) as [Ln _ Lf Lg _ T _ _ _ _].
+  unfold bounds_ok in Hb. rewrite forallb_forall in Hb.
+  assert (Hp : In (g, []) (combine (segments d) (unmoved d))).
+  { unfold unmoved. clear - Hg. induction (segments d) as [|h hs IH]; [destruct Hg|]. cbn.
+    destruct Hg as [->|Hg]; auto. }
+  specialize (Hb _ Hp). cbn [fst snd] in Hb.
   apply andb_prop in Hb as [He Hb]. rewrite forallb_forall in Hb.
-  apply (bound_kept d g n Okg); auto.
-  - apply andb_prop in Hc as [Hc _]. apply andb_prop in Hc as [_ Hl].
-    apply Forall_forall. intros l Hl'. rewrite forallb_forall in Hl. specialize (Hl l Hl').
-    destruct l as [[p q]|]; cbn; auto. now apply num_ltb_lt.
-  - now apply (place_in d g n Okg).
-  - unfold at_time. now rewrite map_length.
+  set (s := place g t). assert (Hs : 0 <= s <= 1) by now apply (place_in d g n Okg).
+  assert (Lat : length (at_time x t) = n) by (unfold at_time; now rewrite map_length).
+  assert (Es : slack n [] (fst b) = nzero) by (unfold slack; destruct (Nat.ltb _ _); auto; now destruct (_ - _)%nat).
+  apply (bound_kept d g n Okg [] s (at_time x t) b); auto.
   - exact (Hin g Hg Hgt).
+  - rewrite Es, val_nzero, Rminus_diag_eq, Rabs_R0; auto. lra.
+  - unfold limit_of. destruct (Nat.ltb (fst b) n) eqn:Ej; auto. apply Nat.ltb_ge in Ej.
+    rewrite app_nth2 by lia. rewrite Lat. set (i := (fst b - n)%nat).
+    destruct (Nat.lt_ge_cases i (length (limits d))) as [Hi|Hi]; [|now rewrite nth_overflow].
+    unfold input, wanted.
+    rewrite (zip_nth _ None 0) by (rewrite ?zip_length; lia). apply clip_within.
+    rewrite Forall_forall in Hlim. apply Hlim, nth_In; auto.
 Qed.
 End Valid.

@@ -160,7 +160,7 @@ class Writer:
     def upper(self, P: list[list[Any]], what: str) -> str:
         """The upper triangle of a symmetric matrix."""
         if any(number(P[i][j]) != number(P[j][i]) for i in range(len(P)) for j in range(i)):
-            raise NotCovered(f"{what} is not symmetric")
+            raise Refused(f"{what} is not symmetric")
         return self.to.listed(self.nums(row[i:]) for i, row in enumerate(P))
 
     def squares(self, stated: dict[str, Any]) -> str:
@@ -270,14 +270,18 @@ class Writer:
         """The multipliers of the leaves, by columns, one for each form."""
         to = self.to
         if tree is None:
-            return to.chosen("Leaf", 0, to.listed([to.listed([])] * forms))
+            return to.chosen("Leaf", 0, to.maybe(None), to.listed([to.listed([])] * forms))
         if set(tree) == {"split", "parts"}:
             lower, upper = (self.tree(part, forms) for part in tree["parts"])
             return to.chosen("Split", 1, to.count(integer(tree["split"], 0, 99)), lower, upper)
+        stated = None
         if "ends" in tree:
-            raise NotCovered("stated ends of a leaf are not covered")
+            ends = tree["ends"]
+            weights = (self.nums(ends[f"{name}_weights"]) for name in ("low", "high"))
+            stated = to.made("Ends", self.num(ends["low"]), self.num(ends["high"]), *weights)
         Ns = tree["N"] if forms > 1 else [tree["N"]]
-        return to.chosen("Leaf", 0, to.listed(self.matrix(zip(*N, strict=True)) for N in Ns))
+        columns = to.listed(self.matrix(zip(*N, strict=True)) for N in Ns)
+        return to.chosen("Leaf", 0, to.maybe(stated), columns)
 
     def plan(self, problem: "Increments") -> list[str]:
         """a, b_1 ..., b_0, c of a difference equation, and the policy's feedback."""
@@ -415,19 +419,41 @@ class Writer:
             goal = to.pair(self.nums(stated["centre"]), self.matrix(stated["P"]))
         to.named("goal : option (list num * list (list num))", to.maybe(goal))
 
+    def by_interval(self, name: str, problem: Funnel, entries: list[Any], made: Any) -> str:
+        """Pieces of each interval, in the order in which they begin."""
+        to = self.to
+        found: list[list[str]] = [[] for _ in range(problem.intervals)]
+        order = sorted(
+            entries, key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"]))
+        )
+        for i, piece in enumerate(order):
+            k = integer(piece["interval"], 0, len(found) - 1)
+            found[k].append(to.named(f"{name}_{i}", made(piece, k)))
+        return to.listed(map(to.listed, found))
+
+    def held(self, problem: Funnel) -> None:
+        """The hold, the errors, the rates and what proves them."""
+        to, proof = self.to, problem.proof
+        to.named("period : num", self.num(problem.period))
+        to.named("errors : list num", self.nums(problem.errors))
+        none = [[0] * problem.field["inputs"]] * problem.intervals
+        to.named("rates : list (list num)", self.matrix(proof.get("rates", none)))
+
+        def turn(piece: dict[str, Any], _interval: int) -> str:
+            up = "true" if integer(piece["sign"], -1, 1) > 0 else "false"
+            return to.made("RatePiece", to.count(piece["input"]), up, self.piece(piece, []))
+
+        pieces = self.by_interval("turn", problem, proof.get("rate_pieces", []), turn)
+        to.named("turns : list (list rate_piece)", pieces)
+
     def witness(self, problem: Funnel) -> str:
         """What is used to decide it."""
         to, proof = self.to, problem.proof
-        by_segment: list[list[str]] = [[] for _ in range(problem.intervals)]
-        order = sorted(
-            proof["pieces"], key=lambda p: (p["interval"], Fraction(p["index"], 2 ** p["level"]))
+        pieces = self.by_interval(
+            "piece", problem, proof["pieces"], lambda p, k: self.piece(p, problem.kappa[k])
         )
-        for i, piece in enumerate(order):
-            k = integer(piece["interval"], 0, len(by_segment) - 1)
-            by_segment[k].append(to.named(f"piece_{i}", self.piece(piece, problem.kappa[k])))
         names = ("basis", "multiplier", "sides")
         bases = [self.monomials(proof.get(name, [])) for name in names]
-        pieces = to.listed(map(to.listed, by_segment))
         pushed = "true" if "kappa" in proof else "false"
         least = self.num(proof.get("goal_multiplier", 0))
         return to.made("Witness", self.num(proof["margin"]), *bases, pieces, pushed, least)
@@ -435,7 +461,8 @@ class Writer:
     def piece(self, piece: dict[str, Any], kappa: list[Any]) -> str:
         """One part of time, at a vertex and in a mode."""
         to = self.to
-        rows = zip(*(piece["mu"][name] for name in ("shifts", "start", "end")), strict=True)
+        none: dict[str, Any] = {"shifts": [], "start": [], "end": []}
+        rows = zip(*(piece.get("mu", none)[name] for name in none), strict=True)
         lines = to.listed(
             to.pair(
                 to.whole(integer(shift, -SHIFT, SHIFT)),
@@ -470,6 +497,17 @@ Theorem funnel_stays : forall x, solution data x ->
   in_goal data x.
 Proof. exact (funnel_theorem field policy funnel goal proof accepted). Qed.
 Print Assumptions funnel_stays.
+"""
+HELD = """\
+Definition data := stated field policy funnel goal.
+Theorem accepted : held_files_ok field policy funnel goal period errors proof rates turns = true.
+Proof. vm_cast_no_check (eq_refl true). Qed.
+Theorem held_stays : forall since x u, held_solution data period errors since x u ->
+  (begin data <= since <= finish data)%R -> inside data x since ->
+  (forall t, (since <= t <= finish data)%R -> inside data x t /\\ held_in_bounds data x u t) /\\
+  in_goal data x.
+Proof. exact (held_theorem field policy funnel goal period errors proof rates turns accepted). Qed.
+Print Assumptions held_stays.
 """
 NEAR = """\
 Theorem accepted : tubes_ok data tubes proofs = true.
@@ -511,10 +549,14 @@ Print Assumptions stable.
 def coq(problem: Problem) -> str:
     """A file of Coq: the problem, the witness and the theorem."""
     if isinstance(problem, Funnel):
-        to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Data")
+        modules = "Turning Held " if problem.held else ""
+        to = Coq(f"Integers Forms Polynomials Positive Claim Funnel Goal Files {modules}Data")
         writer = Writer(to)
         writer.problem(problem)
         to.named("proof", writer.witness(problem))
+        if problem.held:
+            writer.held(problem)
+            return "\n".join(to.lines) + "\n" + HELD
         return "\n".join(to.lines) + "\n" + THEOREM
     if isinstance(problem, Composition):
         to = Coq("Integers Forms Polynomials Positive Claim Funnel Goal Files Composed Data")
@@ -554,6 +596,7 @@ def trees(writer: Writer, problem: Increments) -> list[str]:
 
 
 ASKED = {
+    "held": "field policy funnel goal period errors proof rates turns",
     "funnel": "field policy funnel goal proof",
     "plan": "data tubes proofs a b b0 feedback",
     "tube": "data tubes proofs",

@@ -40,6 +40,8 @@ let piece () =
   let kappa = nums () in let mu = listed (pair whole (pair entry entry)) in
   let columns = wholes () in let gram_factors = squares () in
   { depth; index; vertex; mode; kappa; mu; columns; gram_factors; tau = listed (pair wholes squares) }
+let rate_piece () =
+  let whose = count () in let upward = count () = 1 in { whose; upward; part = piece () }
 let witness () =
   let margin = num () in
   let basis = listed wholes in let multiplier = listed wholes in let sides = listed wholes in
@@ -68,8 +70,11 @@ let tube () =
   let fading = num () in let gain = matrix () in let storage = matrix () in
   let weight = matrix () in let tau0 = nums () in let widths = nums () in
   let top = num () in { fading; gain; storage; weight; tau0; widths; top; inlet = num () }
+let stated_ends () =
+  let low_end = num () in let high_end = num () in let low_weights = nums () in
+  { low_end; high_end; low_weights; high_weights = nums () }
 let rec tree () = match count () with
-  | 0 -> Leaf (listed matrix)
+  | 0 -> let stated = maybe stated_ends () in Leaf (stated, listed matrix)
   | 1 -> let i = count () in let lower = tree () in Split (i, lower, tree ())
   | _ -> failwith "a tree"
 
@@ -106,6 +111,11 @@ let () =
     | "funnel" ->
       let f = field () in let p = policy () in let u = funnel () in
       let g = maybe (pair nums matrix) () in decide_funnel f p u g (witness ())
+    | "held" ->
+      let f = field () in let p = policy () in let u = funnel () in
+      let g = maybe (pair nums matrix) () in let period = num () in let errors = nums () in
+      let w = witness () in let rates = matrix () in
+      decide_held f p u g period errors w rates (listed (fun () -> listed rate_piece))
     | "tube" -> let m = model () in let ts = listed tube in decide_tubes m ts (listed tree)
     | "plan" ->
       let m = model () in let ts = listed tube in let proofs = listed tree in

@@ -144,6 +144,11 @@ def _number(value: Fraction, like: Any) -> Any:
     return copysign(0.0, like) if value == 0 else float(value)
 
 
+def _escaped(sign: str) -> str:
+    """A sign of a text as JSON may write it too; those outside ASCII are in texts only."""
+    return sign if sign.isascii() else json.dumps(sign)[1:-1]
+
+
 def differences(documents: dict[str, Any], files: dict[str, tuple[str, Any]]) -> None:
     """Raise Differs unless the files (text and content, by role) print as these documents."""
     for role, document in documents.items():
@@ -153,6 +158,8 @@ def differences(documents: dict[str, Any], files: dict[str, tuple[str, Any]]) ->
         except (OverflowError, ValueError) as error:
             raise Differs(f"{role}: {error}") from error
         theirs = SPACE.sub(r"\1", text)
+        if not theirs.isascii():
+            theirs = "".join(map(_escaped, theirs))
         if mine != theirs:
             at = next((i for i, (a, b) in enumerate(zip(mine, theirs, strict=False)) if a != b), -1)
             raise Differs(
@@ -181,6 +188,10 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
     proof = _witness(terms["proof"], len(clips), states, files["proof"][1]["proof"]["pieces"])
     if claim["goal"] is None:
         proof["goal_multiplier"] = None
+    if "turns" in terms:
+        held, stated = _held(terms, len(clips), files["proof"][1])
+        claim |= held
+        proof |= stated
     return {
         "vector_field": {
             "states": states, "inputs": inputs, "uncertain": number(uncertain),
@@ -236,9 +247,34 @@ def _witness(term: Made, limited: int, states: int, order: list[Any]) -> dict[st
     }  # fmt: skip
 
 
+def _held(
+    terms: dict[str, Any], limited: int, like: dict[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The claim's and the proof's members about a hold and errors; 0 is nothing held."""
+    period, errors, rates = (number(terms[name]) for name in ("period", "errors", "rates"))
+    found: dict[str, list[Any]] = {}
+    for k, row in enumerate(terms["turns"]):
+        for turn in row:
+            i, up, part = turn.terms
+            piece = _piece(k, part, limited) | {"input": i, "sign": 1 if up.name == "true" else -1}
+            if part.terms[4] or piece.pop("mu")["shifts"]:
+                raise Differs("a rate piece with more than the file has")
+            found.setdefault(_place(piece), []).append(piece)
+    order = like["proof"].get("rate_pieces", [])
+    pieces = [found[_place(piece)].pop(0) for piece in order if found.get(_place(piece))]
+    if any(found.values()):
+        raise Differs("rate pieces that the file does not have")
+    held = {"rates": rates, "rate_pieces": pieces} if period else {}
+    if not period and (any(map(any, rates)) or pieces):
+        raise Differs("rates of what is not held")
+    absent = "error" not in like["claim"] and not any(errors)
+    return {"hold": period or None, "error": None if absent else errors}, held
+
+
 def _place(piece: dict[str, Any]) -> str:
     return repr(
-        [piece[key] for key in ("interval", "vertex", "level", "index")] + (piece.get("mode") or [])
+        [piece.get(key) for key in ("interval", "vertex", "level", "index", "input", "sign")]
+        + (piece.get("mode") or [])
     )
 
 
@@ -338,10 +374,15 @@ def _tree(tree: Made, forms: int) -> Any:
     if tree.name == "Split":
         i, lower, upper = tree.terms
         return {"split": i, "parts": [_tree(lower, forms), _tree(upper, forms)]}
-    columns = [[list(row) for row in zip(*number(N), strict=True)] for N in tree.terms[0]]
+    stated, Ns = tree.terms
+    columns = [[list(row) for row in zip(*number(N), strict=True)] for N in Ns]
     if not any(columns):
         return None
-    return {"N": columns if forms > 1 else columns[0]}
+    leaf: dict[str, Any] = {"N": columns if forms > 1 else columns[0]}
+    names = ("low", "high", "low_weights", "high_weights")
+    for ends in _maybe(stated):
+        leaf["ends"] = dict(zip(names, map(number, ends.terms), strict=True))
+    return leaf
 
 
 def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:

@@ -28,9 +28,8 @@ class Funnel:
 
     def __init__(self, document: Any, content: str, folder: Path) -> None:
         self.claim, self.proof = document["claim"], document["proof"]
-        for member in ("hold", "error", "decay"):
-            if member in self.claim:
-                raise NotCovered(f"not covered by the second kernel: {member}")
+        if "decay" in self.claim:
+            raise NotCovered("not covered by the second kernel: decay")
         self.files: Files = {"proof": (content, document)}
         roles = "vector_field policy funnel"
         files, digests = _bound(self.claim.get("about"), folder, roles, self.files)
@@ -45,6 +44,11 @@ class Funnel:
             raise NotCovered("limits that are not sorted by input")
         self.intervals = len(self.funnel["t"]) - 1
         self.kappa = self.proof.get("kappa", [[]] * self.intervals)
+        errors = [0.0] * self.field["states"]
+        self.period, self.errors = self.claim.get("hold", 0), self.claim.get("error", errors)
+        self.held = "hold" in self.claim or any(self.errors)
+        if "error" in self.claim and not self.held:
+            raise NotCovered("an error of 0 in every state")
 
 
 class Composition:
@@ -61,6 +65,10 @@ class Composition:
             if strict.proof_of(stage, role) != "continuous_funnel":
                 raise Refused(f"{role} should claim a continuous_funnel")
             self.stages.append(Funnel(stage, text, folder))
+            if "hold" in stage["claim"]:
+                raise Refused(f"{role} has a hold")
+            if self.stages[-1].held:
+                raise NotCovered("an error of a stage")
             self.files |= {f"{role}.{part}": file for part, file in self.stages[-1].files.items()}
 
 

@@ -18,6 +18,7 @@ TRIAL = re.compile(r"(sha256:[0-9a-f]{64})(?:\[([0-9]{1,12}):([0-9]{1,12})\])?\Z
 DEGREES = 63
 PHASES = 8
 TEXT, STATES, SIGNALS, POWER, SPLITS = 200, 120, 50, 20, 40
+ORDER = 200  # of a matrix
 IMPLICIT_STATES, IMPLICIT_INPUTS = 30, 60
 MONOMIALS, TRIALS, TUBES, TERMS, FACTORS = 20_000, 10**5, 8, 200, 4
 COUNT, PLAN, END, MOST = 10**9, 10**6, 10**12, 2**53
@@ -39,13 +40,17 @@ class Refused(Exception):  # noqa: N818 - says what the pages do not allow
 
 @dataclass(frozen=True)
 class Sizes:
-    """n states, m unknowns, p outputs, recorded inputs, and entries of a box that may be split."""
+    """n states, m unknowns, p outputs, recorded inputs, and entries of a box that may be split.
+
+    ends: bounds of the leading coefficient may be stated.
+    """
 
     n: int
     m: int
     p: int
     inputs: int
     box: int
+    ends: bool = False
 
 
 def need(holds: bool, said: str) -> None:
@@ -221,7 +226,10 @@ def _affine(model: dict[str, Any]) -> Sizes:
     for low, high in matrix(model["u_range"], "u_range", inputs, 2):
         need(low < high, "u_range: low >= high")
     word(model["on_out_of_range"], "on_out_of_range", ("clip", "refuse"))
-    return Sizes(lags * p, p, p, inputs, box)
+    leading, *others = (G["exponents"] for G in model["G"])
+    ends = p == 1 and not any(any(e) for rows in others for e in rows)
+    ends = ends and all(sum(e) <= 2 for e in leading) and 0 < box < ORDER
+    return Sizes(lags * p, p, p, inputs, box, ends)
 
 
 def _monotone(model: dict[str, Any]) -> Sizes:
@@ -306,6 +314,14 @@ def tree(value: Any, where: str, sizes: Sizes, forms: int | None, depth: int = 0
             tree(part, where, sizes, forms, depth + 1)
         return
     members(value, where, "N", "ends")
+    if "ends" in value:
+        need(sizes.ends, f"{where}: ends are of one quadratic leading coefficient")
+        names = [f"{name}{more}" for more in ("", "_weights") for name in ("low", "high")]
+        ends = members(value["ends"], f"{where}.ends", " ".join(names))
+        for name in names[:2]:
+            real(ends[name], f"{where}.ends")
+        for name in names[2:]:
+            need(min(reals(ends[name], f"{where}.ends", sizes.box)) >= 0, f"{where}: weights >= 0")
     if forms is None:
         matrix(value["N"], where, sizes.m + sizes.n, sizes.m)
         return
@@ -491,15 +507,20 @@ def increasing(values: list[Any], where: str) -> None:
     need(all(a < b for a, b in pairwise(values)), f"{where} should increase")
 
 
-def basis(value: Any, where: str, n: int) -> int:
-    """The number of its monomials, distinct."""
-    rows = listed(value, where, 1, BASIS)
+def monomials(value: Any, where: str, n: int, degree: int = DEGREES) -> list[list[int]]:
+    """Distinct ones of n variables."""
+    rows = listed(value, where, 0, MONOMIALS)
     for row in rows:
         for entry in listed(row, where, n, n):
-            whole(entry, where, 0, 31)
-        need(sum(row) <= 31, f"{where}: a degree above 31")
+            whole(entry, where, 0, degree)
+        need(sum(row) <= degree, f"{where}: a degree above {degree}")
     need(len({tuple(row) for row in rows}) == len(rows), f"{where}: a monomial twice")
-    return len(rows)
+    return rows
+
+
+def basis(value: Any, where: str, n: int) -> int:
+    """The number of its monomials."""
+    return len(monomials(listed(value, where, 1, BASIS), where, n, 31))
 
 
 def squares(entry: dict[str, Any], where: str, k: int) -> None:
@@ -582,13 +603,24 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     need(len(set(inputs)) == len(inputs), "limits: an input twice")
     need(all(low < high for _, low, high in rows), "limits: low >= high")
     claim, limits = document["claim"], len(rows)
-    members(claim, "claim", "kind about", "goal")
+    members(claim, "claim", "kind about", "goal hold error")
     if "goal" in claim:
         members(claim["goal"], "goal", "centre P")
         reals(claim["goal"]["centre"], "goal", n)
         matrix(claim["goal"]["P"], "goal", n, n)
-    required = "margin basis multiplier pieces" + " sides" * (limits > 0)
-    required += " goal_multiplier" * ("goal" in claim)
+    held, errors = "hold" in claim, [Fraction(0)]
+    if held:
+        need(real(claim["hold"], "hold") > 0, "hold > 0")
+    if "error" in claim:
+        errors = reals(claim["error"], "error", n)
+        need(min(errors) >= 0, "error >= 0")
+    affine = all(
+        e <= 1 for piece in field["pieces"] for equation in piece for row in equation["exponents"]
+        for e in row[1 + n : 1 + n + m]
+    )  # fmt: skip
+    need(affine or not claim.keys() & {"hold", "error"}, "the equations are not affine in an input")
+    required = "margin basis multiplier pieces" + " sides" * (limits > 0 or held)
+    required += " goal_multiplier" * ("goal" in claim) + " rates rate_pieces" * held
     proof = members(document["proof"], "proof", required, "kappa" if uncertain else "")
     need(real(proof["margin"], "margin") > 0, "the margin should be > 0")
     if "goal" in claim:
@@ -596,18 +628,29 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
     if "kappa" in proof:
         for row in matrix(proof["kappa"], "kappa", intervals, uncertain):
             need(min(row) > 0, "kappa > 0")
-    sizes = [basis(proof[name], name, n) for name in ("basis", "multiplier")]
-    sides = basis(proof["sides"], "sides", n) if limits else 0
+    terms = len(monomials(proof["multiplier"], "multiplier", n))
+    sizes = basis(proof["basis"], "basis", n), terms
+    sides = basis(proof["sides"], "sides", n) if limits or held else 0
     modes = " mode tau" * (limits > 0)
-    vertices = 1 if "kappa" in proof else 2**uncertain
-    for piece in listed(proof["pieces"], "pieces", 0, PIECES):
-        needed = "interval vertex level index mu columns squares" + modes
-        members(piece, "piece", needed)
+    corners = 2**m if held or any(errors) else 1
+
+    def place(piece: dict[str, Any], vertices: int, taus: int) -> None:
         whole(piece["interval"], "interval", 0, intervals - 1)
         level = whole(piece["level"], "level", 0, LEVEL)
         whole(piece["index"], "index", 0, 2**level - 1)
         whole(piece["vertex"], "vertex", 0, vertices - 1)
         squares(piece, "piece", sizes[0])
+        if limits:
+            for side in listed(piece["mode"], "mode", limits, limits):
+                whole(side, "mode", -1, 1)
+        if taus:
+            for entry in listed(piece["tau"], "tau", taus, taus):
+                squares(members(entry, "tau", "columns squares"), "tau", sides)
+
+    vertices = corners * (1 if "kappa" in proof else 2**uncertain)
+    for piece in listed(proof["pieces"], "pieces", 0, PIECES):
+        members(piece, "piece", "interval vertex level index mu columns squares" + modes)
+        place(piece, vertices, limits)
         mu = members(piece["mu"], "mu", "shifts start end")
         for name in ("shifts", "start", "end"):
             for entry in listed(mu[name], name, sizes[1], sizes[1]):
@@ -615,11 +658,15 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
                     whole(entry, name, -SHIFT, SHIFT)
                 else:
                     wide(entry, name)
-        if limits:
-            for side in listed(piece["mode"], "mode", limits, limits):
-                whole(side, "mode", -1, 1)
-            for entry in listed(piece["tau"], "tau", limits, limits):
-                squares(members(entry, "tau", "columns squares"), "tau", sides)
+    if held:
+        rates = matrix(proof["rates"], "rates", intervals, m)
+        need(all(rate > 0 for row in rates for rate in row), "rates > 0")
+        for piece in listed(proof["rate_pieces"], "rate_pieces", 1, PIECES):
+            names = "interval vertex level index columns squares input sign tau"
+            members(piece, "rate piece", names + " mode" * (limits > 0))
+            whole(piece["input"], "input", 0, m - 1)
+            need(whole(piece["sign"], "sign", -1, 1) != 0, "sign: -1 or 1")
+            place(piece, corners * 2**uncertain, 1 + limits)
 
 
 def sampled(files: dict[str, tuple[str, Any]]) -> None:

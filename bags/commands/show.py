@@ -11,6 +11,7 @@ from rich.table import Table
 
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
+from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
@@ -102,6 +103,41 @@ def notes(result: Identified) -> list[str]:
     if result.fit.chosen.proof is None:
         lines.append("NOT PROVED stable: there is no proof file, and nothing is certified")
     return lines
+
+
+def gain_lines(found: Gain) -> list[str]:
+    """What was proved of a model's gain or passivity, and how near two runs of it come."""
+    number, unit = Fraction(found.proof.number), found.unit and f" {found.unit}"
+    fading = "" if found.proof.discount == 1.0 else f", with discount {found.proof.discount!r}"
+    least = found.proof.kind == "gain"
+    bound = f"gain at most {text.above(number)}" if least else (
+        f"passivity index at least {text.below(number)}"
+    )  # fmt: skip
+    lines = [f"{bound}{unit}{fading}: proved, of the model"]
+    if (seen := found.reached) is None:
+        lines.append("not compared with simulated runs")
+    else:
+        value, (_, inputs) = Fraction(seen.value), signals(found.model)
+        bound = f"at least {text.below(value)}" if least else f"at most {text.above(value)}"
+        where = ", ".join(
+            f"{signal.name} {size:.3g} around {around:.3g} {signal.unit}".rstrip()
+            for signal, size, around in zip(inputs, seen.amplitude, seen.around, strict=True)
+        )
+        shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
+        lines.append(f"{bound}{unit}: {shown}")
+    return [*lines, *str(found.verdict).splitlines()]
+
+
+def named_number(given: str) -> tuple[str, float]:
+    """NAME=VALUE as an option has it; DataError if it is none."""
+    name, found, value = given.rpartition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        found = ""
+    if not (found and name) or not math.isfinite(number):
+        raise DataError(f"'{given}' should be NAME=VALUE, as speed=0.5")
+    return name, number
 
 
 def selection_table(selection: Selection[Model]) -> Table:

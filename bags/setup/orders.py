@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from bags.setup.candidates import Found, Pair, slope_window
-from bags.setup.proposal import POOR, Proposal
+from bags.setup.proposal import Proposal
 from bags.signals.delays import RELATED
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
@@ -24,7 +24,7 @@ SHOWN: Final = 4  # of the classes that were tried
 OTHERS: Final = 3  # commands that are named besides
 
 
-def say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
+def say_lags(proposal: Proposal, train: Dataset) -> None:
     """The fewest lags whose simulation of a part of the training trials is about as good as any."""
     names = train.names
     held_back = list(names[1::3]) or list(names[:1])
@@ -62,8 +62,6 @@ def say_lags(proposal: Proposal, train: Dataset, found: Found) -> None:
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
     proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"
-    if best > POOR:
-        proposal.walls.append(_poor(best, proposal.tried_on) + _others(proposal, found))
 
 
 def say_degree(proposal: Proposal, train: Dataset) -> None:
@@ -105,8 +103,6 @@ def say_degree(proposal: Proposal, train: Dataset) -> None:
     )
     proposal.why["lags"] = f"least squares on trials held back; lags, delays, right_degree: {said}"
     proposal.why["right_degree"] = "as the lags"
-    if best > POOR:
-        proposal.walls.append(_poor(best, "trials held back"))
 
 
 def followed(proposal: Proposal, found: Found) -> list[Pair]:
@@ -116,11 +112,6 @@ def followed(proposal: Proposal, found: Found) -> list[Pair]:
     pairs = found.best_for(signals["response"][0]["path"])
     follows = [p for p in pairs if p.command.text not in chosen and abs(p.correlation) >= RELATED]
     return follows[:OTHERS]
-
-
-def _others(proposal: Proposal, found: Found) -> str:
-    said = ", ".join(f"{p.command.text} ({p.correlation:+.2f})" for p in followed(proposal, found))
-    return f": it follows {said} too (-u, once for each)" if said else ""
 
 
 def _varies(trials: Dataset) -> str:
@@ -137,12 +128,3 @@ def _terms(tried: StateAffineClass) -> int:
     """Of the polynomial in the inputs."""
     window = len(tried.window(len(tried.input_range or ())))
     return math.comb(window + tried.right_degree, tried.right_degree)
-
-
-def _poor(best: float, where: str) -> str:
-    return (
-        f"nothing that was tried simulates {where} with less than {best:.3g} % error: the tube "
-        "will be wide; another pair of signals, or more of them, may say more. Not tried here: "
-        "`model: feedback` for what swings on a spring that stiffens, `cells` for dry friction and "
-        "for levels that flow over, `block_cascade` for what saturates"
-    )

@@ -4,6 +4,7 @@ What is proposed is tried: the bags are read with it as identification reads the
 refused there is changed (gaps cut out, responses resampled) or said.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -16,6 +17,7 @@ from bags.recordings.definitions import Definition
 from bags.recordings.folders import trial_name
 from bags.recordings.message_types import is_stamped, standard_types
 from bags.setup.candidates import Found, slope_window
+from bags.setup.curved import say_class
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.orders import followed, say_degree, say_lags
 from bags.setup.proposal import POOR, Proposal, Signal
@@ -116,22 +118,40 @@ def propose(
     if _say_motions(proposal, trials.every):
         trials = _tried(proposal, bags, definitions)
     if linear:
-        say_lags(proposal, trials.train, found)
+        say_lags(proposal, trials.train)
     else:
         say_degree(proposal, trials.train)
     _say_funnel(proposal)
     others = [pair.command.text for pair in followed(proposal, found)]
-    if not (widen and proposal.error > POOR and others):
-        return proposal
-    wider = propose(
-        bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
-        definitions=definitions, types=types,
-    )  # fmt: skip
-    if not wider.error < proposal.error:
-        return proposal
-    without = f"; without it models are off by {proposal.error:.3g} %"
-    wider.why |= {text: wider.why[text] + without for text in others}
-    return wider
+    if widen and proposal.error > POOR and others:
+        wider = propose(
+            bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
+            definitions=definitions, types=types,
+        )  # fmt: skip
+        if wider.error < proposal.error:
+            without = f"; without it models are off by {proposal.error:.3g} %"
+            wider.why |= {text: wider.why[text] + without for text in others}
+            return wider
+    if len(responses) == 1:
+        say_class(proposal, trials.train)
+    if POOR < proposal.error < math.inf:
+        _say_poor(proposal, found)
+    return proposal
+
+
+def _say_poor(proposal: Proposal, found: Found) -> None:
+    signals = proposal.content["signals"]
+    wall = (
+        f"nothing that was tried simulates {proposal.tried_on} with less than "
+        f"{proposal.error:.3g} % error: the tube will be wide; another pair of signals, or more "
+        "of them, may say more"
+    )
+    if len(signals["response"]) > 1:
+        wall += "; of several responses only `state_affine` was tried, and there is `implicit`"
+    elif len(signals["excitation"]) == 1 and (also := followed(proposal, found)):
+        said = ", ".join(f"{pair.command.text} ({pair.correlation:+.2f})" for pair in also)
+        wall += f": it follows {said} too (-u, once for each)"
+    proposal.walls.append(wall)
 
 
 def _unwrapped(text: str) -> bool:

@@ -93,13 +93,17 @@ class BlockCascadeClass:
 
 @dataclass(frozen=True, eq=False)
 class CascadeFit:
-    """The model, its proof, the choice that made it, and all choices that were tried."""
+    """The model, its proof, the choice that made it, and all choices that were tried.
+
+    again: rms error on all that the choice was fitted to again, in y's unit (None: it was not).
+    """
 
     model: BlockCascade
     proof: StabilityProof
     chosen: CascadeChoice
     choices: tuple[CascadeChoice, ...]
     seconds: float
+    again: float | None = None
 
     def __str__(self) -> str:
         unit = self.model.y.unit
@@ -120,12 +124,14 @@ def identify_block_cascade(
     validation: Dataset,
     model_class: BlockCascadeClass,
     *,
+    whole: Dataset | None = None,
     transient: int = 0,
     slowest: float = MAX_RADIUS,
     progress: Progress = silent,
 ) -> CascadeFit:
     """Identify a `BlockCascade` by simulation error, proved incrementally stable.
 
+    whole: trials to which what was chosen is fitted again (None: it stays fitted to `train`).
     transient: samples at the start of each trajectory that are simulated and not scored. slowest:
     radius of the filters' poles, at most.
     Raises ShapeError for several inputs or outputs, DataError on too little or constant data,
@@ -177,6 +183,16 @@ def identify_block_cascade(
     )  # fmt: skip
     tried.append(polished)
     chosen, parameters = min(tried, key=_validation_error)
+    again = None
+    if whole is not None:
+        progress("fitted to all trials", 1.0 - 1.0 / total)
+        all_trials = _trials(whole, scales, transient, model_class)
+        refitted, parameters = _choice(
+            with_intervals(parameters, all_trials, chosen.intervals), all_trials, all_trials,
+            scales[1], chosen.smoothing,
+            steps=FINAL_STEPS, tolerance=FINAL_TOLERANCE, radius=slowest,
+        )  # fmt: skip
+        again = refitted.train_rms
     progress("minimised further", 1.0)
     model = _model(parameters, scales, train)
     proof = prove_stability(model)
@@ -187,7 +203,7 @@ def identify_block_cascade(
             "more starts or more data"
         )
     return CascadeFit(
-        model, proof, chosen, tuple(c for c, _ in tried), time.perf_counter() - started
+        model, proof, chosen, tuple(c for c, _ in tried), time.perf_counter() - started, again
     )
 
 

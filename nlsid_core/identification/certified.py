@@ -16,8 +16,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.bounded_set import BoundedSet
 from nlsid_core.identification.certified_descent import Outputs, Step, descend
 from nlsid_core.identification.matrix_set import MatrixSet
-from nlsid_core.identification.newton import Point, minimise
-from nlsid_core.identification.rse import Bound
+from nlsid_core.identification.newton import INEQUALITY_GAP, Point, minimise
+from nlsid_core.identification.rse import Bound, affordable_steps
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.identification.stability import StabilityProof, prove_stability
 from nlsid_core.identification.state_affine import StateAffineRows
@@ -25,6 +25,10 @@ from nlsid_core.models import StateAffineModel
 
 IN_ONE_SET = 8  # steps of the descent before the set is renewed
 STOP = 1e-4  # relative decrease of J that ends the iteration
+STEPS_A_BOUND = 25  # of Newton's method, to its minimum in the set, as a rule
+FEW_STEPS = 3  # towards it in a large problem, at one weight of the barrier,
+FEWEST_BOUNDS = 12  # however large it is
+GAP, GAP_FALL = 0.1, 0.5  # relative to J, which falls from bound to bound
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +49,28 @@ def certified_simulation_error(
 ) -> Iterator[CertifiedIterate]:
     """Yield the minimisers of the bounds inside the certified set, first to last.
 
+    In a large problem, by `affordable_steps`, there are fewer bounds, and each iterate is a few
+    steps towards its minimiser, so that J can go up.
     Raises ShapeError for degrees that there is no such set for: 2 at most for G_0 of one output
     beside constant lagged coefficients, 1 for all others, in few inputs.
     """
     inside = _set_of(problem).start(problem)
     theta, linearised = problem.rows.identity, None
-    previous = np.inf
+    previous, steps, gap = np.inf, None, GAP
+    affordable = affordable_steps(problem.rows)
+    if iterations * STEPS_A_BOUND > affordable:
+        steps, iterations = FEW_STEPS, min(iterations, max(FEWEST_BOUNDS, affordable // FEW_STEPS))
     for _ in range(iterations):
         bound = Bound(problem.rows, linearised)
-        found = minimise(bound, theta, inequalities=inside.inequalities(), extra=inside.extra)
+        found = minimise(
+            bound, theta, inequalities=inside.inequalities(), extra=inside.extra,
+            steps=steps, gap=gap,
+        )  # fmt: skip
+        gap = max(GAP_FALL * gap, INEQUALITY_GAP)
         theta = linearised = found.point.theta
         inside = inside.renewed(theta, found.extra)
         yield CertifiedIterate(found.point, inside)
-        if previous * (1.0 - STOP) <= found.point.J:
+        if previous * (1.0 - STOP) <= found.point.J and (steps is None or gap < STOP):
             return
         previous = found.point.J
 

@@ -36,7 +36,7 @@ BOUNDARY_PIVOT = 1e-7  # smallest pivot of K below which the minimiser is taken 
 SMALL = 0.1  # eigenvalue of K relative to its size that may vanish at the minimum
 FEWEST, WIDEST, MAX_BASES = 2, 4, 8  # vectors that join U at once, and how often they do
 INVERSE_ITERATIONS = 4  # of a subspace: what matters is orders of magnitude apart
-SHORT_STEP, SHORT_STEPS = 2.0**-5, 3  # so many steps so short, and Newton alone has stalled
+SHORT_STEP, SHORT_STEPS = 2.0**-2, 2  # so many steps so short, and Newton alone has stalled
 GAP = 1e-7  # μ·(barrier parameter) relative to J at which the barrier path of K ends
 INEQUALITY_GAP = 1e-6  # the same for inequalities alone: J is exact, and they are relaxed again
 FIRST_GAP = 0.1  # the same at the start of the path of K: Newton has come near by itself
@@ -160,14 +160,20 @@ def minimise(
     *,
     inequalities: Sequence[MatrixInequality] = (),
     extra: FloatArray | None = None,
+    steps: int | None = None,
+    gap: float = INEQUALITY_GAP,
 ) -> Minimum:
     """Minimise J_m from θ = `start`, strictly inside K ≻ 0 and every inequality.
 
     extra: start of further unknowns that only occur in the inequalities. Where too many eigenvalues
     of K vanish the lowest point that was reached is returned: a bound may be made exact there too.
+    steps: only so many of Newton's method, without a barrier of K and with that of the inequalities
+    at the one μ whose minimiser is within `gap`·J of the minimum.
     """
     descent = Descent(bound, inequalities, len(start))
     z = start if extra is None else np.concatenate([start, extra])
+    if steps is not None:
+        return descent.to_minimum(z, mu=descent.weight(z, gap), limit=steps)
     found = descent.freely(z)
     if found.is_inside:
         return found
@@ -305,6 +311,11 @@ class Descent:
         self.perfect = PERFECT_FIT * objective.rows.unit
         self.steps = 0
 
+    def weight(self, z: FloatArray, gap: float) -> float:
+        """μ of the inequalities at which the path is within gap·J, J that at z; 0 without any."""
+        size = sum(inequality.order for inequality in self.inequalities)
+        return gap * self.objective.at(z[: self.parameters]).J / size if size else 0.0
+
     def freely(self, z: FloatArray) -> Minimum:
         """Without a barrier of K."""
         return self.path(z) if self.inequalities else self.to_minimum(z)
@@ -324,14 +335,19 @@ class Descent:
             mu *= MU_FALL if barrier is None else MU_FALL_K
 
     def to_minimum(
-        self, z: FloatArray, *, mu: float = 0.0, barrier: Repulsion | SchurBarrier | None = None
+        self,
+        z: FloatArray,
+        *,
+        mu: float = 0.0,
+        barrier: Repulsion | SchurBarrier | None = None,
+        limit: int = MAX_NEWTON,
     ) -> Minimum:
-        """Newton's method for one μ."""
+        """Newton's method for one μ, of `limit` steps at most."""
         value, point = self._value(z, mu, barrier)
         if point is None:
             raise SolverError("Newton's method was started where J is infinite")
-        short, limit = 0, MAX_NEWTON if barrier is None else MAX_CENTRING
-        for _ in range(limit):
+        short = 0
+        for _ in range(limit if barrier is None else MAX_CENTRING):
             gradient, hessian = self._derivatives(z, point, mu, barrier)
             if not (np.isfinite(gradient).all() and np.isfinite(hessian).all()):
                 raise SolverError(

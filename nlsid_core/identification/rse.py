@@ -22,6 +22,8 @@ from nlsid_core.arrays import FloatArray
 from nlsid_core.identification.banded import Factor, Rows, shift, sparse, symmetric_product
 from nlsid_core.identification.newton import Point, minimise, project
 
+WORK = 5e10  # rows times squared left parameters, of all Newton steps together: a minute
+
 
 @dataclass(frozen=True, eq=False)
 class Iterate:
@@ -41,23 +43,33 @@ def robust_simulation_error(
     start: FloatArray | None = None,
     iterations: int = 40,
     tolerance: float = 1e-6,
+    steps: int | None = None,
+    exact_first: bool = False,
 ) -> Iterator[Iterate]:
     """Yield the minimiser of each bound, first to last.
 
     start: left parameters at which the first bound is exact (None: the first bound is that of
     G_m = I). Stops after `iterations` bounds or when J falls by less than `tolerance` of itself.
+    steps: of Newton's method for each bound, at most (None: to its minimum): J goes down all the
+    same, as each bound is exact where it begins. exact_first: the first one to its minimum.
     Raises SolverError if Newton's method cannot go on.
     """
     linearised_at = start
     previous = float("inf")
-    for _ in range(iterations):
+    for number in range(iterations):
         start = rows.identity if linearised_at is None else linearised_at
-        found = minimise(Bound(rows, linearised_at), start)
+        limit = None if exact_first and number == 0 else steps
+        found = minimise(Bound(rows, linearised_at), start, steps=limit)
         point = found.point
         yield Iterate(point.theta, point.p, point.J, found.on_boundary)
         if np.isfinite(previous) and previous - point.J <= tolerance * previous:
             return
         linearised_at, previous = point.theta, point.J
+
+
+def affordable_steps(rows: Rows) -> int:
+    """Newton steps that `WORK` is enough for."""
+    return int(WORK / (len(rows) * len(rows.offsets) ** 2))
 
 
 class Bound:

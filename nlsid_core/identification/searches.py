@@ -211,6 +211,7 @@ def block_cascade(
             fitted,
             judged,
             model_class,
+            whole=train if task.validation is None else None,
             transient=task.transient,
             slowest=min(MAX_RADIUS, task.searched_rate),
             progress=task.progress,
@@ -218,6 +219,8 @@ def block_cascade(
         *choices, last = found.choices
         steps = [Step(str(choice), choice.validation_rms) for choice in choices]
         steps.append(Step(f"{last}, minimised further", last.validation_rms))
+        if found.again is not None:
+            steps.append(Step("fitted to all trials, training error", found.again))
         trail.history = History(trail.history.value, tuple(steps))
         return replace(found.model, bags=train.bags), found.proof
 

@@ -25,15 +25,16 @@ from nlsid_core.identification.fit import (
 from nlsid_core.identification.methods import FirstRse, Method, Rse
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rates import is_too_slow, searched_rate
-from nlsid_core.identification.rse import Iterate, robust_simulation_error
+from nlsid_core.identification.rse import Iterate, affordable_steps, robust_simulation_error
 from nlsid_core.identification.simulation_error import SimulationError
 from nlsid_core.progress import Progress, silent
 
 T = TypeVar("T", bound=Model)
 W = TypeVar("W", bound=Method)
 log = logging.getLogger(__name__)
-WORK = 5e9  # rows times squared left parameters, of all bounds together: a minute or two
-FEWEST_BOUNDS = 3  # from every start, however large the problem is, and from the identity there
+STEPS_A_BOUND = 10  # of Newton's method, to its minimum, as a rule
+FEW_STEPS = 2  # towards it in a large problem: a new bound brings more than the end of the last
+FEWEST_BOUNDS = 6  # from every start, however large the problem is
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,44 +107,48 @@ class Trail(Generic[T]):
         """The iterates of the robust simulation error; the first and the best are candidates.
 
         starts: left parameters with their names, at which a first bound is made exact; from each
-        it is iterated too, and the iterate of the least simulation error is kept. Of a large
-        problem there are fewer bounds, by `WORK`. within: the nearest left
-        parameters that are allowed, at which an iterate that is not is taken.
+        it is iterated too, and the iterate of the least simulation error is kept. In a large
+        problem, by `affordable_steps`, no bound but the first is taken to its minimum.
+        within: the nearest left parameters that are allowed, at which an iterate that is not is
+        taken.
         """
         first, final = self.task.wanted(FirstRse), self.task.wanted(Rse)
         if first is None and final is None:
             return
         begun = (("", None), *(() if final is None else starts))
-        affordable = int(WORK / (len(rows) * len(rows.offsets) ** 2 * len(begun)))
         iterations = 1 if final is None else final.iterations
-        is_large = iterations > max(FEWEST_BOUNDS, affordable)
-        if is_large:
-            others = (affordable * len(begun) - FEWEST_BOUNDS) // max(1, len(begun) - 1)
-            iterations = min(iterations, max(FEWEST_BOUNDS, others))
-            log.info("a large problem: %d bounds from each stable start", iterations)
+        affordable = affordable_steps(rows) // len(begun)
+        steps = None
+        if final is not None and iterations * STEPS_A_BOUND > affordable:
+            steps = FEW_STEPS
+            iterations = min(iterations, max(FEWEST_BOUNDS, affordable // steps))
+            log.info("a large problem: %d bounds from each start, %d Newton steps towards the "
+                     "minimum of each", iterations, steps)  # fmt: skip
         error = SimulationError(rows)
         started, best, failure = time.process_time(), None, SolverError("no iterate")
         for start, theta in begun:
-            steps: list[Step] = []
+            path: list[Step] = []
+            exact_first = theta is None and first is not None
             try:
-                least = FEWEST_BOUNDS if is_large and theta is None and starts else iterations
-                for last in robust_simulation_error(rows, start=theta, iterations=least):
-                    steps.append(Step(f"iterate {len(steps) + 1} {start}".rstrip(), last.J))
-                    if theta is None and len(steps) == 1 and first is not None:
+                for last in robust_simulation_error(
+                    rows, start=theta, iterations=iterations, steps=steps, exact_first=exact_first
+                ):
+                    path.append(Step(f"iterate {len(path) + 1} {start}".rstrip(), last.J))
+                    if first is not None and exact_first and len(path) == 1:
                         seconds, found = time.process_time() - started, model(last)
                         self._keep(first, found, self.prove(found), seconds)
-                    done = 0.2 + 0.4 * len(steps) / iterations
-                    self.task.progress(f"robust simulation error, iterate {len(steps)}", done)
+                    done = 0.2 + 0.4 * len(path) / iterations
+                    self.task.progress(f"robust simulation error, iterate {len(path)}", done)
                 allowed = last.theta if within is None else within(last.theta)
                 reached = error.at(allowed)
                 if not np.array_equal(allowed, last.theta):
                     last = replace(last, theta=allowed, p=reached.p, J=reached.J)
-                    steps.append(Step("at the slowest rate allowed", reached.J))
+                    path.append(Step("at the slowest rate allowed", reached.J))
             except (SolverError, LinAlgError) as reason:
                 failure = SolverError(str(reason))
                 continue
             if best is None or best[0] > reached.J:
-                best = reached.J, last, tuple(steps)
+                best = reached.J, last, tuple(path)
         if best is None:
             raise failure
         self.history = History(self.history.value, best[2])

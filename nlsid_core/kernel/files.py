@@ -112,18 +112,19 @@ class Node:
             raise Rejected(f"{self.where} divides by zero")
         return Fraction(int(above), int(below) if slash else 1)
 
+    def integer(self) -> int:
+        """A whole number; one beyond 2^53 is a text of digits."""
+        if type(self.value) is not int and (type(self.value) is not str or "/" in self.value):
+            raise Rejected(f"{self.where} should be a whole number")
+        return self.rational().numerator
+
     def integers(self, least: int, most: int) -> tuple[int, ...]:
         """A list of `least` to `most` whole numbers; those beyond 2^53 are texts of digits."""
         entries = self.value
         if type(entries) is list and all(type(e) is int for e in entries):
             numbers: list[int] = entries
         else:
-            numbers = []
-            for entry in self.items(least, most):
-                stated = entry.value
-                if type(stated) is not int and (type(stated) is not str or "/" in stated):
-                    raise Rejected(f"{self.where} should hold whole numbers only")
-                numbers.append(entry.rational().numerator)
+            numbers = [entry.integer() for entry in self.items(least, most)]
         if not least <= len(numbers) <= most:
             raise Rejected(f"{self.where} should be a list of {least} to {most} entries")
         return tuple(numbers)

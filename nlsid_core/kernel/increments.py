@@ -267,6 +267,7 @@ def _state_affine(node: Node, driven: bool, bounds: Node | None) -> Model:
 def _with_inputs(G: list[Terms], drive: Any, scales: list[Fraction]) -> Terms:
     """The derivatives of Σ G_k(w) ȳ_k + p(w) by ȳ and by the inputs behind w, in (ȳ, w)."""
     p, size = len(G[0][0][1]), len(G[0][0][1]) * len(G)
+    _refuse_slopes(sum(map(len, G)) * p**2 + len(drive) * p, p, size + len(scales))
     rows: list[Polynomial] = [
         [((*_powers(k * p + j, size), *e), c[i][j]) for k, g in enumerate(G) for e, c in g
          for j in range(p)] + [((*[0] * size, *e), c[i]) for e, c in drive]
@@ -381,6 +382,9 @@ def _driven(
     """
     inputs = range(len(model.u))
     reach = [max((d for j, d in window if j == i), default=0) for i in inputs]
+    if len(model.F) + sum(reach) > MAX_STATES:
+        what = f"{len(model.F)} states and {sum(reach)} remembered inputs"
+        raise Rejected(f"the model has {what}; 1 to {MAX_STATES} together are decided")
     past = [(i, d) for i in inputs for d in range(1, reach[i] + 1)]
     columns = [*past, *((i, 0) for i in inputs)]
     chosen = [_unit(columns.index((i, d)), len(columns)) for i, d in window]
@@ -506,8 +510,7 @@ def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
 def _jacobian(rows: Sequence[Polynomial], of: range) -> Terms:
     """The derivatives of polynomials by the variables `of`, as a matrix polynomial."""
     found: dict[tuple[int, ...], list[list[Fraction]]] = {}
-    if sum(map(len, rows)) * len(rows) * len(of) ** 2 > MAX_SLOPES:
-        raise Rejected("the model has too many terms for its slopes to be written out")
+    _refuse_slopes(sum(map(len, rows)), len(rows), len(of))
     for i, row in enumerate(rows):
         for j in of:
             for powers, c in derivative(row, j):
@@ -516,6 +519,11 @@ def _jacobian(rows: Sequence[Polynomial], of: range) -> Terms:
                 entry = found.setdefault(powers, [[Fraction(0)] * len(of) for _ in rows])
                 entry[i][j] += c
     return [(list(powers), found[powers]) for powers in sorted(found)]
+
+
+def _refuse_slopes(terms: int, rows: int, variables: int) -> None:
+    if terms * rows * variables**2 > MAX_SLOPES:
+        raise Rejected("the model has too many terms for its slopes to be written out")
 
 
 def _least_slope(model: ImplicitModel, driven: bool) -> Matrix | None:
@@ -681,7 +689,7 @@ def _extreme(E: list[Matrix]) -> list[Matrix]:
 
 def _polynomials(node: Node, variables: int, *shape: int) -> Terms:
     parts = node.members("exponents coefficients")
-    exponents = parts["exponents"].monomials(variables, MAX_POWER * variables)
+    exponents = parts["exponents"].monomials(variables)
     coefficients = parts["coefficients"].array(len(exponents), *shape)
     if not exponents or any(power > MAX_POWER for row in exponents for power in row):
         raise Rejected(f"{node.where} should have monomials, with powers from 0 to {MAX_POWER}")

@@ -51,9 +51,11 @@ def read_level(node: Node, inputs: int, rows: int) -> CommandLevel:
 
 def _term(node: Node, inputs: int) -> Term:
     parts = node.members("inputs of centre scale fading")
-    factors = parts["inputs"].integers(0, MAX_FACTORS)
-    if any(not 0 <= i < inputs for i in factors):
-        raise Rejected(f"{node.where}: inputs should be among the model's {inputs}")
+    factors = tuple(parts["inputs"].wholes(None))
+    if len(factors) > MAX_FACTORS or any(not 0 <= i < inputs for i in factors):
+        raise Rejected(
+            f"{node.where}: inputs should be at most {MAX_FACTORS}, among the model's {inputs}"
+        )
     of = parts["of"].text()
     if of not in ("value", "change"):
         raise Rejected(f"{node.where}: of should be value or change, not {of!r}")

@@ -54,8 +54,8 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
         raise Rejected(f"{parts['basis'].where} should hold 1 to {MAX_BASIS} distinct monomials")
     columns = powers_of_two(parts["columns"], size)
     stated = parts["squares"].members("unit factors", "scale weights")
-    scale = stated["scale"].rational() if "scale" in stated else Fraction(1)
-    if scale < 1 or scale.denominator != 1:
+    scale = stated["scale"].integer() if "scale" in stated else 1
+    if scale < 1:
         raise Rejected(f"{where}: scale should be a positive whole number")
     weights = stated["weights"].integers(0, 4 * MAX_BASIS) if "weights" in stated else None
     factors = []
@@ -66,7 +66,7 @@ def read_squares(parts: Mapping[str, Node], ring: Ring) -> Squares:
             raise Rejected(f"{where}: one weight of 0 or more for each row of each factor")
         factors.append(list(zip(heights, entries, strict=True)))
     degree, unit = max(map(sum, rows)), stated["unit"].whole(0, MAX_SHIFT)
-    return Squares(tuple(map(ring.key, rows)), columns, degree, scale, unit, factors)
+    return Squares(tuple(map(ring.key, rows)), columns, degree, Fraction(scale), unit, factors)
 
 
 def read_witness(node: Node, ring: Ring) -> Squares:

@@ -3,21 +3,40 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from typer.testing import CliRunner
 
+from bags.chain.config import load_config
 from bags.commands.cli import app
 from bags.designs import documents
 from tests.duffing import trials
 from tests.identified_bags import FUNNEL, write_bag, write_config
 
-RUNS = 10
+RUNS, SAMPLES = 8, 240
+
+
+@pytest.mark.slow
+def test_init_proposes_feedback_where_linear_models_say_little(tmp_path: Path) -> None:
+    for k, trial in enumerate(trials([0.1, 0.15, 0.2, 0.25] * 3, samples=400, damping=0.25)):
+        write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
+    config = tmp_path / "robot.yaml"
+    drive, answer = ("/joint_commands:effort[name=joint_0]", "/joint_states:position[name=joint_0]")
+    given = ["init", str(tmp_path / "bags"), "-u", drive, "-y", answer, "--out", str(config)]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.output
+    assert load_config(config).identification.given["model"] == "feedback"
+    said = " ".join(config.read_text().replace("#", "").split())
+    linear, feedback = (
+        float(said.partition(f"{model}: ")[2].split()[0]) for model in ("linear", "feedback")
+    )
+    assert feedback < 0.3 * linear
 
 
 def test_feedback_goes_from_bags_to_a_monitor(tmp_path: Path) -> None:
-    for k, trial in enumerate(trials([0.15] * RUNS, samples=400, seed=4)):
+    for k, trial in enumerate(trials([0.15] * RUNS, samples=SAMPLES, seed=4)):
         write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)
-    broken = trials([0.15], samples=400, seed=9).trajectories[0]
-    y = np.where(np.arange(400)[:, None] < 200, broken.y, 0.6 * broken.y)
+    broken = trials([0.15], samples=SAMPLES, seed=9).trajectories[0]
+    y = np.where(np.arange(SAMPLES)[:, None] < SAMPLES // 2, broken.y, 0.6 * broken.y)
     write_bag(tmp_path / "bags", "broken", y, broken.u)
     section = {"model": "feedback", "stages": 2, "imitated": 20}
     config = write_config(tmp_path / "config.yaml", section, **FUNNEL)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nlsid_core import files
-from nlsid_core.identification import prove_stability
+from nlsid_core.identification import certified, prove_stability
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
 from nlsid_core.identification.matrix_set import MatrixSet, slowest_rate
 from nlsid_core.identification.rse import robust_simulation_error
@@ -52,12 +52,25 @@ def test_iterates_never_go_up_and_the_last_one_is_proved(
     case: tuple[int, int, int, float], tmp_path: Path
 ) -> None:
     stacked = rows(*case)
-    certified = list(certified_simulation_error(stacked, iterations=5))
+    found = list(certified_simulation_error(stacked, iterations=5))
     *_, free = robust_simulation_error(stacked.rows, iterations=5)
-    assert all(b.J <= a.J * (1 + 1e-5) for a, b in pairwise(certified))
-    assert free.J * (1 - 1e-5) <= certified[-1].J <= 1.02 * free.J
-    point = certified[-1].point
+    assert all(b.J <= a.J * (1 + 1e-5) for a, b in pairwise(found))
+    assert free.J * (1 - 1e-5) <= found[-1].J <= 1.02 * free.J
+    point = found[-1].point
     assert "every input" in checked(stacked.model(point.theta, point.p), tmp_path)
+
+
+def test_few_steps_a_bound_stay_inside_the_set_and_end_as_low(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stacked = rows(2, 1, 0, 6.0)
+    *_, whole = certified_simulation_error(stacked, iterations=12)
+    monkeypatch.setattr(certified, "affordable_steps", lambda _: 36)
+    few = list(certified_simulation_error(stacked, iterations=40))
+    assert len(few) == certified.FEWEST_BOUNDS
+    assert few[-1].J <= 1.02 * whole.J
+    for iterate in few:
+        assert prove_stability(stacked.model(iterate.point.theta, iterate.point.p)) is not None
 
 
 def test_the_set_gives_a_proof_where_the_free_iterates_have_none() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from examples import limit_cycle, rimless_wheel
+from examples import hopper, limit_cycle, rimless_wheel
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
     ContinuousTracking,
@@ -91,6 +91,48 @@ def test_a_wheel_that_starts_in_its_funnel_walks_on_for_ever(side: int) -> None:
         assert abs(before - funnel.nominal(funnel.tf)[0]) <= end
         assert abs(after - speed) <= start
     assert after == pytest.approx(rimless_wheel.PUBLISHED, abs=0.2 * start)
+
+
+def hops(found: FunnelDesign, start: FloatArray, gust: float) -> Iterator[tuple[float, float]]:
+    """(V on landing, V on leaving the ground again) of hops in time; w has the sign of dx/dt."""
+    policy, funnel = found.policy, found.funnel
+    e, x, speed = hopper.SPEED + start[0], *start[1:]
+
+    def across(z: FloatArray) -> tuple[float, FloatArray]:
+        """The phase and the state across it, from y, dy/dt, x, dx/dt."""
+        ground = np.sqrt(z[1] ** 2 + 2 * hopper.GRAVITY * max(z[0], 0.0))
+        phase = float(np.clip(-z[1] / ground, -1, 1))
+        return phase, np.array([ground - hopper.SPEED, z[2], z[3]])
+
+    def flying(_: float, z: FloatArray) -> list[float]:
+        u = float(policy(*across(z))[0])
+        return [z[1], -hopper.GRAVITY, z[3], u + gust * np.sign(z[3])]
+
+    def landed(_: float, z: FloatArray) -> float:
+        return float(z[0])
+
+    landed.terminal, landed.direction = True, -1.0  # type: ignore[attr-defined]
+    while True:
+        run = solve_ivp(flying, (0, 9), [1e-9, e, x, speed], events=landed, rtol=1e-8, atol=1e-10)
+        z = run.y_events[0][0]
+        low = float(funnel.value(funnel.tf, across(z)[1][None])[0])
+        e, x, speed = -0.8 * z[1] + 0.2 * hopper.SPEED, z[2], 0.9 * z[3]
+        again = np.array([e - hopper.SPEED, x, speed])
+        yield low, float(funnel.value(funnel.t0, again[None])[0])
+
+
+@pytest.mark.slow
+def test_a_hopper_that_starts_in_its_funnel_hops_on_for_ever() -> None:
+    """Simulated in time, until it touches the ground: how long a hop lasts is not known before."""
+    found = hopper.designed()
+    funnel, rng = found.funnel, np.random.default_rng(2)
+    P = funnel.shape(funnel.t0)
+    for start in rng.normal(size=(8, 3)):
+        start /= np.sqrt(start @ P @ start)
+        hopping = hops(found, 0.9999 * start, hopper.GUST)
+        for _ in range(TURNS):
+            assert max(next(hopping)) < 1
+    assert max(next(hops(found, 0.9999 * start, 30 * hopper.GUST))) > 1, "a storm is seen"
 
 
 def test_a_cycle_closes_up_to_the_reset_that_the_widths_allow() -> None:

@@ -15,7 +15,8 @@ from nlsid_core.running.held import Held
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from tests.falling_pendulum import tracking
-from tests.funnel_files import POLICY, PROOF, Files, bind, copy_of, saved
+from tests.forged_held import HELD_FORGERIES, forged_held
+from tests.funnel_files import PROOF, Files, bind, saved
 
 HOLD = 0.01  # s
 ERROR = [0.002, 0.01]
@@ -89,32 +90,9 @@ def refused(files: Files, reason: str) -> None:
         proofs.decide(files[PROOF], files)
 
 
-def test_what_is_a_little_more_than_was_proved_is_refused(files: Files) -> None:
-    longer = copy_of(files)
-    longer[PROOF]["claim"]["hold"] *= 1.5
-    refused(longer, "not positive")
-    shakier = copy_of(files)
-    shakier[PROOF]["claim"]["error"] = [5 * e for e in ERROR]
-    refused(shakier, "not positive")
-    slower = copy_of(files)
-    slower[PROOF]["proof"]["rates"][3][0] *= 0.5
-    refused(slower, "not positive")
-    fewer = copy_of(files)
-    del fewer[PROOF]["proof"]["rate_pieces"][7]
-    refused(fewer, "a piece of interval .* is missing")
-    unsigned = copy_of(files)
-    for piece in unsigned[PROOF]["proof"]["rate_pieces"]:
-        piece["sign"] = 1
-    refused(unsigned, "is missing")
-    still = copy_of(files)
-    still[PROOF]["proof"]["rates"][0][0] = 0.0
-    refused(still, "hold and rates should be positive")
-    jumping = copy_of(files)
-    jumping[POLICY]["K"][4][0][0][0] *= 1.001
-    refused(jumping, "the policy jumps at a knot")
-    bare = copy_of(files)
-    del bare[PROOF]["claim"]["hold"]
-    refused(bare, "unknown member")
+@pytest.mark.parametrize("what", HELD_FORGERIES)
+def test_what_is_a_little_more_than_was_proved_is_refused(files: Files, what: str) -> None:
+    refused(forged_held(files, what), HELD_FORGERIES[what][1])
 
 
 def test_an_input_that_is_clipped_may_be_held_too() -> None:

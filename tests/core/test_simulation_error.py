@@ -1,6 +1,7 @@
 """Simulation error: its derivatives, weights, and the last step that keeps the certificate."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from nlsid_core.identification import (
     identify,
     newton,
     prove_stability,
+    rse,
     trail,
 )
 from nlsid_core.identification.banded import Rows
@@ -314,10 +316,21 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     assert fit.proof.rate < 1.0
 
 
+def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> None:
+    data = beside_another_output(two_resonances(1, noise=0.1))
+    rows = build_state_affine_rows(data, StateAffineClass(2)).rows
+    start = dict(stable_starts(data, 2))["from least squares"]
+    few = list(robust_simulation_error(rows, start=start, iterations=60, steps=2))
+    *_, last = robust_simulation_error(rows, start=start, iterations=60)
+    assert all(b.J <= a.J * (1 + 1e-9) for a, b in pairwise(few))
+    assert few[-1].J <= 1.01 * last.J
+    assert SimulationError(rows).at(few[-1].theta).J <= few[-1].J * (1 + 1e-9)
+
+
 def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
     data = two_resonances(1, noise=0.1)
     whole = identify(data, StateAffineClass(4), method=Rse(), comparators=())
-    monkeypatch.setattr(trail, "WORK", 1.0)
+    monkeypatch.setattr(rse, "WORK", 1.0)
     short = identify(data, StateAffineClass(4), method=Rse(), comparators=())
     assert len(whole.history.steps) > trail.FEWEST_BOUNDS == len(short.history.steps)
     assert whole.errors["train"]["rse"] < short.errors["train"]["rse"] < 18.0

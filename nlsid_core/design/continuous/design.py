@@ -33,6 +33,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
+MOST_KNOTS = 100  # of a motion that is given more: each takes programs of its own
 HALVINGS = 6  # of intervals where P is far from linear
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
@@ -182,15 +183,26 @@ def _simulated(setting: Setting) -> str:
 def _tried(
     setting: Setting, again: Callable[[Nominal], Setting] | None, progress: Progress
 ) -> _Found:
-    """ρ for the cost-to-go; where w stops that, for what the pushed linear loop reaches."""
+    """ρ for the cost-to-go; where w stops that, for what the pushed linear loop reaches.
+
+    Where knots stop it, it is tried with twice as many.
+    """
     try:
         return _found(setting, progress)
-    except NoFunnel as refusal:
-        pushed = _pushed(setting, again) if refusal.diagnosis.dominant == "disturbance" else None
-        if pushed is None:
+    except Infeasible as refusal:
+        term = refusal.diagnosis.dominant if isinstance(refusal, NoFunnel) else "knots"
+        if term == "disturbance":
+            pushed = _pushed(setting, again)
+            if pushed is None:
+                raise
+            with suppress(Infeasible):
+                return _found(pushed, progress)
+        K = len(setting.policy.t)
+        if term != "knots" or again is None or 2 * K - 1 > MOST_KNOTS:
             raise
+        nominal = Nominal(setting.policy.x, setting.policy.u)
         with suppress(Infeasible):
-            return _found(pushed, progress)
+            return _tried(again(nominal.halved(np.ones(K - 1))), again, progress)
         raise
 
 
@@ -225,7 +237,7 @@ def _found(setting: Setting, progress: Progress) -> _Found:
         if setting.hold is None:
             return first
         expansion = setting.expansion
-        setting, free = replace(first[0], expansion=None), first[1].rho
+        setting, free = replace(first[0], expansion=None, needed=first[3]), first[1].rho
     elif setting.hold is None:
         return _swept(setting, validity_caps(steps.field, policy, P), progress)
     else:
@@ -246,6 +258,8 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
 def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
     """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
+    with suppress(Infeasible):
+        return held(LONGEST)
     period, found = hold.period, None
     while found is None:
         try:
@@ -254,9 +268,9 @@ def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
             if period <= hold.shortest:
                 raise
             period /= 2**0.5
-    for longer in (LONGEST, 2**0.5 * period) if period == hold.period else ():
+    if period == hold.period:
         with suppress(Infeasible):
-            return held(longer)
+            return held(2**0.5 * period)
     return found
 
 

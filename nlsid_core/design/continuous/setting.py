@@ -60,7 +60,7 @@ class Setting:
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
-    (m, m) of the feedback.
+    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved.
     """
 
     steps: LSteps
@@ -72,6 +72,7 @@ class Setting:
     expansion: Expansion | None = None
     hold: Hold | None = None
     rates: FloatArray | None = None
+    needed: float = 0.0
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
@@ -100,7 +101,8 @@ class Setting:
             cubic = self.expansion.around(self.policy, self.P, last, (rho, rho))
             self.steps.local[last] = cubic
         self.steps.bound_pushes(end, rho)
-        return MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
+        own = MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
+        return max(own, self.needed)
 
 
 def prepare(

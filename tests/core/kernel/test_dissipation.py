@@ -280,6 +280,25 @@ def test_a_box_cannot_be_left_out(name: str) -> None:
     assert not oracle.agrees(proof, {MODEL: model})
 
 
+@pytest.mark.parametrize("name", ["monotone", "implicit_linear"])
+@pytest.mark.parametrize("delay", [119, 2**53])
+def test_inputs_that_are_remembered_for_too_long_are_refused_at_once(name: str, delay: int) -> None:
+    model, proof = claim(name)
+    model["window"][0][1] = delay
+    with pytest.raises(CertificateRejected, match="remembered inputs; 1 to 120 together"):
+        decide(model, proof)
+
+
+def test_a_model_of_too_many_terms_is_refused_before_they_are_written_out() -> None:
+    model, proof = claim("moving")
+    terms = [[i, j] for i in range(20) for j in range(20)]
+    for k in range(119):
+        exponents = {"exponents": terms, "coefficients": [[[0.0]]] * len(terms)}
+        model["G"].insert(1 + k, exponents)
+    with pytest.raises(CertificateRejected, match="too many terms"):
+        decide(model, proof)
+
+
 def test_several_outputs_have_one_multiplier_on_the_whole_box() -> None:
     """Two runs may be in different halves, and no point between them need obey both equations."""
     model, proof = claim("constant")

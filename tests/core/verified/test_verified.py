@@ -24,12 +24,18 @@ from bags.samples import f1tenth
 from benchmarks.verified import generator, mutated
 from nlsid_core import files as saved
 from nlsid_core import kernel, proofs, second
+from nlsid_core.design import design
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
-from tests.core.kernel import mutations
+from tests.core.kernel import mutations, stability_claims
+from tests.core.kernel.held_claims import claim
 from tests.core.kernel.sampled_claims import one_step
+from tests.core.kernel.stability_forgeries import CHANGES
+from tests.falling_pendulum import tracking
+from tests.forged_held import HELD_FORGERIES, forged_held
 from tests.forged_tracking import FORGERIES, forged
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, write
+from tests.funnel_files import saved as saved_design
 from tests.tracked import designed
 from tests.tracked import write as write_design
 
@@ -70,12 +76,13 @@ def accepted(proof: Path, build: Path) -> subprocess.CompletedProcess[str]:
 
 @needs_coq
 @pytest.mark.coq
-@pytest.mark.parametrize("name", ["clipped", "pushed"])
+@pytest.mark.parametrize("name", ["clipped", "pushed", "held"])
 def test_coq_proves_the_theorem_of_a_funnel(name: str, build: Path) -> None:
     done = accepted(FUNNELS / name / "claim.proof.json", build)
     assert done.returncode == 0, done.stderr
     assert "accepted: " in done.stdout
-    assert "in_bounds data x t" in (build / "theorem.v").read_text()
+    stated = "held_in_bounds data x u t" if name == "held" else "in_bounds data x t"
+    assert stated in (build / "theorem.v").read_text()
 
 
 def rho_raised(files: Files) -> None:
@@ -143,6 +150,21 @@ def pushed_by_the_state(files: Files) -> None:
     exponents.sort()
 
 
+def held_longer(files: Files) -> None:
+    """Three times."""
+    files[PROOF]["claim"]["hold"] *= 3
+
+
+def measured_worse(files: Files) -> None:
+    """Ten times."""
+    files[PROOF]["claim"]["error"] = [0.02]
+
+
+def turns_more_slowly(files: Files) -> None:
+    """A third: rates of one interval."""
+    files[PROOF]["proof"]["rates"][0][0] /= 3
+
+
 @needs_coq
 @pytest.mark.coq
 @pytest.mark.parametrize(
@@ -152,7 +174,10 @@ def pushed_by_the_state(files: Files) -> None:
       bounds_too_narrow, input_bounds_too_narrow)]
     + [("pushed", forge) for forge in
        (bounds_too_narrow, input_bounds_too_narrow, kappa_smaller, pushed_more,
-        pushed_by_the_state)],
+        pushed_by_the_state)]
+    + [("held", forge) for forge in
+       (rho_raised, gain_lower, input_bounds_too_narrow, held_longer, measured_worse,
+        turns_more_slowly)],
 )  # fmt: skip
 def test_both_kernels_refuse_a_forgery(
     name: str, forge: Callable[[Files], None], build: Path, tmp_path: Path
@@ -174,7 +199,7 @@ MODELS = (
     "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
     "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
     "tube/lasting_cascade", "stability/linear", "stability/network", "stability/cascade",
-    "stability/moving_lags", "stability/split", "stability/two_outputs",
+    "stability/ends", "stability/moving_lags", "stability/split", "stability/two_outputs",
 )  # fmt: skip
 
 
@@ -183,7 +208,15 @@ COMPOSED = "funnel_composition/two"
 
 
 @pytest.mark.parametrize(
-    "name", [*MODELS, *SAMPLED, COMPOSED, "continuous_funnel/clipped", "continuous_funnel/pushed"]
+    "name",
+    [
+        *MODELS,
+        *SAMPLED,
+        COMPOSED,
+        "continuous_funnel/clipped",
+        "continuous_funnel/pushed",
+        "continuous_funnel/held",
+    ],
 )
 def test_the_numbers_of_a_theorem_print_as_the_files(name: str) -> None:
     """And each of them counts: another one prints as another file."""
@@ -256,6 +289,15 @@ WINDOW = "sha256:" + "0" * 63
 ASSUMED = "funnel.json tubes 0 assumption"
 
 
+def wide_window(files: Files) -> None:
+    """Four entries, and a monomial of degree 20 in each."""
+    model = files["model.json"]
+    model["window"] = [[0, 0], [0, 1], [0, 0], [0, 1]]
+    for table in (*model["G"], model["p"]):
+        table["exponents"] = [[*row, 0, 0] for row in table["exponents"]]
+    model["p"]["exponents"][0] = [20, 20, 20, 20]
+
+
 @pytest.mark.parametrize(
     ("name", "forge", "said"),
     [
@@ -315,6 +357,11 @@ ASSUMED = "funnel.json tubes 0 assumption"
         ("peak", at("claim.proof.json proof ball_basis", []), "1 to 200 entries"),
         ("peak", at("claim.proof.json version", 2.0), "not of version 2"),
         ("peak", at("model.json noise", 2**53 + 1), "a whole number beyond 2^53"),
+        ("peak", at("claim.proof.json proof steps 0 tube squares scale", 1.0), "is allowed"),
+        ("lasting_split", at("funnel.json tubes 0 follows", {
+            "terms": [{"inputs": ["0"], "of": "value", "centre": 0.0, "scale": 1.0, "fading": 0.5}],
+            "weights": [[1.0]]}), "0 to 0 is allowed"),
+        ("lasting_split", wide_window, "a degree above 63"),
         ("lasting_split", at("model.json p", {"exponents": [], "coefficients": []}),
          "p has no monomials"),
     ],
@@ -368,7 +415,7 @@ def test_what_the_reader_refuses_the_first_kernel_refuses(tmp_path: Path) -> Non
 @needs_coq
 @pytest.mark.coq
 def test_the_kernels_do_not_disagree_about_mutants(program: Path, tmp_path: Path) -> None:
-    found = mutated(400, tmp_path / "mutant", program.parent / "second")
+    found = mutated(600, tmp_path / "mutant", program.parent / "second")
     assert found["differ"] == {}
     kinds = ("tube", "stability", "continuous_funnel", "sampled_funnel", "funnel_composition")
     for kind in kinds:
@@ -479,6 +526,44 @@ def test_every_forged_sampled_funnel_is_refused(program: Path, tmp_path: Path) -
     for what in FORGERIES:
         proof = write_design(forged(designed(), what), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
+
+
+@needs_coq
+@pytest.mark.coq
+def test_every_forged_held_funnel_is_refused(program: Path, tmp_path: Path) -> None:
+    """Those that the first kernel's tests hold; one whose input is held between samples."""
+    files = saved_design(design(tracking(hold=0.01, error=[0.002, 0.01])), tmp_path)
+    assert second.opinion(write(files, tmp_path), program).verdict == "accepted"
+    for what in HELD_FORGERIES:
+        proof = write(forged_held(files, what), tmp_path)
+        assert second.opinion(proof, program).verdict == "refused", what
+
+
+@needs_coq
+@pytest.mark.coq
+def test_every_forged_stability_is_refused(program: Path, tmp_path: Path) -> None:
+    """Those that the first kernel's tests hold."""
+    for what, (name, change, _) in CHANGES.items():
+        model, proof = stability_claims.claim(name)
+        assert said_of(model, proof, program, tmp_path) == "accepted", name
+        change(model, proof["proof"])
+        assert said_of(model, proof, program, tmp_path) == "refused", what
+
+
+def said_of(model: Json, proof: Json, program: Path, folder: Path) -> str:
+    """What the second kernel says of a proof of stability."""
+    files = {"model.json": model, "claim.proof.json": proof}
+    return second.opinion(put(files, folder), program).verdict
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(("low", "kept"), [(0.5, False), (1.0, False), (0.0, True)])
+def test_a_bound_that_an_old_input_breaks_is_refused(
+    low: float, kept: bool, program: Path, tmp_path: Path
+) -> None:
+    said = second.opinion(write(claim(low), tmp_path), program).verdict
+    assert said == ("accepted" if kept else "refused")
 
 
 @needs_coq

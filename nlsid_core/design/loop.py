@@ -1,0 +1,66 @@
+"""`compose_loop`: two proved gains in files, and the proof that a loop of both models is bounded.
+
+Source: docs/certificate_small_gain.md.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nlsid_core import files, proofs
+from nlsid_core.arrays import Json
+from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
+from nlsid_core.kernel import Verdict
+
+LOOP = "small_gain.proof.json"
+KIND = "dissipation"
+
+
+def is_gain(path: Path | str) -> bool:
+    """Whether a file is a proof of a gain or of passivity."""
+    claim = files.load_document(Path(path)).get("claim")
+    return isinstance(claim, dict) and claim.get("kind") == KIND
+
+
+def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path, Verdict]:
+    """Bind two proofs of gains, and their models, into one claim that `check` decides.
+
+    Copies each proof and its model to `folder`, as first.proof.json, first.model.json and so on,
+    and writes small_gain.proof.json, whose path is returned.
+
+    Raises DataError if there are not two proofs, CertificateRejected or CertificateMismatch if one
+    is none of a gain or the models do not fit, Infeasible if the gains' product is 1 or more.
+    """
+    if len(paths) != 2:
+        raise DataError(f"a loop is of two proved gains, got {len(paths)}")
+    contents: dict[str, Json | bytes] = {}
+    about: Json = {}
+    numbers = []
+    for role, path in zip(("first", "second"), map(Path, paths), strict=True):
+        if not is_gain(path):
+            raise CertificateRejected(f"{path} is no proof of a gain")
+        document = files.load_document(path)
+        binding = files.member(document["claim"]["about"], "model", dict, source=str(path))
+        name = files.member(binding, "file", str, source=str(path))
+        beside = path.parent / name
+        if beside.name != name or not beside.is_file():
+            raise CertificateMismatch(f"{path}: the model file {name!r} is not beside it")
+        own = {"model": binding | {"file": f"{role}.model.json"}}
+        document = document | {"claim": document["claim"] | {"about": own}}
+        proof = files.encode(document)
+        contents |= {f"{role}.model.json": beside.read_bytes(), f"{role}.proof.json": proof}
+        about[role] = {"file": f"{role}.proof.json", "digest": files.digest(proof)}
+        numbers.append(document["claim"].get("supply", {}).get("number", 0.0))
+    one, two = numbers
+    if one * two >= 1.0:
+        raise Infeasible(
+            f"the gains {one:.4g} and {two:.4g} have the product {one * two:.4g}; only a product "
+            "below 1 proves the loop"
+        )
+    claim = proofs.proof_document({"kind": "small_gain", "about": about}, {})
+    verdict = proofs.decide(claim, contents)
+    folder = Path(folder)
+    for name, content in contents.items():
+        assert isinstance(content, bytes)
+        files.write_atomically(folder / name, content)
+    files.write_document(folder / LOOP, claim)
+    return folder / LOOP, verdict

@@ -1,0 +1,133 @@
+"""`nlsid gain` and the loops of `nlsid compose`, from model files."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bags.commands.cli import app
+from bags.commands.show import named_number
+from nlsid_core import files
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.models import DifferenceEquation, Signal
+from nlsid_core.proofs import check
+from tests.core.kernel.dissipation_claims import feedthrough, integrator, moving
+from tests.core.kernel.stability_claims import U, Y, linear
+
+RUN = CliRunner()
+
+
+def written(folder: Path, model: object, name: str = "model") -> Path:
+    path = folder / f"{name}.json"
+    files.write_document(path, model.document())  # type: ignore[attr-defined]
+    return path
+
+
+def test_the_gain_of_a_model_is_printed_between_proof_and_runs(tmp_path: Path) -> None:
+    """The peak of its frequency response is 1.125627."""
+    model = written(tmp_path, linear())
+    result = RUN.invoke(app, ["gain", str(model)])
+    assert result.exit_code == 0, result.output
+    first, second, proved, wrote = result.output.splitlines()
+    assert first == "gain at most 1.126 m/s per V: proved, of the model"
+    assert second.startswith("at least 1.125 m/s per V: two simulated runs, a wave of 3.75 Hz, ")
+    assert proved.startswith("PROVED incremental gain: two runs of the model satisfy ")
+    proof = tmp_path / "model.gain.proof.json"
+    assert wrote == f"wrote {proof}"
+    assert "G = 1.126" in str(check(proof))
+
+
+def test_an_index_of_passivity_is_a_proof_of_its_own(tmp_path: Path) -> None:
+    """1/(1 - 0.5/z) has the least real part 2/3."""
+    model = written(tmp_path, feedthrough())
+    result = RUN.invoke(app, ["gain", str(model), "--passivity"])
+    assert result.exit_code == 0, result.output
+    assert result.output.startswith("passivity index at least 0.6665 m/s per V: proved, of the")
+    assert "\nat most 0.6667 m/s per V: two simulated runs, " in result.output
+    assert (tmp_path / "model.passivity.proof.json").is_file()
+
+
+def test_what_has_no_gain_is_not_proved_but_with_a_discount(tmp_path: Path) -> None:
+    model = written(tmp_path, integrator())
+    result = RUN.invoke(app, ["gain", str(model)])
+    assert result.exit_code == 1
+    assert result.output.startswith("NOT PROVED")
+    assert not (tmp_path / "model.gain.proof.json").exists()
+    result = RUN.invoke(app, ["gain", str(model), "--discount", "0.875"])
+    assert result.exit_code == 0, result.output
+    assert result.output.startswith("gain at most 1.449 m/s per V, with discount 0.875: proved")
+    assert "not compared with simulated runs" in result.output
+
+
+def test_a_scale_takes_the_unit_away(tmp_path: Path) -> None:
+    model = written(tmp_path, linear())
+    result = RUN.invoke(app, ["gain", str(model), "--scale", "speed=0.5"])
+    assert result.output.startswith("gain at most 2.252: proved")
+    proof = json.loads((tmp_path / "model.gain.proof.json").read_text())
+    assert proof["claim"]["scales"] == {"u": [1.0], "y": [0.5]}
+
+
+@pytest.mark.parametrize("given", ["speed", "=2", "speed=fast", "speed=nan"])
+def test_a_scale_that_is_none_is_refused(given: str) -> None:
+    with pytest.raises(DataError, match=r"NAME=VALUE"):
+        named_number(given)
+
+
+def test_scales_of_unknown_signals_or_of_no_size_are_refused(tmp_path: Path) -> None:
+    model = written(tmp_path, linear())
+    result = RUN.invoke(app, ["gain", str(model), "--scale", "sped=0.5"])
+    assert isinstance(result.exception, DataError)
+    assert "no signal is called sped; the model has speed, command" in str(result.exception)
+    result = RUN.invoke(app, ["gain", str(model), "--scale", "speed=0"])
+    assert "all positive" in str(result.exception)
+    result = RUN.invoke(app, ["gain", str(model), "--discount", "1.5"])
+    assert "discount should satisfy" in str(result.exception)
+
+
+def test_a_model_that_needs_a_box_says_so_where_no_trials_lie_beside_it(tmp_path: Path) -> None:
+    model = written(tmp_path, moving())
+    result = RUN.invoke(app, ["gain", str(model)])
+    assert isinstance(result.exception, DataError)
+    assert "needs a box of its outputs" in str(result.exception)
+
+
+def heard(gain: float) -> DifferenceEquation:
+    return DifferenceEquation(
+        np.array([0.25]), np.array([0.1, 0.3]) * gain, 0.0, 0.025, Signal("voltage", "V"),
+        Signal("heard", "m/s"), (-1.0, 1.0),
+    )  # fmt: skip
+
+
+def test_two_gains_are_composed_into_a_loop(tmp_path: Path) -> None:
+    proofs = []
+    for name, model in (("car", linear()), ("other", heard(1.0))):
+        path = written(tmp_path, model, name)
+        assert RUN.invoke(app, ["gain", str(path)]).exit_code == 0
+        proofs.append(str(tmp_path / f"{name}.gain.proof.json"))
+    result = RUN.invoke(app, ["compose", *proofs, "--out", str(tmp_path / "loop")])
+    assert result.exit_code == 0, result.output
+    assert result.output.startswith("PROVED small gain: ")
+    verdict = check(tmp_path / "loop" / "small_gain.proof.json")
+    assert float(verdict.margin) == pytest.approx(1 - 1.125627 * 0.4 / 0.75, abs=1e-3)
+    swapped = RUN.invoke(app, ["compose", *proofs[::-1], "--out", str(tmp_path / "swapped")])
+    assert swapped.exit_code == 0
+
+
+def test_a_loop_that_is_not_small_or_does_not_fit_is_refused(tmp_path: Path) -> None:
+    same = DifferenceEquation(np.array([0.5]), np.array([0.1, 0.1]), 0.0, 0.025, Y, U, (-1.0, 1.0))
+    paths = {}
+    for name, model in (("car", linear()), ("loud", heard(2.0)), ("same", same)):
+        assert RUN.invoke(app, ["gain", str(written(tmp_path, model, name))]).exit_code == 0
+        paths[name] = str(tmp_path / f"{name}.gain.proof.json")
+    out = ["--out", str(tmp_path / "loop")]
+    loud = RUN.invoke(app, ["compose", paths["car"], paths["loud"], *out])
+    assert isinstance(loud.exception, Infeasible)
+    assert "1.126 and 1.067 have the product 1.201" in str(loud.exception)
+    fits = RUN.invoke(app, ["compose", paths["car"], paths["same"], *out])
+    assert isinstance(fits.exception, CertificateRejected)
+    assert "the units differ" in str(fits.exception)
+    alone = RUN.invoke(app, ["compose", paths["car"], *out])
+    assert "a loop is of two proved gains" in str(alone.exception)
+    assert not (tmp_path / "loop").exists()
