@@ -14,6 +14,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.design.continuous.decay import prove_decay
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import Proved, prove_pieces
 from nlsid_core.dynamics import VectorField, constant_on
@@ -28,6 +29,9 @@ FIRST, LAST = 2.65, 1.1  # W at both ends of Figure 5.2(a)
 LEVEL, SIGMA, RATE = 4.0, 0.36, 3.0  # V = x²/LEVEL in Figure 5.2(b)
 LEAST_SIGMA = 0.25
 STEPS = 8  # of the bisection
+FIELD = VectorField.from_function(
+    lambda x, w: np.array([x[0] / 2 + w[0] / 2 - x[0] ** 3]), 1, 0, uncertain=[[-1, 1]]
+)
 
 
 def decay(sigma: float) -> Lemma:
@@ -41,16 +45,25 @@ def decay(sigma: float) -> Lemma:
 
 def invariance(last: float) -> tuple[ContinuousFunnel, Proved]:
     """Lemma 5.2 for W = x² ≤ ρ(t), ρ linear from 2.65 to `last`."""
-    field = VectorField.from_function(
-        lambda x, w: np.array([x[0] / 2 + w[0] / 2 - x[0] ** 3]), 1, 0, uncertain=[[-1, 1]]
-    )
+    policy, funnel = around_zero(FIRST, last)
+    return funnel, prove_pieces(LSteps(FIELD), policy, funnel)
+
+
+def pulled_in() -> float:
+    """Lemma 5.3 for V = x²/4 at the rate 3, by the pieces of a funnel: the floor that is found."""
+    proved = prove_decay(LSteps(FIELD, decay=RATE), *around_zero(LEVEL, LEVEL))
+    assert proved.pieces.decay is not None
+    return proved.pieces.decay[1]
+
+
+def around_zero(first: float, last: float) -> tuple[ContinuousPolicy, ContinuousFunnel]:
+    """No input, and W = x² ≤ ρ(t), ρ linear from `first` to `last`."""
     t = np.linspace(0, END, KNOTS)
     still = constant_on(t, np.zeros((KNOTS - 1, 1)))
     nothing = constant_on(t, np.zeros((KNOTS - 1, 0)))
     policy = ContinuousPolicy(still, nothing, constant_on(t, np.zeros((KNOTS - 1, 0, 1))), "")
-    rho = FIRST + (last - FIRST) * t / END
-    funnel = ContinuousFunnel(still, np.ones((KNOTS, 1, 1)), rho, "", "")
-    return funnel, prove_pieces(LSteps(field), policy, funnel)
+    rho = first + (last - first) * t / END
+    return policy, ContinuousFunnel(still, np.ones((KNOTS, 1, 1)), rho, "", "")
 
 
 def solutions(starts: FloatArray, t: FloatArray) -> FloatArray:
@@ -121,6 +134,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    print(main())
+    print(main(), pulled_in())
     if arguments.plot is not None:
         draw(arguments.plot)

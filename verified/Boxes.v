@@ -4,14 +4,17 @@ From Verified Require Import Integers Forms Claim Condition Definite Goal Funnel
 Import ListNotations.
 Open Scope R_scope.
 
+(* Stated bounds of one entry, with the weights that prove them (Ends.v). *)
+Record stated_ends := Ends {
+  low_end : num; high_end : num; low_weights : list num; high_weights : list num }.
 (* A box halved, and halved again. *)
-Inductive tree := Leaf (Ns : list matrix) | Split (i : nat) (lower upper : tree).
+Inductive tree := Leaf (stated : option stated_ends) (Ns : list matrix) | Split (i : nat) (lower upper : tree).
 Definition middle (a b : num) : num := nmul (1%Z, 2%positive) (nadd a b).
 Section Leaves.
-Variable ok : list (num * num) -> list matrix -> bool.
+Variable ok : list (num * num) -> option stated_ends -> list matrix -> bool.
 Fixpoint on_leaves (t : tree) (box : list (num * num)) : bool :=
   match t with
-  | Leaf Ns => ok box Ns
+  | Leaf stated Ns => ok box stated Ns
   | Split i lower upper =>
       match nth_error box i with
       | Some (a, b) =>
@@ -29,9 +32,9 @@ Proof.
   - destruct (IH i E) as [A|A]; [left|right]; constructor; auto.
 Qed.
 Lemma leaf_of t : forall box w, on_leaves t box = true -> in_box w box ->
-  exists box' Ns, ok box' Ns = true /\ in_box w box'.
+  exists box' stated Ns, ok box' stated Ns = true /\ in_box w box'.
 Proof.
-  induction t as [Ns|i lower IHl upper IHu]; intros box w H Hw; cbn in H; [eauto|].
+  induction t as [stated Ns|i lower IHl upper IHu]; intros box w H Hw; cbn in H; [eauto|].
   destruct (nth_error box i) as [[a b]|] eqn:E; [|discriminate]. apply andb_prop in H as [H1 H2].
   destruct (halves a b (middle a b) w box Hw i E); eauto.
 Qed.

@@ -1,6 +1,6 @@
 (* Tubes and stability of identified models: what is decided, and why outputs then stay near. *)
 From Coq Require Import ZArith Reals List Lra Lia Psatz.
-From Verified Require Import Integers Forms Claim Condition Definite Goal Funnel Tubes Increments Boxes Cells.
+From Verified Require Import Integers Forms Claim Condition Definite Goal Funnel Tubes Increments Boxes Ends Cells.
 Import ListNotations.
 Open Scope R_scope.
 
@@ -66,12 +66,22 @@ Section Near.
 Context {K : Ints}.
 
 (* One multiplier for each form, at every leaf. *)
-Definition leaf_ok (m : model) (forms : list pairs) (box : list (num * num)) (Ns : list matrix)
-  : bool :=
-  let vs := vertices_of m box in
-  andb (Nat.eqb (length Ns) (length forms))
-    (forallb (fun e => positive_at (steepening m) (unknowns m + states m) (fst e) vs (snd e))
-      (combine forms Ns)).
+Definition vertices_at (m : model) (box : list (num * num)) (stated : option stated_ends)
+  : option (list matrix) :=
+  match stated, m with
+  | None, _ => Some (vertices_of m box)
+  | Some e, Affine 1 _ _ _ ts => vertices_between box e ts
+  | _, _ => None
+  end.
+Definition leaf_ok (m : model) (forms : list pairs) (box : list (num * num))
+  (stated : option stated_ends) (Ns : list matrix) : bool :=
+  match vertices_at m box stated with
+  | Some vs =>
+      andb (Nat.eqb (length Ns) (length forms))
+        (forallb (fun e => positive_at (steepening m) (unknowns m + states m) (fst e) vs (snd e))
+          (combine forms Ns))
+  | None => false
+  end.
 
 Definition difference (u v : list R) (z x : list R) : list R := minus (u ++ z) (v ++ x).
 
@@ -262,25 +272,32 @@ Proof.
   apply andb_prop in Hm' as [H1 H2]. apply andb_prop in H1 as [H0 H1]. apply Nat.ltb_lt in H0.
   apply andb_prop in H2 as [_ H2].
   assert (Hbox : exists w', in_box w' (box_of m) /\
-    forall box, in_box w' box -> settled (steepening m) (vertices_of m box) zeta).
+    forall box stated vs, in_box w' box -> vertices_at m box stated = Some vs ->
+    settled (steepening m) vs zeta).
   { destruct m as [a|p n scale range ts|e1 e2 e3 a shift|maps into next out]; cbn [step box_of steepening vertices_of] in *.
-    - exists []. split; [constructor|]. intros box _ c l _ H. specialize (H [] (or_introl eq_refl)).
+    - exists []. split; [constructor|]. intros box [st|] vs _ Hv; [discriminate|]. injection Hv as <-.
+      intros c l _ H. specialize (H [] (or_introl eq_refl)).
       cbn in H. rewrite dot_nil_r in H. lra.
-    - decompose [and] Sx; decompose [and] Sz. exists w. split; auto. intros box Hw c l _ H'.
+    - decompose [and] Sx; decompose [and] Sz. exists w. split; auto. apply andb_prop in H2 as [_ H2].
+      assert (Z1 : forall i, In i (seq 0 p) -> weighted ts w zeta i = 0).
+      { intros i Hi. apply in_seq in Hi. unfold difference.
+        rewrite weighted_minus by (rewrite !app_length; lia).
+        match goal with A : forall i, _ -> weighted ts w (v ++ x) i + _ = 0,
+          B : forall i, _ -> weighted ts w (u ++ z) i + _ = 0 |- _ =>
+          specialize (A i ltac:(lia)); specialize (B i ltac:(lia)) end. lra. }
+      intros box [st|] vs Hw Hv.
+      { destruct p as [|[|p]]; try discriminate. specialize (Z1 O (or_introl eq_refl)).
+        destruct zeta as [|z0 zs] eqn:Ez; [discriminate|].
+        exact (between_settled n box st ts vs w z0 zs Hv Hw H2 Z1). }
+      injection Hv as <-. intros c l _ H'.
       pose proof (vertices_bound l zeta box ts c w Hw H') as B.
-      apply andb_prop in H2 as [_ H2].
       rewrite (valued_weighted p (p + n)) in B by auto.
       assert (Z0 : forall l, dot l (map (weighted ts w zeta) (seq 0 p)) = 0); [|rewrite Z0 in B; lra].
-      { intros k. assert (Z1 : forall i, In i (seq 0 p) -> weighted ts w zeta i = 0).
-        { intros i Hi. apply in_seq in Hi. unfold difference.
-          rewrite weighted_minus by (rewrite !app_length; lia).
-          match goal with A : forall i, _ -> weighted ts w (v ++ x) i + _ = 0,
-            B : forall i, _ -> weighted ts w (u ++ z) i + _ = 0 |- _ =>
-            specialize (A i ltac:(lia)); specialize (B i ltac:(lia)) end. lra. }
-        revert Z1. generalize (seq 0 p). clear. intros js. revert k.
+      { intros k. revert Z1. generalize (seq 0 p). clear. intros js. revert k.
         induction js as [|i js IH]; intros [|k0 k] Z1; cbn; auto.
         rewrite (Z1 i) by now left. rewrite IH; [ring|]. intros; apply Z1; now right. }
-    - exists []. split; [constructor|]. intros box _ c l Hl H. specialize (H _ (or_introl eq_refl)).
+    - exists []. split; [constructor|]. intros box [st|] vs _ Hv; [discriminate|]. injection Hv as <-.
+      intros c l Hl H. specialize (H _ (or_introl eq_refl)).
       decompose [and] Sx; decompose [and] Sz. rewrite Split in *.
       destruct v as [|v0 [|]]; try discriminate. destruct u as [|u0 [|]]; try discriminate.
       change (minus [u0] [v0]) with [u0 - v0] in *. cbn [hd app] in *.
@@ -333,7 +350,8 @@ Proof.
       assert (Larg : forall a, length (plus (at_ into a) w) = length maps).
       { intros a. unfold plus. rewrite zip_length; rewrite at_length; congruence. }
       destruct (slopes_between maps _ _ Hmaps (Larg (u ++ z)) (Larg (v ++ x))) as [sigma [Hs E]].
-      exists sigma. split; [exact Hs|]. intros box Hbox c l _ H.
+      exists sigma. split; [exact Hs|]. intros box [st|] vs Hbox Hv; [discriminate|]. injection Hv as <-.
+      intros c l _ H.
       assert (Ls : length sigma = length maps).
       { apply Forall2_length in Hs. now rewrite map_length in Hs. }
       assert (Lb : length sigma = length box) by (clear - Hbox; now apply Forall2_length in Hbox).
@@ -350,8 +368,9 @@ Proof.
         rewrite minus_plus by (rewrite at_length; congruence). symmetry. apply at_minus.
         rewrite !app_length. congruence. }
   destruct Hbox as [w' [Hw' Hs]].
-  destruct (leaf_of _ t _ w' Ht Hw') as [box [Ns [Hok Hin]]].
-  unfold leaf_ok in Hok. apply andb_prop in Hok as [Hlen Hok]. apply Nat.eqb_eq in Hlen.
+  destruct (leaf_of _ t _ w' Ht Hw') as [box [stated [Ns [Hok Hin]]]].
+  unfold leaf_ok in Hok. destruct (vertices_at m box stated) as [vs|] eqn:Evs; [|discriminate].
+  specialize (Hs box stated vs Hin Evs). apply andb_prop in Hok as [Hlen Hok]. apply Nat.eqb_eq in Hlen.
   rewrite forallb_forall in Hok.
   assert (G : exists N, In (base, N) (combine forms Ns)).
   { clear - Hb Hlen. revert Ns Hlen Hb. induction forms as [|f forms IH]; intros [|N Ns] H Hb;

@@ -160,7 +160,7 @@ class Writer:
     def upper(self, P: list[list[Any]], what: str) -> str:
         """The upper triangle of a symmetric matrix."""
         if any(number(P[i][j]) != number(P[j][i]) for i in range(len(P)) for j in range(i)):
-            raise NotCovered(f"{what} is not symmetric")
+            raise Refused(f"{what} is not symmetric")
         return self.to.listed(self.nums(row[i:]) for i, row in enumerate(P))
 
     def squares(self, stated: dict[str, Any]) -> str:
@@ -270,14 +270,18 @@ class Writer:
         """The multipliers of the leaves, by columns, one for each form."""
         to = self.to
         if tree is None:
-            return to.chosen("Leaf", 0, to.listed([to.listed([])] * forms))
+            return to.chosen("Leaf", 0, to.maybe(None), to.listed([to.listed([])] * forms))
         if set(tree) == {"split", "parts"}:
             lower, upper = (self.tree(part, forms) for part in tree["parts"])
             return to.chosen("Split", 1, to.count(integer(tree["split"], 0, 99)), lower, upper)
+        stated = None
         if "ends" in tree:
-            raise NotCovered("stated ends of a leaf are not covered")
+            ends = tree["ends"]
+            weights = (self.nums(ends[f"{name}_weights"]) for name in ("low", "high"))
+            stated = to.made("Ends", self.num(ends["low"]), self.num(ends["high"]), *weights)
         Ns = tree["N"] if forms > 1 else [tree["N"]]
-        return to.chosen("Leaf", 0, to.listed(self.matrix(zip(*N, strict=True)) for N in Ns))
+        columns = to.listed(self.matrix(zip(*N, strict=True)) for N in Ns)
+        return to.chosen("Leaf", 0, to.maybe(stated), columns)
 
     def plan(self, problem: "Increments") -> list[str]:
         """a, b_1 ..., b_0, c of a difference equation, and the policy's feedback."""

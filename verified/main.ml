@@ -70,8 +70,11 @@ let tube () =
   let fading = num () in let gain = matrix () in let storage = matrix () in
   let weight = matrix () in let tau0 = nums () in let widths = nums () in
   let top = num () in { fading; gain; storage; weight; tau0; widths; top; inlet = num () }
+let stated_ends () =
+  let low_end = num () in let high_end = num () in let low_weights = nums () in
+  { low_end; high_end; low_weights; high_weights = nums () }
 let rec tree () = match count () with
-  | 0 -> Leaf (listed matrix)
+  | 0 -> let stated = maybe stated_ends () in Leaf (stated, listed matrix)
   | 1 -> let i = count () in let lower = tree () in Split (i, lower, tree ())
   | _ -> failwith "a tree"
 

@@ -374,10 +374,15 @@ def _tree(tree: Made, forms: int) -> Any:
     if tree.name == "Split":
         i, lower, upper = tree.terms
         return {"split": i, "parts": [_tree(lower, forms), _tree(upper, forms)]}
-    columns = [[list(row) for row in zip(*number(N), strict=True)] for N in tree.terms[0]]
+    stated, Ns = tree.terms
+    columns = [[list(row) for row in zip(*number(N), strict=True)] for N in Ns]
     if not any(columns):
         return None
-    return {"N": columns if forms > 1 else columns[0]}
+    leaf: dict[str, Any] = {"N": columns if forms > 1 else columns[0]}
+    names = ("low", "high", "low_weights", "high_weights")
+    for ends in _maybe(stated):
+        leaf["ends"] = dict(zip(names, map(number, ends.terms), strict=True))
+    return leaf
 
 
 def _model(term: Made, like: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from bags.recordings.names import listed
 from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
 from nlsid_core.arrays import FloatArray
-from nlsid_core.data.calibration import CalibrationTrials, calibration_trials
+from nlsid_core.data.calibration import CalibrationTrials, calibration_trials, check_apart
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.design import OutputTube, OutputTubeDesign, design
 from nlsid_core.design.tube import least_window
@@ -223,6 +223,9 @@ def by_use(labelled: Dataset, config: Config) -> Trials:
             validation=config.split.validation,
             calibration=config.split.calibration,
         )
+    if trials.calibration is not None:
+        fitted = (*trials.train, *(trials.validation or ()))
+        check_apart(fitted, trials.calibration)
     named = (*config.split.test, *config.split.validation, *config.split.calibration)
     absent = tuple(name for name in named if not _of_bags(labelled, [name]))
     skipped, filled = skipped_samples(labelled), filled_samples(labelled)

@@ -13,7 +13,7 @@ from typing import Any, Final
 from pydantic import TypeAdapter
 
 from bags.chain.identification_config import Identification, IdentificationConfig
-from bags.setup.proposal import GOOD, POOR, Proposal
+from bags.setup.proposal import POOR, Proposal
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import Sem, identify
@@ -22,6 +22,7 @@ from nlsid_core.identification.searches import hold_out
 SAMPLES: Final = 2000  # of the training trials, to which these classes are fitted
 START: Final = 20  # samples of each trial that are not scored: some classes read their start there
 SECONDS: Final = 30.0  # of processor time, after which no further class is begun
+ENOUGH: Final = 5.0  # % of error, below which no further class is tried
 BETTER: Final = 0.8  # of the linear model's error, that another class has to reach
 LOOP_WORTH: Final = 0.6  # of the best error so far, that an unproved loop has to reach
 LAGS: Final = (2, 3)  # of such loops
@@ -31,7 +32,7 @@ Section = Mapping[str, Any]
 
 def say_class(proposal: Proposal, train: Dataset) -> None:
     """Propose another class where its proved model simulates trials held back far better."""
-    if not GOOD < proposal.error < math.inf:
+    if not ENOUGH < proposal.error < math.inf:
         return
     names = train.names[1::3]
     fitted, held_back = (train.without(names), train.select(names)) if names else hold_out(train)
@@ -66,7 +67,7 @@ def tried_classes(
         if math.isfinite(error) or section is known:
             best = min(best, error)
             yield section, error
-        if best <= GOOD or time.process_time() - started > SECONDS:
+        if best <= ENOUGH or time.process_time() - started > SECONDS:
             return
     loops = {
         lags: _error({"model": "feedback", "lags": lags, "method": Sem.name}, few, held_back)

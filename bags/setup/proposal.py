@@ -9,8 +9,7 @@ from typing import Any, Final
 from bags.chain.config import Config
 
 POOR: Final = 50.0  # % of error in simulation, above which a model says little
-GOOD: Final = 10.0  # % below which no further class is tried
-GRADES: Final = ((GOOD, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
+GRADES: Final = ((10.0, "good"), (25.0, "fair"), (POOR, "weak: the tube will be wide"))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """The times of a recording: offset and drift between clocks, gaps, duplicates, commands held."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -102,15 +101,6 @@ def _drift(t: FloatArray, ahead: FloatArray) -> float:
     if total < max(DRIFT_LEAST, DRIFT_SIGNIFICANT * scatter):
         return 0.0
     return float(slope)
-
-
-def segments(stamp_ns: IntArray, max_gap: float) -> list[tuple[int, int]]:
-    """[start, stop) of the runs of messages with at most `max_gap` s between neighbours."""
-    if not len(stamp_ns):
-        return []
-    breaks = np.flatnonzero(np.diff(stamp_ns) > max_gap * 1e9) + 1
-    edges = [0, *breaks.tolist(), len(stamp_ns)]
-    return list(pairwise(edges))
 
 
 def without_duplicates(stamp_ns: IntArray) -> IntArray:

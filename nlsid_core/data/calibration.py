@@ -11,6 +11,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from nlsid_core.data.shared import shared_stretch
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import DataError
 
@@ -44,7 +45,7 @@ def calibration_trials(
 
     That is the 2nd, 4th, ... of the distinct recordings in `train`. If there is but one, it is cut
     into windows of `least` samples, and every second window scales. Raises DataError if a recording
-    is on both sides, or if there are not two windows.
+    is on both sides or twice among `calibration`, or if there are not two windows.
     """
     if calibration is not None:
         twice = {recording(trial) for trial in train} & {recording(trial) for trial in calibration}
@@ -54,6 +55,7 @@ def calibration_trials(
                     f"{trial.name}: this recording is for the design and for the calibration; the "
                     "largest of trials that designed the tube says nothing of the next one"
                 )
+        check_apart(train, calibration)
         return CalibrationTrials(train, calibration)
     recordings = list(dict.fromkeys(recording(trial) for trial in train))
     if len(recordings) == 1:
@@ -65,10 +67,26 @@ def calibration_trials(
             )
         return CalibrationTrials(Dataset(cut[::2]), Dataset(cut[1::2]), cut=True)
     scaling = set(recordings[1::2])
-    return CalibrationTrials(
-        Dataset(tuple(trial for trial in train if recording(trial) not in scaling)),
-        Dataset(tuple(trial for trial in train if recording(trial) in scaling)),
-    )
+    parts = [
+        [trial for trial in train if (recording(trial) in scaling) is of] for of in (False, True)
+    ]
+    design, scales = (Dataset(tuple(part)) for part in parts)
+    check_apart(design, scales)
+    return CalibrationTrials(design, scales)
+
+
+def check_apart(others: Iterable[Trajectory], calibration: Iterable[Trajectory]) -> None:
+    """Raise DataError if a calibration trial has samples of another trial, whatever its digest.
+
+    See `shared_stretch` for what that can see and what it cannot.
+    """
+    found = shared_stretch(others, calibration)
+    if found is not None:
+        raise DataError(
+            f"{found}. A calibration trial is a recording of its own; the largest of trials that "
+            "designed the tube, or of one that is there twice, says nothing of the next one: "
+            "leave one of the two out"
+        )
 
 
 def windows(trials: Iterable[Trajectory], samples: int) -> tuple[Trajectory, ...]:

@@ -60,8 +60,7 @@ class Rates:
     ) -> "Rates":  # fmt: skip
         """Look at the function once, with symbols."""
         box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
-        if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
-            raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
+        _refuse_box(box)
         given = tuple(inspect.signature(function).parameters)
         if not given or not set(given) <= set(ARGUMENTS):
             raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
@@ -80,9 +79,15 @@ class Rates:
         return cls(function, n, m, box, tuple(exact), tuple(row.uses for row in traced), affine)
 
     @classmethod
-    def numeric(cls, function: Callable[..., Any], n: int, m: int) -> "Rates":
+    def numeric(
+        cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None
+    ) -> "Rates":
         """Only for values at points: nothing is asked of the function but numbers."""
-        return cls(function, n, m, np.zeros((0, 2)), (), ())
+        box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
+        _refuse_box(box)
+        if "w" in inspect.signature(function).parameters and not len(box):
+            raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
+        return cls(function, n, m, box, (), ())
 
     @property
     def depends_on_time(self) -> bool:
@@ -253,7 +258,8 @@ class Cubic:
             result[i, given + place] = row.bound
             for used, c in zip(row.monomials, row.coefficients.tolist(), strict=True):
                 if used and used[0] >= first:
-                    result[i, used[0] - first] += c / float(self.radius[used[0]])
+                    width = float(self.radius[used[0]])
+                    result[i, used[0] - first] += c / width if width else 0.0
         return result
 
     def nonlinear_states(self) -> tuple[int, ...]:
@@ -377,6 +383,13 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
     return VectorField(
         tuple(pieces), n, m, t[1:-1], uncertain, np.array(valid).reshape(-1, 4), EXPANSION
     )
+
+
+def _refuse_box(box: FloatArray) -> None:
+    if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
+        raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
+    if not np.isfinite(box).all():
+        raise DataError(f"uncertain should be finite bounds of w, is {box.tolist()}")
 
 
 def _once(

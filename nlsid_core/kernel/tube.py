@@ -25,6 +25,7 @@ from .trials import MEASURED, Measured, Recorded, calibration, read_measured, re
 MAX_SAMPLES = 10**9
 MAX_TUBES = 8  # of one funnel
 MAX_PLAN = 10**6  # samples of a plan
+BESIDE = "watched as well, not needed for this sentence"  # what (D) and (O_j) do not use
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,8 @@ def _response(model: Model, node: Node, fitted_to: list[Recorded] | None) -> lis
         if follows is not None:
             bound, g = f"({bound} sqrt(g))", f", g = {formula(follows, j, model.u)}"
         said.append(
-            f"output error: |{signal.name} - simulated| / {bound} <= 1 at every sample{g} ({worth})"
+            f"output error, {BESIDE}: |{signal.name} - simulated| / {bound} <= 1 at every "
+            f"sample{g} ({worth})"
         )
     return said
 
@@ -341,7 +343,7 @@ def _assumed(model: Model, tube: Tube, fitted_to: list[Recorded] | None, *, own:
     said = [f"innovation energy{whose}: {energy} ({calibration(assumed.measured, fitted_to)})"]
     if assumed.peak is not None:
         worth = calibration(assumed.peak[1], fitted_to)
-        said.append(f"innovation peak{whose}: {peak[0]} ({worth})")
+        said.append(f"innovation peak{whose}, {BESIDE}: {peak[0]} ({worth})")
     return said
 
 

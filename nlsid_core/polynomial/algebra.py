@@ -5,6 +5,7 @@ exact. An operation of the two is exact: every float64 is a rational.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
 from numbers import Integral, Rational
@@ -20,6 +21,8 @@ from nlsid_core.polynomial.values import monomial_values
 
 Coefficients: TypeAlias = NDArray[Any]
 Number: TypeAlias = int | float | Fraction
+# True while a user's function is called on polynomials, where == has no one answer
+TRACING: ContextVar[bool] = ContextVar("tracing", default=False)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -244,9 +247,13 @@ class Polynomial:
             difference = _sum(self, -as_polynomial(other))
         except NotPolynomial:
             return NotImplemented
+        if difference.degree and TRACING.get():
+            raise NotPolynomial(f"comparison == of {_short(self)} is not a polynomial")
         return len(difference) == 0
 
     def __hash__(self) -> int:
+        if self.degree and TRACING.get():
+            raise NotPolynomial(f"a set or dictionary of {_short(self)} is not a polynomial")
         return hash(frozenset((exponent[exponent > 0].tobytes()) for exponent in self.exponents))
 
     def __float__(self) -> float:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.errors import NotPolynomial, ShapeError
 from nlsid_core.polynomial.algebra import (
+    TRACING,
     Polynomial,
     as_polynomial,
     variables,
@@ -35,12 +36,15 @@ def trace(function: Callable[..., Any], arguments: Mapping[str, int]) -> NDArray
         vectors.append(_object_array(unknowns[start : start + size]))
         start += size
     title = getattr(function, "__name__", "function")
+    token = TRACING.set(True)
     try:
         result = function(*vectors)
     except NotPolynomial as error:
         raise NotPolynomial(f"{title}: {error}") from error
     except TypeError as error:
         raise NotPolynomial(f"{title} cannot be called on polynomials: {error}") from error
+    finally:
+        TRACING.reset(token)
     array = result if isinstance(result, np.ndarray) else np.array(result, dtype=object)
     traced = np.empty(array.shape, dtype=object)
     for index in np.ndindex(array.shape):

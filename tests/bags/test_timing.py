@@ -10,7 +10,7 @@ from bags.signals.delays import delay
 from bags.signals.reader import Samples, read_signals
 from bags.signals.repeats import find_period, same_excitation
 from bags.signals.resample import Method, resample
-from bags.signals.timing import clock_relation, segments, without_duplicates
+from bags.signals.timing import clock_relation, without_duplicates
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import COMMAND, PERIOD_NS, SPEED, START_NS, speed_bag
 
@@ -41,13 +41,6 @@ def test_simulated_time_is_told_by_its_pace() -> None:
     found = clock_relation(np.rint(0.4e9 * t).astype(np.int64), stamps(t))
     assert found.drift == pytest.approx(-0.6)
     assert str(found) == "stamps run at 0.4 times the pace of log time: simulated time?"
-
-
-def test_segments_end_where_messages_are_missing() -> None:
-    t = np.array([0.0, 0.1, 0.2, 1.0, 1.1, 3.0])
-    assert segments(stamps(t), 0.5) == [(0, 3), (3, 5), (5, 6)]
-    assert segments(stamps(t), 5.0) == [(0, 6)]
-    assert segments(stamps(np.zeros(0)), 5.0) == []
 
 
 def test_the_first_of_each_stamp_is_kept() -> None:

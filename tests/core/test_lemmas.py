@@ -34,6 +34,11 @@ def test_example_5_1_2_decays_down_to_a_quarter_and_not_below(sigma: float, prov
             two_lemmas.decay(sigma)
 
 
+def test_the_pieces_of_a_funnel_prove_a_lower_floor_than_the_thesis_states() -> None:
+    """σ = 0.36 there; none below 1/4 is true."""
+    assert two_lemmas.LEAST_SIGMA < two_lemmas.pulled_in() < 0.28 < two_lemmas.SIGMA
+
+
 @pytest.mark.parametrize(("last", "proved"), [(1.1, True), (0.8, False)])
 def test_example_5_1_2_shrinks_to_its_published_width_and_not_much_further(
     last: float, proved: bool

@@ -87,6 +87,27 @@ def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
     assert followed.x.ends()[-1] == pytest.approx(end, abs=0.02)
 
 
+def test_a_motion_is_planned_for_the_centre_of_what_is_uncertain() -> None:
+    ends: dict[str, Any] = {"start": [0.0, 0.0], "end": [1.0, 0.0], "seconds": 1}
+    pushed = lambda x, u, w: [x[1], u[0] + w[0]]  # noqa: E731
+    found = plan_motion(pushed, **ends, m=1, uncertain=[[1.0, 3.0]])
+    alone = plan_motion(lambda x, u: [x[1], u[0] + 2.0], **ends, m=1)
+    assert found.u.ends() == pytest.approx(alone.u.ends())
+    for box, message in ((None, "give its bounds as `uncertain`"), ([[0, np.inf]], "finite")):
+        with pytest.raises(DataError, match=message):
+            plan_motion(pushed, **ends, m=1, uncertain=box)
+
+
+def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
+    def rate(x: Any, u: Any, w: Any) -> list[Any]:
+        return [x[1], u[0] - np.sin(x[0]) + w[0]]
+
+    box = [[0.0, 0.0]]
+    motion = plan_motion(rate, start=[0, 0], end=[1, 0], seconds=2, m=1, uncertain=box)
+    found = design(ContinuousTracking(rate, motion, goal=[0.2, 0.2], uncertain=box))
+    assert found.verdict.margin > 0
+
+
 def test_inputs_share_what_they_do_by_the_square_of_their_scale() -> None:
     """ẍ = u₀ + u₁ at the cost ∫(u₀/s₀)² + (u₁/s₁)² has u₀/u₁ = (s₀/s₁)² at the least."""
     found = plan_motion(

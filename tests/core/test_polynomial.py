@@ -126,6 +126,11 @@ def test_cross_products_and_matrices_can_be_traced() -> None:
         (lambda x: float(x[0]), "float"),
         (lambda x: 1j * x[0], "complex"),
         (lambda x: repr(x[0]), "'x0'"),
+        (lambda x: x[1] + (6.0 if x[0] == 0 else 0.0), "comparison == of x0"),
+        (lambda x: x[1] + (6.0 if x[0] != x[1] else 0.0), "comparison == of x0"),
+        (lambda x: x[1] + (6.0 if x[0] in (0.1, 0.2) else 0.0), "comparison == of x0"),
+        (lambda x: x[1] + (6.0 if x[0] in {0.1, 0.2} else 0.0), "a set or dictionary of x0"),
+        (lambda x: np.where(x == 0, x, 1.0), "comparison == of x0"),
     ],
 )
 def test_a_function_that_is_not_polynomial_says_which_operation_was_not(

@@ -47,6 +47,7 @@ def plan_motion(
     seconds: float,
     u: ArrayLike | None = None,
     m: int | None = None,
+    uncertain: ArrayLike | None = None,
     limits: ArrayLike | None = None,
     scale: ArrayLike | None = None,
     through: ArrayLike | None = None,
@@ -54,13 +55,13 @@ def plan_motion(
 ) -> Nominal:
     """The motion from `start` to `end` (n,) in `seconds` with small ∫|u(t) - u|² dt.
 
-    dynamics: of some of t, x, u, named so; w, of a field, in the centre of its box. u: (m,) the
-    input that costs nothing, and that the motion starts and ends with if it keeps both ends at
-    rest (None: zeros, for `m` inputs). limits: rows (input, low, high), or one pair an input, that
-    the motion keeps to nine tenths of. scale: (m,) what is much of each input, by which the cost
-    weighs them (None: half of its range, or |u|, 1 at least). through: (P, n) states to guess the
-    path by, equally spaced in time (None: the straight line). knots: of the cubics (None: as many
-    as they need).
+    dynamics: of some of t, x, u, w, named so; w is in the centre of its box, a field's own or
+    `uncertain` (n_w, 2). u: (m,) the input that costs nothing, and that the motion starts and ends
+    with if it keeps both ends at rest (None: zeros, for `m` inputs). limits: rows (input, low,
+    high), or one pair an input, that the motion keeps to nine tenths of. scale: (m,) what is much
+    of each input, by which the cost weighs them (None: half of its range, or |u|, 1 at least).
+    through: (P, n) states to guess the path by, equally spaced in time (None: the straight line).
+    knots: of the cubics (None: as many as they need).
 
     Raises DataError on input that makes no sense, Infeasible if no motion was found.
     """
@@ -76,7 +77,10 @@ def plan_motion(
     count = dynamics.m if isinstance(dynamics, VectorField) else m
     rest = np.zeros(count or 0) if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
     n, m = len(ends[0]), len(rest)
-    rates = dynamics if isinstance(dynamics, VectorField) else Rates.numeric(dynamics, n, m)
+    if isinstance(dynamics, VectorField):
+        rates: VectorField | Rates = dynamics
+    else:
+        rates = Rates.numeric(dynamics, n, m, uncertain)
     box = np.tile([-np.inf, np.inf], (m, 1))
     for i, low, high in [] if limits is None else limits_of(limits, m).tolist():
         middle, half = (low + high) / 2, KEPT * (high - low) / 2

@@ -41,7 +41,9 @@ def selected(folder: Path, identification: str, *who: str) -> tuple[str, list[by
     done = CliRunner().invoke(app, ["select", *bags, *given])
     assert done.exit_code == 0, done.output
     written = (documents.MODEL, documents.MODEL_PROOF, documents.TRAINING, documents.HELD_BACK)
-    said = done.output.partition(" test trials")[0]  # what follows says how long it took
+    _, chosen, rest = done.output.partition("chosen by")  # workers say first what they read
+    assert chosen
+    said = rest.partition(" test trials")[0]  # what follows says how long it took
     return said, [(folder / "out" / name).read_bytes() for name in written]
 
 

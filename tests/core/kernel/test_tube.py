@@ -18,6 +18,8 @@ from tests.core.kernel.tube_claims import FUNNEL, MODEL, MODELS, attacks, claim,
 EVERY = pytest.mark.parametrize("name", MODELS)
 Change = Callable[[SimpleNamespace], Any]
 
+BESIDE = "watched as well, not needed for this sentence"
+
 
 @EVERY
 def test_a_tube_of_every_class_is_proved_and_the_oracle_agrees(name: str) -> None:
@@ -50,7 +52,8 @@ def test_the_sentences_are_those_of_the_page() -> None:
     peak = rounded(tubes(funnel)["peak"]["level"], "ROUND_FLOOR")
     largest = rounded(tubes(funnel)["peak"]["measured"], "ROUND_CEILING")
     assert said[3] == (
-        f"  assuming (1) innovation peak of its own observer: e^2 <= {peak} (m/s)^2 at every "
+        f"  assuming (1) innovation peak of its own observer, {BESIDE}: "
+        f"e^2 <= {peak} (m/s)^2 at every "
         f"sample (largest of 5 distinct trials, each taken whole, {largest}, safety factor 1.5 in "
         "amplitude; a next trial that is exchangeable with them exceeds their largest with "
         "probability at most 1/6)"
@@ -78,8 +81,8 @@ def test_the_rule_of_a_level_by_commands_is_printed_with_every_number() -> None:
         f"(change of {name} / 1.5{unit})^2), sums over the run's samples, each i samples ago "
         f"(largest of 5 distinct trials" in said[2]
     )
-    assert said[3].startswith("  assuming innovation peak: e^2 <= ")
-    assert said[4].startswith("  assuming output error: |speed - simulated| / (")
+    assert said[3].startswith(f"  assuming innovation peak, {BESIDE}: e^2 <= ")
+    assert said[4].startswith(f"  assuming output error, {BESIDE}: |speed - simulated| / (")
     assert f" sqrt(g)) <= 1 at every sample, g = 1 + 2 (sum 0.9^i (change of {name}" in said[4]
     assert "probability at most 1/6)" in said[4]
 

@@ -27,9 +27,10 @@ from nlsid_core import kernel, proofs, second
 from nlsid_core.design import design
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.progress import silent
-from tests.core.kernel import mutations
+from tests.core.kernel import mutations, stability_claims
 from tests.core.kernel.held_claims import claim
 from tests.core.kernel.sampled_claims import one_step
+from tests.core.kernel.stability_forgeries import CHANGES
 from tests.falling_pendulum import tracking
 from tests.forged_held import HELD_FORGERIES, forged_held
 from tests.forged_tracking import FORGERIES, forged
@@ -198,7 +199,7 @@ MODELS = (
     "tube/engaged", "tube/lasting_linear", "tube/lasting_monotone", "tube/lasting_split",
     "tube/lasting_two_outputs", "tube/lasting_implicit_ray", "tube/lasting_network",
     "tube/lasting_cascade", "stability/linear", "stability/network", "stability/cascade",
-    "stability/moving_lags", "stability/split", "stability/two_outputs",
+    "stability/ends", "stability/moving_lags", "stability/split", "stability/two_outputs",
 )  # fmt: skip
 
 
@@ -536,6 +537,23 @@ def test_every_forged_held_funnel_is_refused(program: Path, tmp_path: Path) -> N
     for what in HELD_FORGERIES:
         proof = write(forged_held(files, what), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
+
+
+@needs_coq
+@pytest.mark.coq
+def test_every_forged_stability_is_refused(program: Path, tmp_path: Path) -> None:
+    """Those that the first kernel's tests hold."""
+    for what, (name, change, _) in CHANGES.items():
+        model, proof = stability_claims.claim(name)
+        assert said_of(model, proof, program, tmp_path) == "accepted", name
+        change(model, proof["proof"])
+        assert said_of(model, proof, program, tmp_path) == "refused", what
+
+
+def said_of(model: Json, proof: Json, program: Path, folder: Path) -> str:
+    """What the second kernel says of a proof of stability."""
+    files = {"model.json": model, "claim.proof.json": proof}
+    return second.opinion(put(files, folder), program).verdict
 
 
 @needs_coq
