@@ -3,7 +3,7 @@
 Source: thesis Section 5.1.3.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -45,11 +45,21 @@ def compose_funnels(paths: Sequence[Path | str], folder: Path | str) -> Path:
     claim = {"kind": KIND, "about": about}
     document = proofs.proof_document(claim, {"multipliers": multipliers})
     proofs.decide(document, contents)
-    folder = Path(folder)
+    write_beside(Path(folder), contents, [Path(path) for path in paths])
+    files.write_document(Path(folder) / COMPOSITION, document)
+    return Path(folder) / COMPOSITION
+
+
+def write_beside(folder: Path, contents: Mapping[str, bytes], sources: Sequence[Path]) -> None:
+    """Write the files; DataError before any is, if one would replace a file beside a source."""
+    for source in sources:
+        for name, content in contents.items():
+            old = source.parent / name
+            same = old.is_file() and folder.is_dir() and old.parent.samefile(folder)
+            if same and old.read_bytes() != content:
+                raise DataError(f"{old} is there and would be replaced: choose another folder")
     for name, content in contents.items():
         files.write_atomically(folder / name, content)
-    files.write_document(folder / COMPOSITION, document)
-    return folder / COMPOSITION
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
+from nlsid_core.design.compose import write_beside
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.kernel import Verdict
 
@@ -32,7 +33,7 @@ def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path,
     """
     if len(paths) != 2:
         raise DataError(f"a loop is of two proved gains, got {len(paths)}")
-    contents: dict[str, Json | bytes] = {}
+    contents: dict[str, bytes] = {}
     about: Json = {}
     numbers = []
     for role, path in zip(("first", "second"), map(Path, paths), strict=True):
@@ -58,9 +59,6 @@ def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path,
         )
     claim = proofs.proof_document({"kind": "small_gain", "about": about}, {})
     verdict = proofs.decide(claim, contents)
-    folder = Path(folder)
-    for name, content in contents.items():
-        assert isinstance(content, bytes)
-        files.write_atomically(folder / name, content)
-    files.write_document(folder / LOOP, claim)
-    return folder / LOOP, verdict
+    write_beside(Path(folder), contents, [Path(path) for path in paths])
+    files.write_document(Path(folder) / LOOP, claim)
+    return Path(folder) / LOOP, verdict

@@ -6,7 +6,7 @@ two reach is a bound from the other side: no gain below it is true of the model,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ FADED = 1e-5  # of a response's largest sample: from there on it is over
 LONGEST = 4000  # samples of a response
 PERIODS = 12  # memories that a wave lasts
 SHORTEST = 400  # samples of a wave
+ROUNDED = 1e-6  # of the outputs: a smaller difference is taken for rounding
 LARGE = (1e-3, 0.1, 0.5)  # waves, of an input's range
 
 
@@ -46,14 +47,20 @@ def two_runs(
     y_scales: FloatArray,
     y_box: Sequence[Sequence[float]] | None = None,
 ) -> TwoRuns | None:
-    """The best pair that is found, or None if no run settles.
+    """The best pair that is found, or None if no run settles or no input can move.
 
     kind: gain or passivity. reach: (n_u, 2), the range of each input. u_scales (n_u,), y_scales
     (n_y,): units of the differences. y_box: of the outputs, (n_y, 2), which both runs keep to.
     """
     found: TwoRuns | None = None
     low, high = reach.T
+    if not (high > low).all():
+        return None
     linear = isinstance(model, DifferenceEquation)
+    centre = np.zeros(len(low))
+    if isinstance(model, DifferenceEquation):  # its differences have no constant, nor its rounding
+        model, centre = replace(model, c=0.0), (low + high) / 2
+        low, high, reach = low - centre, high - centre, reach - centre[:, None]
     for part in (0.5,) if linear else (0.5, 0.1, 0.9):
         around = low + part * (high - low)
         try:
@@ -65,12 +72,16 @@ def two_runs(
                 seen = _pair(start, around, size, frequency, direction, len(h), reach)
                 if y_box is not None and not _inside(seen[1:], np.array(y_box)):
                     continue
+                if np.ptp(seen[1] - seen[2]) < ROUNDED * np.abs(seen[1]).max():
+                    continue
                 value = _value(seen[0] / u_scales, (seen[2] - seen[1]) / y_scales, kind)
                 better = found is None or (
                     value > found.value if kind == "gain" else value < found.value
                 )
                 if better:
-                    found = TwoRuns(value, frequency / model.period, tuple(around), tuple(size))
+                    found = TwoRuns(
+                        value, frequency / model.period, tuple(around + centre), tuple(size)
+                    )
         except (NlsidError, ArithmeticError, np.linalg.LinAlgError):
             continue  # it does not come to rest here, or has no next output
     return found

@@ -146,8 +146,8 @@ def decide_funnel(
     whose = "that starts in it" if hold.period else "that is in it"
     decision = Decision(
         f"funnel: every solution {whose} at a time from {text.exact(funnel.t[0])} to {end} s "
-        f"stays in it until {end} s{goal}{_kept(field, bounds)}{_falls(falls)}; {count} pieces of "
-        "time decided, on its boundary V falls by at least the margin, in 1/s",
+        f"stays in it until {end} s{goal}{_kept(field, bounds)}{_falls(falls, end)}; {count} pieces "
+        "of time decided, on its boundary V falls by at least the margin, in 1/s",
         margin,
         _assumptions(field, policy, bounds, hold),
         digests,
@@ -275,13 +275,13 @@ def _read_decay(node: Node) -> Decay:
     return decay
 
 
-def _falls(falls: Decay | Fraction) -> str:
+def _falls(falls: Decay | Fraction, end: str) -> str:
     if not isinstance(falls, Decay):
         return ""
     rate, floor = text.exact(falls.rate), text.exact(falls.floor)
     return (
-        f", and for any times t1 <= t2 from then on V(t2) <= {floor} or V(t2) <= {floor} + "
-        f"exp(-{rate} (t2 - t1)) (V(t1) - {floor}), V = |x - x0|^2_P / rho"
+        f", and for any times t1 <= t2 from then until {end} s V(t2) <= {floor} or V(t2) <= "
+        f"{floor} + exp(-{rate} (t2 - t1)) (V(t1) - {floor}), V = |x - x0|^2_P / rho"
     )
 
 

@@ -488,6 +488,9 @@ def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
         y_box, u_box = ends["y"].array(p, 2), ends["u"].array(len(u), 2)
         if any(low >= high for low, high in [*y_box, *u_box]):
             raise Rejected(f"{bounds.where}: a range is empty")
+        for i, terms in enumerate(given.shift):  # else a state is no output: it has another range
+            if [(list(e), c) for e, c in terms] != [(_unit(i, n + given.inputs), 1)]:
+                raise Rejected(f"{node.where}: on a box, the states should be the past outputs")
         rows = [*y_box, *y_box * (n // p), *(u_box[i] for i, _ in window)]
         box = [(low, high) for low, high in rows]
     only = [least] if least is not None else [E[0][1]] if constant else []

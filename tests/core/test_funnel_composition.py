@@ -78,6 +78,15 @@ def test_the_command_line_composes_and_checks(proofs: list[Path], tmp_path: Path
     assert "PROVED composition of 2 funnels" in checked.output
 
 
+def test_stages_are_not_replaced_by_others(proofs: list[Path], tmp_path: Path) -> None:
+    compose_funnels(proofs, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    later = [tmp_path / f"stage{k}.proof.json" for k in (2, 3)]
+    with pytest.raises(DataError, match="would be replaced"):
+        compose_funnels(later, tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_stages_in_the_wrong_order_are_not_composed(proofs: list[Path], tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not follow"):
         compose_funnels(proofs[::-1], tmp_path)

@@ -353,8 +353,8 @@ def test_what_is_recorded_and_excited_is_what_the_configuration_names(
         assert called("/excitation/start").returncode == 0
         operator.hears("excitation", "done")
         operator.waits(0.5)
-        there = called().stdout.split()
-        assert {"/excitation/start", "/model_identifier/identify"} <= set(there)
+        there = {"/excitation/start", "/model_identifier/identify"}
+        operator.spin_until(lambda: there <= set(called().stdout.split()))
         refused = called("/excitation/begin")
         assert refused.returncode == 2
         assert "no service /excitation/begin" in refused.stderr

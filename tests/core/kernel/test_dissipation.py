@@ -280,6 +280,20 @@ def test_a_box_cannot_be_left_out(name: str) -> None:
     assert not oracle.agrees(proof, {MODEL: model})
 
 
+def test_a_state_that_is_no_past_output_is_refused_on_a_box() -> None:
+    """The box says where outputs are: x2 = 10 u(t-1) may be elsewhere."""
+    model, proof = claim("implicit_box")
+    model["states"] = ["x1", "x2"]
+    model["h"] = {"exponents": [[1, 0, 0, 0], [0, 0, 3, 0]], "coefficients": [[1.0], [-0.001]]}
+    model["shift"] = {"exponents": [[0, 0, 1]], "coefficients": [[10.0]]}
+    for box, refused in ((proof["claim"]["box"], "past outputs"), (None, "on a box only")):
+        proof["claim"] = proof["claim"] | {"box": box}
+        if box is None:
+            del proof["claim"]["box"]
+        with pytest.raises(CertificateRejected, match=refused):
+            decide(model, proof)
+
+
 @pytest.mark.parametrize("name", ["monotone", "implicit_linear"])
 @pytest.mark.parametrize("delay", [119, 2**53])
 def test_inputs_that_are_remembered_for_too_long_are_refused_at_once(name: str, delay: int) -> None:
