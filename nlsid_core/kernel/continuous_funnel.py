@@ -146,8 +146,8 @@ def decide_funnel(
     whose = "that starts in it" if hold.period else "that is in it"
     decision = Decision(
         f"funnel: every solution {whose} at a time from {text.exact(funnel.t[0])} to {end} s "
-        f"stays in it until {end} s{goal}{_kept(field, bounds)}{_falls(falls, end)}; {count} pieces "
-        "of time decided, on its boundary V falls by at least the margin, in 1/s",
+        f"stays in it until {end} s{goal}{_kept(field, bounds)}{_falls(falls, end)}; {count} "
+        "pieces of time decided, on its boundary V falls by at least the margin, in 1/s",
         margin,
         _assumptions(field, policy, bounds, hold),
         digests,

@@ -130,7 +130,7 @@ def in_units(signals: Sequence[Signal], scales: Sequence[Fraction]) -> str:
 
 def _statement(claim: Dissipation) -> str:
     model = claim.model
-    fade = "" if claim.discount == 1 else f"{text.exact(claim.discount)}^t "
+    fade = "" if claim.discount == 1 else f"{text.exact(claim.discount)}^k "
     outputs = in_units(model.y, claim.y_scales)
     inputs = in_units(apart(model.u, model.y), claim.u_scales)
     if claim.kind == "gain":

@@ -49,7 +49,7 @@ def test_the_sentences_are_these() -> None:
         "one past, for every input"
     )
     model, proof = claim("integrator")
-    assert "sum 0.875^t |dy|^2 <= G^2 sum 0.875^t |du|^2 + V(0)" in decide(model, proof).statement
+    assert "sum 0.875^k |dy|^2 <= G^2 sum 0.875^k |du|^2 + V(0)" in decide(model, proof).statement
     model, proof = claim("passive")
     said = decide(model, proof).statement
     assert said.startswith(
