@@ -489,7 +489,8 @@ def _implicit(node: Node, bounds: Node | None, driven: bool) -> Model:
         if any(low >= high for low, high in [*y_box, *u_box]):
             raise Rejected(f"{bounds.where}: a range is empty")
         for i, terms in enumerate(given.shift):  # else a state is no output: it has another range
-            if [(list(e), c) for e, c in terms] != [(_unit(i, n + given.inputs), 1)]:
+            past = [(_unit(i, n + given.inputs), Fraction(1))]
+            if [(list(map(Fraction, e)), c) for e, c in terms] != past:
                 raise Rejected(f"{node.where}: on a box, the states should be the past outputs")
         rows = [*y_box, *y_box * (n // p), *(u_box[i] for i, _ in window)]
         box = [(low, high) for low, high in rows]
