@@ -189,7 +189,7 @@ def test_a_disturbance_that_is_too_strong_is_named() -> None:
 
 @pytest.mark.slow
 def test_a_refusal_tells_of_the_place_that_was_not_passed_however_often_it_was_tried() -> None:
-    rate, problem = dubins(0.5)
+    rate, problem = dubins(1.0)
     text = refusal(rate, problem.nominal, goal=problem.goal, uncertain=problem.uncertain)
     found = re.search(r"lets V fall by (\S+) 1/s, and the disturbance w takes (\S+) 1/s", text)
     assert found
