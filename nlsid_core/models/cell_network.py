@@ -21,6 +21,7 @@ from nlsid_core.models.signal import FORMAT, Signal, head, objects, recorded, ta
 KIND = "cell_network"
 MAX_MAPS = 8  # a proof visits 2^m vertices
 START_STEPS, FIRST_DAMPING, DIFFERENCE = 40, 1e-3, 1e-7
+LEAST_DAMPING = 1e-12  # with less, the matrix of a step can be singular in float64
 PRIOR = 1e-3  # weight of the usual start beside one measured sample, both in their spreads
 
 
@@ -162,7 +163,7 @@ class CellNetwork:
             step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
             after = residual(x + step)
             better = after @ after < r @ r
-            damping *= 0.1 if better else 10.0
+            damping = max(damping * (0.1 if better else 10.0), LEAST_DAMPING)
             if better:
                 x, r = x + step, after
             if np.abs(step).max() < DIFFERENCE * (1.0 + np.abs(x).max()):
