@@ -160,7 +160,10 @@ class CellNetwork:
         for _ in range(START_STEPS):
             J = np.column_stack([(residual(x + move) - r) / DIFFERENCE for move in moves])
             normal = J.T @ J
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
+            try:
+                step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -J.T @ r)
+            except np.linalg.LinAlgError:  # a state so large that differences do not move it
+                break
             after = residual(x + step)
             better = after @ after < r @ r
             damping = max(damping * (0.1 if better else 10.0), LEAST_DAMPING)
