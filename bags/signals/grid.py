@@ -428,18 +428,6 @@ def filled_samples(dataset: Dataset) -> int:
     return sum(json.loads(trial.provenance or "{}").get("filled", 0) for trial in dataset)
 
 
-def require_excitation(dataset: Dataset) -> None:
-    """DataError if an input is constant over the whole dataset: nothing follows from it."""
-    for column, name in enumerate(dataset.trajectories[0].u_names):
-        inputs = np.concatenate([trajectory.u[:, column] for trajectory in dataset])
-        if np.ptp(inputs) == 0.0:
-            raise DataError(
-                f"no excitation: input '{name}' is {inputs[0]:g} throughout all {len(dataset)} "
-                "trials, so its effect cannot be told from an offset; record trials in which it "
-                "changes, or leave it out of the excitations"
-            )
-
-
 def _period_ns(stamp_ns: IntArray, period: float | None, label: str, *, on_grid: bool) -> int:
     if len(stamp_ns) < 2:
         raise DataError(f"{label} has {len(stamp_ns)} sample; a sample time needs two")

@@ -117,10 +117,8 @@ class Scaled:
                     "three times as many, or fewer start_samples"
                 )
         if like is None:
-            mean, spread = signal_scale(np.concatenate([t.y for t in data]), "response")
-            y, u = (float(mean[0]), float(spread[0])), signal_scale(
-                np.concatenate([t.u for t in data]), "excitation"
-            )  # fmt: skip
+            mean, spread = signal_scale(data, "y")
+            y, u = (float(mean[0]), float(spread[0])), signal_scale(data, "u")
         else:
             y, u = like.y, like.u
         trials = []

@@ -227,10 +227,7 @@ class ImplicitRows:
 
 def build_implicit_rows(dataset: Dataset, model_class: ImplicitClass) -> ImplicitRows:
     """The rows t = h … of every trial. Raises DataError on too little or too poor data."""
-    y_scale, u_scale = (
-        signal_scale(np.concatenate([getattr(trial, letter) for trial in dataset]), role)
-        for letter, role in (("y", "response"), ("u", "excitation"))
-    )
+    y_scale, u_scale = signal_scale(dataset, "y"), signal_scale(dataset, "u")
     n_v, window = len(y_scale[0]), model_class.window(len(u_scale[0]))
     n = n_v * model_class.lags
     history = max(model_class.lags, *(d for _, d in window))

@@ -120,8 +120,8 @@ def build_regression(dataset: Dataset, lags: int) -> Regression:
             f"{rows} rows for {parameters} parameters; give at least "
             f"{MIN_ROWS_PER_PARAMETER * parameters} or fewer lags than {lags}"
         )
-    y_scale = _scalars(signal_scale(np.concatenate([trial.y for trial in dataset]), "response"))
-    u_scale = _scalars(signal_scale(np.concatenate([trial.u for trial in dataset]), "excitation"))
+    y_scale = _scalars(signal_scale(dataset, "y"))
+    u_scale = _scalars(signal_scale(dataset, "u"))
     outputs, windows, row = [], [], []
     for trial in dataset:
         outputs.append(lagged((trial.y - y_scale[0]) / y_scale[1], lags)[:, :, 0])

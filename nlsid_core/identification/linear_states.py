@@ -55,10 +55,7 @@ def identify_linear_states(dataset: Dataset, *, slowest: float = 1.0) -> LinearS
     Raises DataError for data too few or not rich enough, Infeasible if the minimiser has no exact
     proof, SolverError as the solver does.
     """
-    x_scale, u_scale = (
-        signal_scale(np.concatenate([getattr(trial, letter) for trial in dataset]), name)
-        for letter, name in (("y", "state"), ("u", "input"))
-    )
+    x_scale, u_scale = signal_scale(dataset, "y"), signal_scale(dataset, "u")
     steps = [
         [(t.y[1:] - x_scale[0]) / x_scale[1], (t.y[:-1] - x_scale[0]) / x_scale[1],
          (t.u[:-1] - u_scale[0]) / u_scale[1], np.ones((len(t) - 1, 1))]

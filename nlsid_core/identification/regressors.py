@@ -1,8 +1,11 @@
 """Recorded signals as regressors: mean and spread, lags, and the refusal of poor ones."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from nlsid_core.arrays import FloatArray
+from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
 
 CONSTANT = 1e-10  # relative spread below which a signal is constant
@@ -13,13 +16,15 @@ FEWER = (
 RANK_TOLERANCE = 1e-10  # relative singular value at which regressors repeat each other
 
 
-def signal_scale(values: FloatArray, role: str) -> tuple[FloatArray, FloatArray]:
-    """Mean and spread of each column of (N, k); DataError names one that is constant."""
+def signal_scale(trials: Iterable[Trajectory], which: str) -> tuple[FloatArray, FloatArray]:
+    """Mean and spread of each y or u over all trials; DataError names one that is constant."""
+    trials = list(trials)
+    values = np.concatenate([getattr(trial, which) for trial in trials])
     mean, spread = values.mean(axis=0), values.std(axis=0)
     for i in np.flatnonzero(spread <= CONSTANT * np.maximum(np.abs(mean), 1.0)):
         raise DataError(
-            f"the {role} {i} is constant ({mean[i]:g}) in all trials: nothing can be identified "
-            "from it"
+            f"{getattr(trials[0], which + '_names')[i]} is constant ({mean[i]:g}) in all trials: "
+            "nothing can be identified from it"
         )
     return mean, spread
 

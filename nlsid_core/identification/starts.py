@@ -38,8 +38,8 @@ def stable_starts(
     train: Dataset, lags: int, radius: float = SLOWEST_POLE
 ) -> Iterator[tuple[str, FloatArray]]:
     """Left parameters ((n+1) n_y²,) of linear models whose poles are within the radius, named."""
-    y = signal_scale(np.concatenate([trial.y for trial in train]), "response")
-    u = signal_scale(np.concatenate([trial.u for trial in train]), "excitation")
+    y = signal_scale(train, "y")
+    u = signal_scale(train, "u")
     scaled = [((trial.y - y[0]) / y[1], (trial.u - u[0]) / u[1]) for trial in train]
     n_y = len(y[0])
     for name, size in (("from least squares", lags), ("from a longer model", LONGER * lags)):

@@ -153,13 +153,13 @@ def build_state_affine_rows(
     short = [trial for trial in dataset if len(trial) <= n]
     if short:
         raise DataError(f"{short[0].name}: {len(short[0])} samples, {n} lags need more")
-    mean, spread = signal_scale(np.concatenate([trial.y for trial in dataset]), "response")
+    mean, spread = signal_scale(dataset, "y")
     W = np.ones(len(spread)) if model_class.weights is None else np.array(model_class.weights)
     if len(W) != len(spread):
         raise DataError(f"weights has {len(W)} outputs, the data {len(spread)}")
     y_scale = mean, spread / np.sqrt(W)
     u_all = np.concatenate([trial.u for trial in dataset])
-    u_scale = signal_scale(u_all, "excitation")
+    u_scale = signal_scale(dataset, "u")
     n_y, n_u = len(y_scale[0]), len(u_scale[0])
     window = model_class.window(n_u)
     Y = np.concatenate([lagged((t.y - y_scale[0]) / y_scale[1], n) for t in dataset])

@@ -21,12 +21,13 @@ from bags.recordings.bag import Bag
 from bags.recordings.folders import expand_bags
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
-from bags.signals.grid import read_dataset, require_excitation
+from bags.signals.grid import read_dataset
 from bags.signals.reader import bag_metadata, read_signals
 from bags.tools.fitness import Level, check_fitness
 from bags.tools.importing import import_tables, read_tables
 from bags.tools.info import bag_info
 from nlsid_core.errors import BagError, DataError
+from nlsid_core.identification import LinearClass, identify
 from tests.bag_messages import (
     CMD,
     CMD_TYPE,
@@ -445,8 +446,8 @@ def test_a_command_that_changes_only_where_no_response_is_is_named(tmp_path: Pat
     said = [finding.what for finding in found.findings if finding.level is Level.BAD]
     assert said == [f"{COMMAND} is 0.5 wherever every response was recorded"]
     dataset = read_dataset([tmp_path / "late"], responses=[SPEED], excitations=[COMMAND])
-    with pytest.raises(DataError, match=r"no excitation: input '/cmd_vel.*' is 0\.5 through"):
-        require_excitation(dataset)
+    with pytest.raises(DataError, match=r"/cmd_vel.* is constant \(0\.5\) in all trials"):
+        identify(dataset, LinearClass(lags=1))
 
 
 def test_imported_columns_read_back_bit_for_bit(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """`nlsid gain` and the loops of `nlsid compose`, from model files."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,21 @@ def test_the_gain_of_a_model_is_printed_between_proof_and_runs(tmp_path: Path) -
     proof = tmp_path / "model.gain.proof.json"
     assert wrote == f"wrote {proof}"
     assert "G = 1.126" in str(check(proof))
+
+
+@pytest.mark.parametrize(("a", "b", "c"), [(0.5, 1e-4, 8.8e8), (0.9, 1e-6, 5.8e5)])
+def test_runs_do_not_differ_by_more_than_is_proved_however_large_outputs_are(
+    tmp_path: Path, a: float, b: float, c: float
+) -> None:
+    """y = a y(t-1) + b u(t-1) + c has the gain b/(1 - a); y itself is some 1e9."""
+    model = DifferenceEquation(
+        np.array([a]), np.array([0.0, b]), c, 0.1, Signal("y", "m"), Signal("u", "V"), (-1.0, 1.0)
+    )  # fmt: skip
+    result = RUN.invoke(app, ["gain", str(written(tmp_path, model))])
+    assert result.exit_code == 0, result.output
+    proved, seen = map(float, re.findall(r"at (?:most|least) (\S+)", result.output)[:2])
+    assert 0.99 * b / (1 - a) < seen <= b / (1 - a) * 1.0001
+    assert b / (1 - a) <= proved < 1.01 * b / (1 - a)
 
 
 def test_an_index_of_passivity_is_a_proof_of_its_own(tmp_path: Path) -> None:

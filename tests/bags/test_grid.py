@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bags.signals.grid import read_dataset, require_excitation, seconds, to_trajectories
+from bags.signals.grid import read_dataset, seconds, to_trajectories
 from bags.signals.reader import Samples, bag_digest
 from nlsid_core.data.trajectory import Trajectory
 from nlsid_core.errors import DataError
@@ -234,15 +234,6 @@ def test_trials_of_different_sample_times_are_refused(tmp_path: Path) -> None:
         read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
     with pytest.raises(DataError, match=r"slow: /odom.*is sampled every 0\.05 s"):
         read_dataset(bags, responses=[SPEED], excitations=[COMMAND], period=0.025)
-
-
-def test_a_constant_input_is_refused_and_a_changing_one_is_not(tmp_path: Path) -> None:
-    bags = [speed_bag(tmp_path / f"trial_{k}", [0.0, 0.1], [0.3, 0.3]) for k in range(2)]
-    constant = read_dataset(bags, responses=[SPEED], excitations=[COMMAND])
-    with pytest.raises(DataError, match=r"no excitation: input '/cmd_vel.*' is 0\.3 through"):
-        require_excitation(constant)
-    bags.append(speed_bag(tmp_path / "other", [0.0, 0.1], [0.4, 0.4]))
-    require_excitation(read_dataset(bags, responses=[SPEED], excitations=[COMMAND]))
 
 
 @pytest.mark.parametrize(

@@ -116,6 +116,8 @@ def test_a_hidden_start_is_found_from_the_first_samples() -> None:
     y, _ = model.states(u, truth)
     assert model.start_from(y[:12], u[:12]) == pytest.approx(truth, abs=1e-4)
     assert model.simulate(u, y[:12]) == pytest.approx(y, abs=1e-4)
+    far = replace(model, start=np.full(2, 1e12))  # so large that differences do not move it
+    assert np.isfinite(far.start_from(y[:12], u[:12])).all()
 
 
 def test_a_parallel_connection_of_filters_around_nonlinearities_is_a_network_and_proved() -> None:

@@ -95,7 +95,7 @@ def _dataset(u: np.ndarray, y: np.ndarray) -> Dataset:
 
 def test_a_constant_input_is_refused_with_the_reason() -> None:
     y = np.random.default_rng(0).standard_normal(100)
-    with pytest.raises(DataError, match=r"excitation 0 is constant \(0.4\)"):
+    with pytest.raises(DataError, match=r"u0 is constant \(0.4\)"):
         identify(_dataset(np.full(100, 0.4), y), LinearClass(2))
 
 

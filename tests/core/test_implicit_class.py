@@ -270,7 +270,7 @@ def test_data_that_do_not_fit_the_class_are_refused() -> None:
         with pytest.raises(DataError, match=reason):
             identify(data, model_class)
     still = replace(data.trajectories[0], u=np.full((60, 1), 0.4))
-    with pytest.raises(DataError, match=r"excitation 0 is constant \(0.4\)"):
+    with pytest.raises(DataError, match=r"u0 is constant \(0.4\)"):
         identify(Dataset((still,)), SPRING)
     square = replace(data.trajectories[0], u=np.tile([0.0, 1.0], 30)[:, None])
     with pytest.raises(DataError, match="regressors of rank"):

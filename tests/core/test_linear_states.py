@@ -101,5 +101,5 @@ def test_data_that_cannot_tell_are_refused() -> None:
     with pytest.raises(DataError, match="not independent"):
         identify_linear_states(Dataset((Trajectory(t=trial.t, y=twice, u=trial.u, name="r"),)))
     flat = Trajectory(t=trial.t, y=trial.y, u=np.ones_like(trial.u), name="r")
-    with pytest.raises(DataError, match="input 0 is constant"):
+    with pytest.raises(DataError, match="u0 is constant"):
         identify_linear_states(Dataset((flat,)))
