@@ -41,12 +41,16 @@ def say_class(proposal: Proposal, train: Dataset) -> None:
     if not others:
         return
     best, least = min(others, key=lambda tried: tried[1])
-    said = ", ".join(f"{s['model']}: {e:.3g} %" for s, e in [(section, error), *others])
+    said = ", ".join(
+        f"{s['model']}: " + (f"{e:.3g} %" if e < math.inf else "none is proved")
+        for s, e in [(section, error), *others]
+    )
     proposal.why["model"] = (
         f"proved models of {SAMPLES} samples or fewer, simulated on trials held back without "
         f"their first {START} samples, are off by {said}"
     )
-    if least <= min(BETTER * error, POOR):
+    # Of so few samples the known class may have no proved model; of all of them it had one.
+    if least <= min(BETTER * min(error, proposal.error), POOR):
         proposal.content["identification"] = dict(best)
         proposal.error, proposal.tried_on = least, "trials held back"
         for key in ("lags", "delays", "right_degree", "input_range", "method"):
