@@ -234,12 +234,12 @@ def funnel_table(design: OutputTubeDesign) -> Table:
             said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
         for width, signal in zip(tube.half_widths.tolist(), signals, strict=True):
-            if (span := washout_of(signal)) is not None and tube.samples is None:
-                moved = text.above(displacement_half_width(width, span, span))
+            if (time := washout_of(signal)) is not None and tube.samples is None:
+                moved = text.above(displacement_half_width(width, time, time))
                 times = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
                 table.add_row(
                     "position",
-                    f"what {signal.name} moves in at most {text.above(span)} s is within {moved} "
+                    f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
                     f"{signal.unit}{times} of what the simulation moves",
                 )
     for line in design.verdict.assumptions:
