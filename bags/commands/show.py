@@ -15,6 +15,7 @@ from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
+from bags.designs.displacement import displacement_half_width, washout_of
 from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
@@ -236,6 +237,15 @@ def funnel_table(design: OutputTubeDesign) -> Table:
         if tube.follows is not None:
             said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
+        for width, signal in zip(tube.half_widths.tolist(), signals, strict=True):
+            if (time := washout_of(signal)) is not None and tube.samples is None:
+                moved = text.above(displacement_half_width(width, time, time))
+                times = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
+                table.add_row(
+                    "position",
+                    f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
+                    f"{signal.unit}{times} of what the simulation moves",
+                )
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
     return table
