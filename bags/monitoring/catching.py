@@ -379,8 +379,8 @@ def what_it_catches(
     shares = {trial.name: run.share for trial, run in zip(calibration, scaling, strict=True)}
     return Catching(
         tuple(
-            Width(n, u, float(w), float(r), float(e), *ends, moves=float(m))
-            for n, u, w, r, e, ends, m in named
+            Width(n, u, float(w), float(r), float(e), least, most, float(m))
+            for n, u, w, r, e, (least, most), m in named
         ),
         tuple(rows),
         len(held_back),
