@@ -15,6 +15,7 @@ from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
+from bags.designs.displacement import displacement_half_width, washout_of
 from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
@@ -37,9 +38,10 @@ COLOURS = {
     Status.UNKNOWN.value: "magenta",
 }
 COMPARISON_CAPTION = """\
-free run: simulated; +k: predicted k samples ahead. residual: coloured (not
-white), follows the input u, or both, at 99 %. rate: proved, a sample; forgets:
-its time constant. time: of the processor."""
+free run: simulated; +k: predicted k samples ahead, - of a class that predicts
+what it simulates. residual: coloured (not white), follows the input u, or both,
+at 99 %. rate: proved, a sample; forgets: its time constant. time: of the
+processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
 UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 STABILITY = "proved rate a sample (time constant)"
@@ -162,7 +164,7 @@ def comparison_table(compared: Compared) -> Group:
     """Every method of every class, scored on the same samples: a table a class, 80 columns."""
     left_out = f"after their first {compared.skipped_at_start} samples"
     parts: list[Table | str] = [f"{len(compared.trials.test)} test trials {left_out}; errors in %"]
-    horizons = list(compared.rows[0].scores.prediction_percent)
+    horizons = sorted({k for row in compared.rows for k in row.scores.prediction_percent})
     for label in dict.fromkeys(row.label for row in compared.rows):
         table = Table(title=escape(label), title_justify="left", box=SIMPLE_HEAD, padding=0)
         table.add_column("method", min_width=13, no_wrap=True)
@@ -188,10 +190,13 @@ def _compared(row: Scored, horizons: Sequence[int]) -> list[str]:
     if candidate.proof is not None:
         rate, _, rest = stated_rate(candidate.proof, candidate.model.period).partition(" (")
         rate, forgets = (f"[green]{rate}", rest.rstrip(")")) if rest else ("[green]proved", "")
-    errors = (scores.simulation_percent, *(scores.prediction_percent[k] for k in horizons))
+    ahead = [scores.prediction_percent.get(k) for k in horizons]
     return [
         candidate.method.name,
-        *(percent(error).removesuffix(" %") for error in errors),
+        *(
+            "-" if error is None else percent(error).removesuffix(" %")
+            for error in (scores.simulation_percent, *ahead)
+        ),
         flaws.get((scores.white, scores.independent), "both"),
         rate,
         forgets,
@@ -232,6 +237,15 @@ def funnel_table(design: OutputTubeDesign) -> Table:
         if tube.follows is not None:
             said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
+        for width, signal in zip(tube.half_widths.tolist(), signals, strict=True):
+            if (time := washout_of(signal)) is not None and tube.samples is None:
+                moved = text.above(displacement_half_width(width, time, time))
+                times = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
+                table.add_row(
+                    "position",
+                    f"what {signal.name} moves in at most {text.below(time)} s is within {moved} "
+                    f"{signal.unit}{times} of what the simulation moves",
+                )
     for line in design.verdict.assumptions:
         table.add_row("assuming", escape(line))
     return table
@@ -356,15 +370,22 @@ def replay_lines(replay: Replay) -> Iterator[str]:
         yield f"{replay.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
     for said in filter(None, (replay.clock, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
-    for reading in replay.unjudged[:UNJUDGED_SAID]:
-        yield f"{replay.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
-    if more := replay.unjudged[UNJUDGED_SAID:]:
-        yield (
-            f"{replay.name}: not judged later either: {len(more)} more, the last from "
-            f"{more[-1].t:.3f} s on"
-        )
     if not replay.judged:
         yield f"{replay.name}: nothing was judged: {replay.reason}"
+        return
+    if replay.starting > len(replay.judged):
+        yield (
+            f"{replay.name}: only {len(replay.judged)} of {len(replay.readings)} samples were "
+            f"judged: the first {replay.starting} start the run"
+        )
+    for stretch in replay.unjudged[:UNJUDGED_SAID]:
+        yield f"{replay.name}: not judged: {stretch.where}: {stretch.why}"
+    if more := replay.unjudged[UNJUDGED_SAID:]:
+        samples = sum(stretch.samples for stretch in more)
+        yield (
+            f"{replay.name}: not judged: {samples} more samples in {len(more)} "
+            f"{'place' if len(more) == 1 else 'places'}, the last {more[-1].where}"
+        )
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -47,7 +47,8 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
         window = slope_window(1.0 / proposal.content["grid"]["period"])
         proposal.walls.append(
             "no number of lags gave a model that is proved stable: identification will refuse; a "
-            f"response that adds up its command for ever needs |derivative({window:g} s)"
+            f"response that adds up its command for ever needs |derivative({window:g} s), or "
+            "|washout(2 s), the time over which its way should be told"
         )
         return
     best = proposal.error = min(known.values())

@@ -7,6 +7,7 @@ from left to right, and use no later sample, so that a monitor gives the same nu
 - `unwrap`: an angle without jumps of a turn, 360 where its unit is deg (see `unit`), else 2π; it
   begins within half a turn of 0.
 - `derivative(T s)`: the slope over the last T s, see `derivative`.
+- `washout(T s)`: what it moved, fading with time constant T, see `washout`.
 
 These say when the signal is sampled (`bags.signals.sampling`):
 
@@ -21,6 +22,7 @@ What drives may be a product, `A * B`, of signals with operations of their own: 
 values in a sample.
 """
 
+import math
 import re
 from collections import deque
 from collections.abc import Iterable
@@ -38,9 +40,9 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.errors import BagError
 
 OPERATIONS: Final = (
-    "unit", "to", "unwrap", "derivative", "clock", "hold", "linear", "delay", "lag",
+    "unit", "to", "unwrap", "derivative", "washout", "clock", "hold", "linear", "delay", "lag",
 )  # fmt: skip
-TIMED: Final = ("derivative", "hold", "linear", "delay", "lag")  # these take a time
+TIMED: Final = ("derivative", "washout", "hold", "linear", "delay", "lag")  # these take a time
 SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
 DRIVING: Final = ("delay", "lag")  # of what drives only
 SIGNAL_CLOCKS: Final = ("header", "log")
@@ -125,6 +127,12 @@ class Expression:
         found = self.operation("delay")
         return 0 if found is None else round(found.window * 1e9)
 
+    @property
+    def washed_out(self) -> float | None:
+        """T in s if each sample is a message with `washout(T s)` as its last step but units."""
+        steps = [found for found in self.operations if found.name not in ("unit", "to", "clock")]
+        return steps[-1].window if steps and steps[-1].name == "washout" else None
+
     def unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the result ("" if nothing implies one); BagError if one cannot be converted.
 
@@ -159,17 +167,18 @@ class Expression:
                 turn = turn_of(unit)
                 turns = np.cumsum(_turns(np.diff(values, prepend=0.0), turn))
                 values = values - turn * turns
-            elif operation.name == "derivative":
+            elif operation.name in ("derivative", "washout"):
+                slope = operation.name == "derivative"
                 try:
-                    values = derivative(values, stamp_ns, operation.window)
+                    values = (derivative if slope else washout)(values, stamp_ns, operation.window)
                 except BagError as error:
                     raise BagError(f"{self}: {error}") from error
-                unit = per_second(unit)
+                unit = per_second(unit) if slope else unit
         return values
 
     def running(self, unit: str) -> "Running":
         """The same, one message after the other, of numbers in `unit`."""
-        steps: list[_Scaled | _Unwrapped | _Slope] = []
+        steps: list[_Scaled | _Unwrapped | _Slope | _Washout] = []
         for operation in self.operations:
             if operation.name == "unit":
                 unit = operation.unit
@@ -181,6 +190,8 @@ class Expression:
             elif operation.name == "derivative":
                 steps.append(_Slope(operation.window))
                 unit = per_second(unit)
+            elif operation.name == "washout":
+                steps.append(_Washout(operation.window))
         return Running(steps)
 
     def recorded_unit(self, msgtype: str, types: Typestore) -> str:
@@ -215,7 +226,7 @@ def parse_factors(text: str) -> tuple[Expression, ...]:
 class Running:
     """An expression's operations on one message after the other: bit for bit what `apply` gives."""
 
-    def __init__(self, steps: "list[_Scaled | _Unwrapped | _Slope]") -> None:
+    def __init__(self, steps: "list[_Scaled | _Unwrapped | _Slope | _Washout]") -> None:
         self._steps = steps
 
     @property
@@ -269,6 +280,39 @@ class _Slope:
         return float(_slopes(stamps[None] - stamp_ns, values[None])[0])
 
 
+class _Washout:
+    def __init__(self, window: float) -> None:
+        self._window_ns = window * 1e9
+        self._last: tuple[int, float] | None = None
+        self._moved = 0.0
+
+    def update(self, stamp_ns: int, value: float) -> float:
+        if not math.isfinite(value):
+            return float("nan")
+        if self._last is not None:
+            before_ns, before = self._last
+            left = math.exp((before_ns - stamp_ns) / self._window_ns)
+            self._moved = left * self._moved + (value - before)
+        self._last = stamp_ns, value
+        return self._moved
+
+
+def washout(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatArray:
+    """(N,) in the unit of `values`: what each step added, fading with time constant `window` s.
+
+    q = 0 at the first finite value p, then q⁺ = exp(-Δt/window) q + (p⁺ - p): a first-order high
+    pass, -3 dB near 1/(2π window). What adds up its command for ever, a position, becomes a signal
+    of a stable model. Nothing is lost: Σ q⁺ - exp(-Δt/window) q is p again, but for its start. NaN
+    where `values` are, which the next step bridges. Raises BagError if stamps do not increase.
+
+    Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation (washout filter).
+    """
+    _require_increasing(stamp_ns, "washout")
+    step = _Washout(window)
+    moved = map(step.update, stamp_ns.tolist(), values.tolist())
+    return np.fromiter(moved, np.float64, len(values))
+
+
 def derivative(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatArray:
     """(N,) per s: at each stamp the slope of the least-squares line through the last `window` s.
 
@@ -282,8 +326,7 @@ def derivative(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatAr
     Source: A. Savitzky, M. Golay, Anal. Chem. 36 (1964) 1627, first derivative, order 2, for
     samples that need not be equidistant.
     """
-    if len(values) and (np.diff(stamp_ns) <= 0).any():
-        raise BagError("stamps do not increase, so there is no derivative")
+    _require_increasing(stamp_ns, "derivative")
     window_ns = round(window * 1e9)
     low = np.searchsorted(stamp_ns, stamp_ns - window_ns, side="left")
     count = np.arange(1, len(stamp_ns) + 1) - low
@@ -301,6 +344,11 @@ def derivative(values: FloatArray, stamp_ns: IntArray, window: float) -> FloatAr
             near = low[block, None] + np.arange(width)
             slopes[block] = _slopes(stamp_ns[near] - stamp_ns[block, None], values[near])
     return slopes
+
+
+def _require_increasing(stamp_ns: IntArray, operation: str) -> None:
+    if (np.diff(stamp_ns) <= 0).any():
+        raise BagError(f"stamps do not increase, so there is no {operation}")
 
 
 def _slopes(before_ns: IntArray, values: FloatArray) -> FloatArray:

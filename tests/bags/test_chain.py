@@ -16,6 +16,7 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags, read_trials
 from bags.chain.training import load_training
 from bags.commands.cli import app
+from bags.commands.show import replay_lines
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
@@ -354,7 +355,37 @@ def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Pa
     both = replace(whole, readings=(waiting, violated, inside, outside, outside))
     assert (both.first_bad, both.first_outside) == (violated, outside)
     parts = replace(whole, readings=(waiting, inside, past, past, nan))
-    assert parts.unjudged == (past, nan)
+    assert [stretch.reasons for stretch in parts.unjudged] == [(past.reason, nan.reason)]
+
+
+def test_the_stretches_that_were_not_judged_begin_and_end(chain: Path) -> None:
+    whole = replay(chain, trial("05"))
+    waiting, inside = whole.readings[0], whole.readings[-1]
+    nan = inside._replace(status=Status.UNKNOWN, reason="no speed at t = 2 s")
+    said = (waiting, *[inside] * 4, nan, *[waiting] * 3, *[inside] * 5, nan, *[inside] * 4)
+    stamps = [*range(14), *range(20, 25)]  # six samples never came
+    readings = tuple(r._replace(t=float(t)) for r, t in zip(said, stamps, strict=True))
+    found = replace(whole, readings=readings, period=1.0)
+    first, second = found.unjudged
+    assert (first.start, first.end, first.samples) == (5.0, 8.0, 4)
+    assert first.why == "no speed at t = 2 s; then 3 to start a new run"
+    assert (second.start, second.end, second.samples) == (14.0, 20.0, 7)
+    assert second.why == "6 samples are missing; then no speed at t = 2 s"
+    left = found.span - found.judged_span
+    assert left == first.samples + second.samples == 11
+
+
+def test_a_recording_that_hardly_outlasts_the_start_says_how_little_was_judged(
+    chain: Path,
+) -> None:
+    whole = replay(chain, trial("05"))
+    start = whole.starting
+    short = replace(whole, readings=whole.readings[: start + 1])
+    assert (short.starting, len(short.judged), short.verdict) == (start, 1, "inside")
+    [*_, said] = replay_lines(short)
+    few = f"only 1 of {start + 1} samples were judged: the first {start} start the run"
+    assert said == f"{short.name}: {few}"
+    assert not any("start the run" in line for line in replay_lines(whole))
 
 
 def test_while_a_start_in_motion_fades_nothing_is_judged_and_the_verdict_says_so(

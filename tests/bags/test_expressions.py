@@ -80,6 +80,7 @@ def test_near_names_are_suggested_for_topics_fields_units_and_operations(tmp_pat
         "/arm:position[0]|derivative(0 s)",
         "/arm:position[0]|derivative(1e99 s)",
         "/arm:position[0]|derivative(5)",
+        "/arm:position[0]|washout",
         "/arm:position[0]|unwrap(1 s)",
         "/arm:position[0]|__import__(os)",
         "/arm:position[0]|to(deg)(rad)",
@@ -90,8 +91,52 @@ def test_operations_that_are_none_are_refused(text: str) -> None:
         Expression.parse(text)
 
 
+def test_a_washed_out_signal_is_the_sum_of_its_steps_each_faded_and_gives_the_signal_back() -> None:
+    rng = np.random.default_rng(4)
+    stamps = np.cumsum(rng.integers(5_000_000, 200_000_000, 120))
+    p = np.cumsum(rng.standard_normal(120)) + 1e3
+    q = Expression.parse("/a:b|washout(0.5 s)").apply(p, stamps, "m")
+    t = stamps / 1e9
+    steps = np.diff(p, prepend=p[0])
+    faded = [sum(steps[: k + 1] * np.exp((t[: k + 1] - t[k]) / 0.5)) for k in range(120)]
+    np.testing.assert_allclose(q, faded, atol=1e-12)
+    lost = 1.0 - np.exp(-np.diff(t) / 0.5)
+    for m, k in ((0, 119), (17, 18), (40, 90)):
+        assert p[k] - p[m] == pytest.approx(q[k] - q[m] + lost[m:k] @ q[m:k], abs=1e-9)
+
+
+def test_a_washout_bridges_what_is_no_number_and_refuses_stamps_that_go_back() -> None:
+    expression = Expression.parse("/a:b|washout(1 s)")
+    stamps = np.array([0, 1, 2, 3]) * 10**9
+    found = expression.apply(np.array([5.0, 7.0, np.nan, 8.0]), stamps, "m")
+    np.testing.assert_allclose(found, [0.0, 2.0, np.nan, 2.0 * np.exp(-2.0) + 1.0])
+    with pytest.raises(BagError, match="stamps do not increase, so there is no washout"):
+        expression.apply(np.zeros(4), stamps[::-1], "m")
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("/a:b|washout(2 s)", 2.0),
+        ("/a:b|unit(deg)|unwrap|washout(500 ms)|to(rad)|clock(log)", 0.5),
+        ("/a:b|washout(2 s)|linear(0.1 s)", None),  # messages between two samples are not judged
+        ("/a:b|washout(2 s)|derivative(1 s)", None),
+        ("/a:b|derivative(1 s)", None),
+        ("/a:b", None),
+    ],
+)
+def test_only_samples_that_are_washed_out_messages_tell_a_displacement(
+    text: str, seconds: float | None
+) -> None:
+    assert Expression.parse(text).washed_out == seconds
+
+
 def test_an_expression_prints_as_it_is_written() -> None:
-    for text in ("/arm:position[0]|unit(rad)|to(deg)|derivative(0.2 s)", f"{ODOM_YAW}|unwrap"):
+    for text in (
+        "/arm:position[0]|washout(2 s)",
+        "/arm:position[0]|unit(rad)|to(deg)|derivative(0.2 s)",
+        f"{ODOM_YAW}|unwrap",
+    ):
         assert str(Expression.parse(text)) == text
 
 

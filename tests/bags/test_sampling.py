@@ -157,6 +157,7 @@ def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> N
         "|unit(deg)|unwrap",
         "|unwrap|derivative(0.1 s)",
         "|derivative(0.07 s)|to(rpm)",
+        "|unwrap|washout(0.3 s)|to(deg)",
     ):
         expression = Expression.parse(f"/odom:a.yaw{text}")
         whole = expression.apply(angles, stamps, "rad")
