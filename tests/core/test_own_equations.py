@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.first_try import Truth, dubins, lines_of, rocket, van_der_pol
+from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
@@ -65,6 +65,18 @@ def test_a_rocket_lands_at_the_first_try_and_no_start_leaves() -> None:
     assert run.violations == 0
     assert found.found.proved.pieces.kappa is not None
     assert np.ptp(np.log2(found.found.proved.pieces.kappa), axis=0).max() > 1  # it follows ρ
+
+
+@pytest.mark.slow
+def test_a_stiff_arm_gets_the_knots_that_its_springs_need() -> None:
+    rate, problem = flexible_arm()
+    found = design(problem)
+    assert len(found.funnel.t) > len(problem.nominal.t)
+    truth = Truth(rate, found, 0)
+    rng = np.random.default_rng(0)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    assert run.violations == 0
+    assert run.max_v > 0.9
 
 
 def test_an_oscillator_without_an_input_is_proved() -> None:

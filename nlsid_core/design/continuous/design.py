@@ -33,7 +33,7 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
-MOST_KNOTS = 100  # of a motion that is given more: each takes programs of its own
+MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its own
 HALVINGS = 6  # of intervals where P is far from linear
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
