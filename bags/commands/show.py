@@ -371,7 +371,8 @@ def replay_lines(replay: Replay) -> Iterator[str]:
     for said in filter(None, (replay.clock, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
     if not replay.judged:
-        yield f"{replay.name}: nothing was judged: {replay.reason}"
+        if not replay.paced:  # said of all such bags together
+            yield f"{replay.name}: nothing was judged: {replay.reason}"
         return
     if replay.starting > len(replay.judged):
         yield (
@@ -386,6 +387,19 @@ def replay_lines(replay: Replay) -> Iterator[str]:
             f"{replay.name}: not judged: {samples} more samples in {len(more)} "
             f"{'place' if len(more) == 1 else 'places'}, the last {more[-1].where}"
         )
+
+
+def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
+    """Once for all bags of which nothing was judged as their samples have another period."""
+    if not (other := [replay for replay in replays if replay.paced]):
+        return
+    named = [f"{replay.name} {replay.paced:.4g} s" for replay in other[:UNJUDGED_SAID]]
+    more = f" and {len(other) - len(named)} more" if len(other) > len(named) else ""
+    bags = "1 bag has samples" if len(other) == 1 else f"{len(other)} bags have samples"
+    yield (
+        f"nothing was judged: {bags} of another period than the model's {other[0].period:g} s: "
+        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs"
+    )
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -1,5 +1,6 @@
 """Taylor models enclose what they stand for, and funnels of them hold for the true dynamics."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +162,28 @@ def test_many_inexact_rates_are_pushes_and_exact_ones_have_none() -> None:
 def test_what_is_not_supported_says_what_is(function: Any, said: str) -> None:
     with pytest.raises(NlsidError, match=said):
         expanded(function, [1.0, -0.5], [0.5, 0.75], states=1)
+
+
+def test_arguments_with_a_default_keep_it() -> None:
+    def damped(x: Any, g: float = 9.81, *, u: Any, damping: float = 0.5) -> list[Any]:
+        return [x[1], -g * np.sin(x[0]) - damping * x[1] + u[0]]
+
+    def plain(x: Any, u: Any) -> list[Any]:
+        return [x[1], -9.81 * np.sin(x[0]) - 0.5 * x[1] + u[0]]
+
+    box = [1.0, -0.5, 0.0], [0.5, 0.75, 1.0]
+    (found, bounds), (wanted, same) = (expanded(f, *box, states=2) for f in (damped, plain))
+    for got, expected in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(got.exponents, expected.exponents)
+        np.testing.assert_array_equal(got.coefficients, expected.coefficients)
+    np.testing.assert_array_equal(bounds, same)
+
+    def falling(x: Any, rate: float = 2.0) -> list[Any]:
+        return [-rate * x[0]]
+
+    assert VectorField.from_function(falling, 1, 0)(0.0, [[3.0]], [[]]).tolist() == [[-6.0]]
+    twice = partial(falling, rate=4.0)
+    assert VectorField.from_function(twice, 1, 0)(0.0, [[3.0]], [[]]).tolist() == [[-12.0]]
 
 
 def test_a_radius_that_makes_no_sense_is_refused() -> None:
