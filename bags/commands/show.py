@@ -115,7 +115,7 @@ def gain_lines(found: Gain) -> list[str]:
     bound = f"gain at most {text.above(number)}" if least else (
         f"passivity index at least {text.below(number)}"
     )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model"]
+    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
     if (seen := found.reached) is None:
         lines.append("not compared with simulated runs")
     else:
@@ -128,6 +128,24 @@ def gain_lines(found: Gain) -> list[str]:
         shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
         lines.append(f"{bound}{unit}: {shown}")
     return [*lines, *str(found.verdict).splitlines()]
+
+
+def _gain_conditions(found: Gain) -> str:
+    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
+    outputs, inputs = signals(found.model)
+    scales = [*zip(outputs, found.proof.y_scales, strict=True),
+              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
+    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
+    said = f", {' and '.join(counted)}" if counted else ""
+    if found.proof.box is None:
+        return said
+    ranges = [
+        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
+        f"{signal.unit}".rstrip()
+        for key, group in (("y", outputs), ("u", inputs))
+        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
+    ]
+    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
 
 
 def named_number(given: str) -> tuple[str, float]:
