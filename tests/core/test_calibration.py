@@ -135,6 +135,7 @@ CONFIDENCE = 0.999  # of the interval around the frequency
 RATIOS = (1e-3, 1e-1, 1.0, 10.0, 1e3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaling", [1, 4, 9])
 def test_exchangeable_trials_exceed_the_largest_as_often_as_stated(
     fit: Fit[DifferenceEquation], scaling: int

@@ -19,10 +19,11 @@ from nlsid_core.running.forecast import Forecast, linear_form, reach
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from nlsid_core.running.stepping import Stepper
-from tests.core.kernel.tube_claims import HIGH, LOW, MODELS, design
+from tests.core.kernel.tube_claims import HIGH, LONG, LOW, MODELS, design
+from tests.marks import slow_among
 
 AHEAD = 12
-EVERY = pytest.mark.parametrize("name", MODELS)
+EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 
 
 def alone(name: str, i: int = 0, *, peak: bool = True) -> tuple[Any, TubeFunnel]:
