@@ -393,6 +393,7 @@ def examples() -> list[dict[str, Any]]:
 
 @pytest.mark.slow  # the classes are identified above; here the page's own words for them are
 @pytest.mark.parametrize("example", examples(), ids=lambda e: "-".join(e) + str(len(str(e))))
+@pytest.mark.pictures
 def test_every_example_of_the_how_to_runs(
     example: dict[str, Any], folder: Path, tmp_path: Path
 ) -> None:

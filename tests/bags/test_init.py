@@ -326,6 +326,7 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
     config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
@@ -553,6 +554,7 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
         ("cougars_auv/SO_lastbag_mcap", 24.0),
     ],
 )
+@pytest.mark.pictures
 def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seconds: float) -> None:
     """Each is one recording, which is cut into parts first, as `init` says it should be."""
     bag, parts = SHARED / robot, tmp_path / "parts"

@@ -108,6 +108,7 @@ def test_the_calibration_trials_do_not_choose_the_observer(
         assert louder.measured > 100 * tube.measured
 
 
+@pytest.mark.slow
 def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
     fit: Fit[DifferenceEquation], train: Dataset
 ) -> None:

@@ -61,6 +61,7 @@ def test_iterates_never_go_up_and_the_last_one_is_proved(
     assert "every input" in checked(stacked.model(point.theta, point.p), tmp_path)
 
 
+@pytest.mark.slow
 def test_few_steps_a_bound_stay_inside_the_set_and_end_as_low(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -146,6 +146,7 @@ def test_without_an_input_there_is_nothing_to_hold() -> None:
         design(ContinuousTracking(field, nominal, goal=[[1.0]], hold=0.01))
 
 
+@pytest.mark.slow
 def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
     with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
         design(tracking(hold=1.0))

@@ -170,6 +170,7 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_command_line_compares_methods_on_the_same_bags(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -319,6 +319,7 @@ def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() ->
     assert "windows of one recording are hardly exchangeable" in str(single.verdict)
 
 
+@pytest.mark.slow
 def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says() -> None:
     """Of 40 next trials, each beside 9 of its own: a tenth, within three standard deviations."""
     model, exceeded = MODELS["linear"](), 0

@@ -112,6 +112,7 @@ def test_a_motion_is_planned_for_the_centre_of_what_is_uncertain() -> None:
             plan_motion(pushed, **ends, m=1, uncertain=box)
 
 
+@pytest.mark.slow
 def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
     def rate(x: Any, u: Any, w: Any) -> list[Any]:
         return [x[1], u[0] - np.sin(x[0]) + w[0]]

@@ -12,6 +12,7 @@ def test_the_f1tenth_example_reaches_the_published_figures() -> None:
     assert computed["inside"] == published["inside"]
 
 
+@pytest.mark.slow
 def test_displacements_of_new_drives_are_within_what_the_tube_of_the_washed_out_position_says() -> (
     None
 ):

@@ -328,7 +328,9 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     assert f"0 of them known from {kept}, 15 asked of now" in lines[1]
     for name in ("cut", "empty", "other", "copy", "back", "gap"):
         assert f"  r9/2022-01/{name}: " in said
-    assert re.search(r"r9/2022-01/back: from \d.* s on: time went back by .* on /odom", said)
+    assert re.search(
+        r"r9/2022-01/back: \d+ samples from \d.* s: time went back by .* on /odom", said
+    )
     assert "r9/2022-01/back: stamps of /cmd_vel go back in 1 place, by up to 0.225 s; " in said
     worst = lines.index("the 10 bags that spent the most, and when:")
     assert "robots with trouble: " in said

@@ -304,6 +304,7 @@ def test_inputs_that_are_remembered_for_too_long_are_refused_at_once(name: str, 
         decide(model, proof)
 
 
+@pytest.mark.slow
 def test_a_model_of_too_many_terms_is_refused_before_they_are_written_out() -> None:
     model, proof = claim("moving")
     terms = [[i, j] for i in range(20) for j in range(20)]
