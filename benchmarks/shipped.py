@@ -28,7 +28,7 @@ def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
         "quadrotor": quadrotor.designed,
         "cart_pole": cart_pole.designed,
         "planar_quadrotor": planar_quadrotor.designed,
-        "torque_limited": torque_limited_pendulum.designed,
+        "torque_limited_pendulum": torque_limited_pendulum.designed,
     }
     for name, design in designs.items():
         yield name, [design().save(folder / name)[-1]]
@@ -37,14 +37,14 @@ def shipped(folder: Path) -> Iterator[tuple[str, list[Path]]]:
     identify_bags(f1tenth(), config, out, progress=silent)
     design_funnel_files(out / documents.MODEL, config, out)
     yield "f1tenth", [out / documents.MODEL_PROOF, out / documents.FUNNEL_PROOF]
-    yield "pendulum", [tracked_pendulum(folder / "pendulum")]
+    yield "pendulum", [_tracked_pendulum(folder / "pendulum")]
 
 
-def tracked_pendulum(out: Path) -> Path:
-    """The sampled funnel of `nlsid track run --config config/pendulum.yaml` (extra `sim`)."""
+def _tracked_pendulum(out: Path) -> Path:
+    """The sampled funnel of config/pendulum.yaml, from bags of the robot in MuJoCo."""
     config = load_tracking_config(config_file("pendulum.yaml"))
-    excitations = tracking_steps.simulate_excitations(config, out / "excitations")
-    tracking_steps.identify_state_bags(excitations, config, out)
+    bags = tracking_steps.simulate_excitations(config, out / "excitations")
+    tracking_steps.identify_state_bags(bags, config, out)
     tracking_steps.plan_tracking(out / documents.MODEL, config, out)
     runs = tracking_steps.simulate_runs(out, config, out / "runs")
     tracking_steps.design_tracking_funnel(out, runs, config, progress=silent)
