@@ -315,7 +315,7 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
             soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
         )  # fmt: skip
-    for line in catching.beyond:
+    for line in (*catching.beyond, *catching.still):
         said = f"warning: {line}"
         console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
     wide = catching.warnings(WIDE if require is None else require)

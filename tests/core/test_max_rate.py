@@ -49,7 +49,7 @@ def test_the_default_is_the_time_constant_of_the_longest_trial() -> None:
     assert default_max_rate(data) == pytest.approx(math.exp(-1 / 90))
     fit = identify(data, LinearClass(1))
     assert fit.max_rate == default_max_rate(data)
-    assert fit.slowest == "slowest rate allowed: 0.9890 (9 s) a sample"
+    assert fit.slowest == "slowest rate allowed: 0.9890 (9 s) a sample", "it is not active"
     assert fit.slowest in str(fit)
 
 
@@ -61,6 +61,7 @@ def test_an_integrator_is_answered_by_the_slowest_rate_that_is_allowed(
     fit = identify(data, LinearClass(2), method=method)
     assert fit.proof.rate <= default_max_rate(data) < 1.0
     assert radii_of(fit).max() == pytest.approx(searched_rate(default_max_rate(data)), abs=2e-3)
+    assert "This bound is active: the model is proved at 0.99" in fit.slowest
     unheard = identify(data, LinearClass(2), method=method, max_rate=1.0 - 1e-7)
     assert radii_of(unheard).max() > 0.9975, "the limit is what kept the pole"
 

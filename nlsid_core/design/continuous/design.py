@@ -46,7 +46,7 @@ class ContinuousSearch:
 
     proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. first: a
     first guess to compare with, of which nothing is proved. history: (what, ∫ volume dt). seconds:
-    wall clock of each stage.
+    wall clock of each stage. cost: what a hold and measurement errors take, in words.
     """
 
     goal: Goal
@@ -54,12 +54,14 @@ class ContinuousSearch:
     first: ContinuousFunnel
     history: tuple[tuple[str, float], ...]
     seconds: dict[str, float]
+    cost: str = ""
 
     def __str__(self) -> str:
-        return (
+        volume = (
             f"volume integral {self.history[-1][1]:.4g}, found and proved in "
             f"{sum(self.seconds.values()):.2f} s"
         )
+        return f"{self.cost}\n{volume}" if self.cost else volume
 
 
 _Found: TypeAlias = tuple[Setting, ContinuousFunnel, Proved, float]
@@ -149,7 +151,9 @@ def decided(
     if setting.hold is not None:
         claim |= setting.hold.claim()
         proof |= setting.rate_proof(funnel, proved.pieces.basis)
-    found = ContinuousSearch(goal, proved, setting.first_guess(), tuple(history), seconds)
+    found = ContinuousSearch(
+        goal, proved, setting.first_guess(), tuple(history), seconds, _cost(setting, funnel)
+    )
     try:
         design = Design.proved(
             setting.steps.field, policy, funnel, claim=claim, proof=proof, found=found
@@ -158,6 +162,24 @@ def decided(
         raise Infeasible(f"the kernel refuses what was found: {refusal}") from refusal
     seconds["proof"] = time.perf_counter() - started
     return design
+
+
+def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
+    """Half-widths at the start with the hold and the errors of the state, and without them."""
+    if setting.hold is None or setting.free is None:
+        return ""
+    part = float(np.sqrt(funnel.rho[0] / setting.free[0]))
+    free = replace(funnel, rho=funnel.rho / part**2)
+    held, unheld = (
+        ", ".join(f"x{i} {width:.3g}" for i, width in enumerate(f.widths(funnel.t0).tolist()))
+        for f in (funnel, free)
+    )
+    causes = [f"the hold of {setting.hold.period:g} s"] if setting.hold.period else []
+    causes += ["the errors of the measured state"] if setting.hold.error.any() else []
+    return (
+        f"{' and '.join(causes)} leave {part:.3g} of the half-widths at {funnel.t0:g} s: {held}; "
+        f"without, {unheld} were found for this policy, not proved"
+    )
 
 
 def _in_use(setting: Setting) -> str:
@@ -242,7 +264,7 @@ def _found(setting: Setting, progress: Progress) -> _Found:
         return _swept(setting, validity_caps(steps.field, policy, P), progress)
     else:
         expansion, free = None, _free(setting, progress)
-    hold = setting.hold
+    setting, hold = replace(setting, free=free), setting.hold
     assert hold is not None
     span = float(setting.policy.t[-1] - setting.policy.t[0])
     if hold.shortest > span:

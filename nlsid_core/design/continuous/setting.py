@@ -60,7 +60,8 @@ class Setting:
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
-    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved.
+    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved. free:
+    (K,) ρ as it was found without the hold, of which nothing may be proved.
     """
 
     steps: LSteps
@@ -73,6 +74,7 @@ class Setting:
     hold: Hold | None = None
     rates: FloatArray | None = None
     needed: float = 0.0
+    free: FloatArray | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
