@@ -503,13 +503,16 @@ Print Assumptions funnel_stays.
 """
 HELD = """\
 Definition data := stated field policy funnel goal decay.
-Theorem accepted : held_files_ok field policy funnel goal decay period errors proof rates turns = true.
+Theorem accepted :
+  held_files_ok field policy funnel goal decay period errors proof rates turns = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
 Theorem held_stays : forall since x u, held_solution data period errors since x u ->
   (begin data <= since <= finish data)%R -> inside data x since ->
   (forall t, (since <= t <= finish data)%R -> inside data x t /\\ held_in_bounds data x u t) /\\
   in_goal data x /\\ decays data x since.
-Proof. exact (held_theorem field policy funnel goal decay period errors proof rates turns accepted). Qed.
+Proof.
+  exact (held_theorem field policy funnel goal decay period errors proof rates turns accepted).
+Qed.
 Print Assumptions held_stays.
 """
 NEAR = """\
