@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from nlsid_core import files, kernel, proofs
+from nlsid_core.errors import CertificateMismatch, CertificateRejected
 
 PROOF, SAID = "claim.proof.json", "said"
 MOST = 10_000_000  # bytes of the files of one
@@ -37,7 +38,7 @@ def recorded(decided: Any, contents: Any) -> Any:
     def record(*given: Any) -> Any:
         try:
             verdict = decided(*given)
-        except (kernel.Rejected, proofs.CertificateMismatch, proofs.CertificateRejected) as refusal:
+        except (kernel.Rejected, CertificateMismatch, CertificateRejected) as refusal:
             keep(contents(*given), f"{type(refusal).__name__}: {refusal}")
             raise
         keep(contents(*given), "proved")
