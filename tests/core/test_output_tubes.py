@@ -24,9 +24,10 @@ from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stepping import Stepper
 from nlsid_core.running.tubes import WATCHED
 from tests import implicit_models
-from tests.core.kernel.tube_claims import MODELS, dataset, design, recorded
+from tests.core.kernel.tube_claims import LONG, MODELS, dataset, design, recorded
+from tests.marks import slow_among
 
-EVERY = pytest.mark.parametrize("name", MODELS)
+EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 
 
 def run(monitor: Monitor, trial: Trajectory) -> list[Reading]:
@@ -155,6 +156,7 @@ def test_a_run_that_starts_at_a_wrong_measurement_is_inside_or_breaks_the_assump
         assert {r.status for r in readings[-10:]} == {Status.INSIDE}, "a wrong start fades"
 
 
+@pytest.mark.slow
 def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
     monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
     run(monitor, trial)
@@ -331,6 +333,7 @@ def test_a_funnel_reads_back_as_it_was_written() -> None:
 # -- design ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() -> None:
     model = MODELS["linear"]()
     made = design_output_tube(model, dataset(model, 0, 6))
@@ -343,6 +346,7 @@ def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() ->
     assert "windows of one recording are hardly exchangeable" in str(single.verdict)
 
 
+@pytest.mark.slow
 def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says() -> None:
     """Of 40 next trials, each beside 9 of its own: a tenth, within three standard deviations."""
     model, exceeded = MODELS["linear"](), 0

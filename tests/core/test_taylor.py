@@ -16,6 +16,7 @@ from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeE
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.proofs import check
 from tests.funnel_files import saved, write
+from tests.marks import slow_among
 
 
 def swinging(x: Any, u: Any) -> list[Any]:
@@ -106,7 +107,7 @@ EVERYTHING: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
-@pytest.mark.parametrize("size", [0.05, 0.5])
+@pytest.mark.parametrize("size", slow_among([0.05, 0.5], {0.05}))
 def test_every_operation_encloses(name: str, size: float) -> None:
     centre, radius = np.array([1.0, -0.5]), size * np.array([1.0, 1.5])
     cubics, bounds = expanded(EVERYTHING[name], centre, radius, states=1)
@@ -234,6 +235,7 @@ def test_a_funnel_of_taylor_models_holds_for_the_true_dynamics(
         assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.4 + 1e-3
 
 
+@pytest.mark.slow
 def test_bounds_of_one_span_do_not_hold_in_another() -> None:
     field, _ = caught()
     assert [j for j, _, _ in field.validity(3)] == [0, 1, 2]
