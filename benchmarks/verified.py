@@ -1,16 +1,18 @@
 """The second kernel (verified/): proofs of the examples in Coq and extracted; mutants of both.
 
-    python -m benchmarks.verified [--json] [--mutations N] [--no-designs]
+    python -m benchmarks.verified [--json] [--mutations N] [--no-designs] [--no-forgeries]
 
 Needs Debian's coq, libcoq-bignums, ocaml-findlib and libzarith-ocaml-dev. Seconds are processor
 seconds: of make with one theorem, the theory being built, and of the extracted checker with the
 generator. A mutant is that of tests/core/kernel; those that the second kernel does not cover cannot
-disagree. A disagreement is listed by what each kernel said of it.
+disagree. A disagreement is listed by what each kernel said of it. Forgeries are all files that the
+first kernel refuses while its tests run, and those that it proves there are asked about too.
 """
 
 import argparse
 import importlib
 import json
+import os
 import re
 import resource
 import subprocess
@@ -26,12 +28,22 @@ from benchmarks.machine import describe
 from benchmarks.shipped import shipped
 from nlsid_core import files, kernel, second
 from tests.core.kernel import mutations
+from tests.core.verified import recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 VERIFIED = ROOT / "verified"
 MUTATIONS = 10_000
 SEED = 4
 KINDS = ("continuous_funnel", "tube", "stability", "sampled_funnel", "funnel_composition")
+TESTS = (
+    "tests/core/kernel", "tests/core/test_decay.py", "tests/core/test_funnel_composition.py",
+    "tests/core/test_funnel_forgeries.py", "tests/core/test_held_funnels.py",
+    "tests/core/test_implicit_proofs.py", "tests/core/test_linear_states.py",
+    "tests/core/test_sampled_funnel.py", "tests/core/test_sampled_funnel_implicit.py",
+    "tests/core/test_saturated_funnels.py", "tests/core/test_trajectory_funnels.py",
+    "tests/core/test_uncertain_funnels.py",
+)  # fmt: skip
+OTHER_KERNEL = "a_plan_is_taken_up_to_the_limit"  # it moves a limit of the first kernel
 
 
 def main() -> None:
@@ -39,7 +51,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--mutations", type=int, default=MUTATIONS)
-    parser.add_argument("--no-designs", action="store_true", help="mutations only")
+    parser.add_argument("--no-designs", action="store_true", help="without the examples' proofs")
+    parser.add_argument("--no-forgeries", action="store_true", help="without the tests' files")
     arguments = parser.parse_args()
     theory = [path.read_text().splitlines() for path in VERIFIED.glob("*.v")]
     result: dict[str, Any] = {"lines": sum(bool(line.strip()) for text in theory for line in text)}
@@ -51,6 +64,8 @@ def main() -> None:
         program = build / "nlsid-second"
         if not arguments.no_designs:
             result |= decided(Path(folder), make, program)
+        if not arguments.no_forgeries:
+            result |= forged(Path(folder) / "recorded", build / "second")
         result |= mutated(arguments.mutations, Path(folder) / "mutant", build / "second")
     print(describe())
     for key, value in result.items():
@@ -111,6 +126,32 @@ def mutated(count: int, folder: Path, checker: Path) -> dict[str, Any]:
         "decided": dict(sorted(both.items())),
         "disagreements": sum(differ.values()),
         "differ": dict(differ.most_common()),
+    }
+
+
+def forged(folder: Path, checker: Path) -> dict[str, Any]:
+    """What the second kernel says of the files that the first one's tests have it decide."""
+    generate = generator()
+    command = [sys.executable, "-m", "pytest", "-q", "-p", recorded.__name__]
+    subprocess.run(
+        [*command, "-k", f"not {OTHER_KERNEL}", *TESTS], check=True, cwd=ROOT,
+        env={**os.environ, recorded.FOLDER: str(folder)}, stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    found: Counter[str] = Counter()
+    differ: Counter[str] = Counter()
+    for case in sorted(folder.iterdir()):
+        said = (case / recorded.SAID).read_text()
+        status, why = generate.decided(case / recorded.PROOF, checker=checker)
+        verdict = {0: "accepted", 1: "refused", 3: "not covered"}[status]
+        found[f"{'proved' if said == 'proved' else 'refused'} and {verdict}"] += 1
+        if status != 3 and (status == 0) != (said == "proved"):
+            differ[f"{verdict} {why}, but {said}"[:160]] += 1
+        if status == 3:
+            found[re.sub(r"'.*|[0-9.e+-]*[0-9]", "", why)[:100]] += 1
+    return {
+        "recorded": dict(sorted(found.items())),
+        "recorded_disagreements": sum(differ.values()),
+        "recorded_differ": dict(differ),
     }
 
 
