@@ -143,7 +143,7 @@ def tested(folder: Path, checker: Path) -> dict[str, Any]:
 
 
 def opinions(proof: Path, generate: Any, checker: Path) -> tuple[bool, str, str]:
-    """Whether the first kernel proves it, the second's verdict, and what was said if they differ."""
+    """Whether the first kernel proves it, the second's verdict; what was said if they differ."""
     said = "proved"
     try:
         kernel.check(proof)
