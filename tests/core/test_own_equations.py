@@ -252,12 +252,18 @@ def test_a_jump_of_rounding_is_none() -> None:
         Nominal(PiecewisePolynomial(t, u - 0.1), x)
 
 
+def lagging(x: Any, u: Any, w: Any) -> Any:
+    """A position whose speed lags its command, and is pushed."""
+    return [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]
+
+
 @pytest.mark.slow
 def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
     t = np.linspace(0, 3, 45)
-    rate = lambda x, u, w: [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]  # noqa: E731
-    still = integrate_nominal(lambda x, u: rate(x, u, [0.0]), lambda _: [0.0], t=t, start=[0, 0])
-    found = design(ContinuousTracking(rate, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
+    still = integrate_nominal(
+        lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
+    )
+    found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
     assert found.found.tried.startswith("found with 0.25 R: with R as it is by default")
 
 
