@@ -25,7 +25,7 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
-MEMBERS = ("format", "version", "shape", "gain", "objective", "vector_field", "nominal", "goal",
+MEMBERS = ("format", "version", "shape", "gain", "search_gain", "objective", "vector_field", "nominal", "goal",
            "Q", "R", "limits", "hold", "error", "decay", "push")  # fmt: skip
 
 
@@ -51,6 +51,7 @@ class FunnelProblem:
     error: FloatArray | None = None
     decay: float | None = None
     push: MeasuredPush | None = None
+    search_gain: bool | None = None
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -60,6 +61,7 @@ class FunnelProblem:
             "version": files.VERSION,
             "shape": self.shape,
             "gain": self.gain,
+            "search_gain": self.search_gain,
             "objective": self.objective,
             "vector_field": self.field.document(),
             "nominal": {
@@ -104,6 +106,9 @@ class FunnelProblem:
         decay = document.get("decay")
         if decay is not None:
             decay = files.member(document, "decay", (int, float), source=source)
+        search_gain = document.get("search_gain")
+        if search_gain is not None:
+            search_gain = files.member(document, "search_gain", bool, source=source)
         words = {"shape": "rho", "gain": "constant", "objective": "volume"} | document
         return cls(
             field,
@@ -119,6 +124,7 @@ class FunnelProblem:
             _array(document, "error", (field.n,), source),
             decay,
             _push(document, field.n, source),
+            search_gain,
         )
 
     def design(
@@ -134,6 +140,7 @@ class FunnelProblem:
             Q=self.Q,
             R=self.R,
             gain=self.gain,
+            search_gain=self.search_gain,
             limits=self.limits if len(self.limits) else None,
             hold=self.hold,
             error=self.error,

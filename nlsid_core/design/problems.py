@@ -107,7 +107,8 @@ class ContinuousTracking:
     that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
     R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
     given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
-    knots: "constant", "linear" or "cubic". limits: rows (input, low, high), or one pair (low, high)
+    knots: "constant", "linear" or "cubic". search_gain: whether K is then changed so that V falls faster,
+    with no larger inputs at the knots (None: where inputs are held). limits: rows (input, low, high), or one pair (low, high)
     for each input, at which inputs saturate; the proof then covers every mode of them.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
@@ -131,6 +132,7 @@ class ContinuousTracking:
     Q: ArrayLike | None = None
     R: ArrayLike | None = None
     gain: str = "constant"
+    search_gain: bool | None = None
     limits: ArrayLike | None = None
     uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None

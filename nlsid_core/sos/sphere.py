@@ -147,6 +147,10 @@ class SphereProgram:
             centred=found.centred,
         )
 
+    def orthonormal(self) -> FloatArray:
+        """(N, k) combinations of v at the points, of which the mean of squares and products is I."""
+        return np.asarray(np.linalg.qr(self._V)[0] * np.sqrt(len(self.points)))
+
     def gram(self, solution: SphereSolution) -> FloatArray:
         """(k, k) Gram matrix of the solution in the monomials `basis`."""
         Q = self._whiten.T @ solution.X @ self._whiten

@@ -16,17 +16,23 @@ from nlsid_core.design.continuous.counterexample import try_to_miss
 from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
 from nlsid_core.design.continuous.setting import MOST_KNOTS, Goal, Setting, final_level, prepare
-from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape, validity_caps
+from nlsid_core.design.continuous.shape import (
+    enlarge_shape,
+    refuse_shape,
+    solve_ends,
+    validity_caps,
+)
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
-from nlsid_core.dynamics import Nominal, VectorField
+from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.dynamics.taylor import field_of
-from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.factor import refuse_unmonitorable
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -34,6 +40,7 @@ from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
 HALVINGS = 6  # of intervals where P is far from linear
+PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
 FINER = ("knots", "remainder")  # what is less where knots are closer
@@ -83,6 +90,7 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
+    search_gain: bool | None = None,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
@@ -98,7 +106,7 @@ def design_funnel(
     """
     started = time.perf_counter()
     prepared = partial(
-        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, limits=limits,
+        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain, limits=limits,
         uncertain=uncertain, hold=hold, error=error, decay=decay,
     )  # fmt: skip
     setting = prepared(nominal)
@@ -309,18 +317,14 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
     """
-    steps, policy, P = setting.steps, setting.policy, setting.P
-    if setting.expansion is not None:
-        search = partial(_expanded, setting, progress)
-        first = proved_for(setting, setting.rho_final, search)
-        if setting.hold is None:
-            return first
-        expansion = setting.expansion
-        setting, free = replace(first[0], expansion=None, needed=first[3]), first[1].rho
-    elif setting.hold is None:
-        return _swept(setting, validity_caps(steps.field, policy, P), progress)
-    else:
-        expansion, free = None, _free(setting, progress)
+    first = _unheld(setting, progress)
+    if setting.searches_gain:
+        first = _with_faster_gain(setting, first, progress)
+    if setting.hold is None:
+        return first
+    found, funnel, _, needed = first
+    expansion, free = setting.expansion, funnel.rho
+    setting = replace(found, expansion=None, needed=needed)
     setting, hold = replace(setting, free=free), setting.hold
     assert hold is not None
     span = float(setting.policy.t[-1] - setting.policy.t[0])
@@ -407,16 +411,31 @@ def _held(
     ) from refusal
 
 
-def _free(setting: Setting, progress: Progress) -> FloatArray:
-    """ρ (K,) as it is found if nothing is held."""
-    steps, policy, P = setting.steps, setting.policy, setting.P
-    caps = validity_caps(steps.field, policy, P)
-    rho_final = min(setting.rho_final, float(caps[-1]))
-    rho, _ = sweep_rho(
-        steps, sections(steps, policy, P), margin=setting.margin(rho_final),
-        rho_final=rho_final, caps=caps, progress=progress,
-    )  # fmt: skip
-    return rho
+def _unheld(setting: Setting, progress: Progress) -> _Found:
+    """The funnel if nothing is held."""
+    if setting.expansion is not None:
+        return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
+    caps = validity_caps(setting.steps.field, setting.policy, setting.P)
+    return _swept(setting, caps, progress)
+
+
+def _with_faster_gain(setting: Setting, first: _Found, progress: Progress) -> _Found:
+    """What is found with the gains of a gain step from `first`, where that is larger."""
+    found, funnel, *_ = first
+    ends = solve_ends(found.steps, found.policy, funnel)
+    try:
+        K = faster_gain(found.steps, found.policy, funnel, ends)
+    except SolverError:  # then the gains stay what they are
+        return first
+    before = setting.policy.K.control
+    for part in PARTS:
+        gain = PiecewisePolynomial(funnel.t, before + part * (K - before))
+        other = replace(setting, policy=replace(setting.policy, K=gain))
+        with suppress(Infeasible, DataError):
+            second = _unheld(other, progress)
+            if second[1].volume_integral() > funnel.volume_integral():
+                return second
+    return first
 
 
 def _swept(setting: Setting, caps: FloatArray, progress: Progress) -> _Found:

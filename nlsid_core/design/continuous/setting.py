@@ -13,6 +13,7 @@ from scipy.linalg import solve_continuous_are
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.expansion import Expansion, NoExpansion
+from nlsid_core.design.continuous.gain import unchanged_gain
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     MAX_DEGREE,
@@ -59,7 +60,8 @@ class Setting:
     """L-steps of the dynamics, policy, P(t) (K, n, n), the goal, and the largest ρ(t_f) in it.
 
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
-    hold: how the input that is applied may differ from the policy's; None if it may not. rates:
+    hold: how the input that is applied may differ from the policy's; None if it may not.
+    searches_gain: whether gains are looked for with which the funnel is larger. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
     (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved. free:
     (K,) ρ as it was found without the hold, of which nothing may be proved.
@@ -73,6 +75,7 @@ class Setting:
     weights: tuple[FloatArray, FloatArray]
     expansion: Expansion | None = None
     hold: Hold | None = None
+    searches_gain: bool = False
     rates: FloatArray | None = None
     needed: float = 0.0
     free: FloatArray | None = None
@@ -117,6 +120,7 @@ def prepare(
     Q: ArrayLike | None,
     R: ArrayLike | None,
     gain: str,
+    search_gain: bool | None = None,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
@@ -137,7 +141,7 @@ def prepare(
     Q = definite(weights[0] if Q is None else Q, field.n, "Q", strict=False)
     R = definite(weights[1] if R is None else R, field.m, "R", strict=True)
     gain = "linear" if hold is not None and gain == "constant" else gain  # it may not jump
-    tracking = _tracking(field, nominal, wanted, policy, Q, R, gain)
+    given, tracking = policy is not None, _tracking(field, nominal, wanted, policy, Q, R, gain)
     policy, S = tracking.policy, tracking.S
     if limits is not None:
         policy = replace(policy, limits=limits_of(limits, field.m))
@@ -150,7 +154,11 @@ def prepare(
     if held is not None:
         held.refuse(field, policy)
     rho_final, target = final_level(steps, policy, S, wanted, expansion)
-    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held)
+    why = unchanged_gain(field, policy, given=given)
+    if search_gain and why:
+        raise DataError(f"no other gains are looked for: {why}")
+    searches = not why and (held is not None if search_gain is None else search_gain)
+    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held, searches)
 
 
 def default_weights(
