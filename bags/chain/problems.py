@@ -25,8 +25,8 @@ from nlsid_core.errors import DocumentError
 from nlsid_core.progress import Progress, silent
 
 FORMAT = "nlsid/funnel_problem"
-MEMBERS = ("format", "version", "shape", "gain", "search_gain", "objective", "vector_field", "nominal", "goal",
-           "Q", "R", "limits", "hold", "error", "decay", "push")  # fmt: skip
+MEMBERS = ("format", "version", "shape", "gain", "search_gain", "objective", "vector_field",
+           "nominal", "goal", "Q", "R", "limits", "hold", "error", "decay", "push")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class FunnelProblem:
     error: FloatArray | None = None
     decay: float | None = None
     push: MeasuredPush | None = None
-    search_gain: bool | None = None
+    search_gain: bool = False
 
     def document(self) -> Json:
         """The JSON form; every number round-trips exactly."""
@@ -106,10 +106,8 @@ class FunnelProblem:
         decay = document.get("decay")
         if decay is not None:
             decay = files.member(document, "decay", (int, float), source=source)
-        search_gain = document.get("search_gain")
-        if search_gain is not None:
-            search_gain = files.member(document, "search_gain", bool, source=source)
-        words = {"shape": "rho", "gain": "constant", "objective": "volume"} | document
+        usual = {"shape": "rho", "gain": "constant", "search_gain": False, "objective": "volume"}
+        words = usual | document
         return cls(
             field,
             Nominal(*parts),
@@ -124,7 +122,7 @@ class FunnelProblem:
             _array(document, "error", (field.n,), source),
             decay,
             _push(document, field.n, source),
-            search_gain,
+            files.member(words, "search_gain", bool, source=source),
         )
 
     def design(

@@ -107,9 +107,9 @@ class ContinuousTracking:
     that the closed loop keeps at the end). policy: None is a time-varying LQR with Q (n, n) and
     R (m, m) (None: on the goal's scale, see `default_weights`), and P(t) its cost-to-go; for a
     given policy P(t) solves the Lyapunov equation with Q. gain: how the LQR's K varies between
-    knots: "constant", "linear" or "cubic". search_gain: whether K is then changed so that V falls faster,
-    with no larger inputs at the knots (None: where inputs are held). limits: rows (input, low, high), or one pair (low, high)
-    for each input, at which inputs saturate; the proof then covers every mode of them.
+    knots: "constant", "linear" or "cubic". search_gain: whether K is then changed so that V falls
+    faster, with inputs that are no larger at the knots. limits: rows (input, low, high), or one
+    pair (low, high) for each input, at which inputs saturate; the proof then covers every mode.
 
     hold: s, how old the input that is applied may be: the time between samples, and any delay
     ("largest": the longest that is found to be provable, to a factor √2; None: the policy is
@@ -132,7 +132,7 @@ class ContinuousTracking:
     Q: ArrayLike | None = None
     R: ArrayLike | None = None
     gain: str = "constant"
-    search_gain: bool | None = None
+    search_gain: bool = False
     limits: ArrayLike | None = None
     uncertain: ArrayLike | None = None
     hold: float | Literal["largest"] | None = None

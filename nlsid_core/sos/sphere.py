@@ -148,7 +148,7 @@ class SphereProgram:
         )
 
     def orthonormal(self) -> FloatArray:
-        """(N, k) combinations of v at the points, of which the mean of squares and products is I."""
+        """(N, k) combinations of v at the points, orthonormal in the mean over them."""
         return np.asarray(np.linalg.qr(self._V)[0] * np.sqrt(len(self.points)))
 
     def gram(self, solution: SphereSolution) -> FloatArray:

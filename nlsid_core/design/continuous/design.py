@@ -90,7 +90,7 @@ def design_funnel(
     Q: ArrayLike | None = None,
     R: ArrayLike | None = None,
     gain: str = "constant",
-    search_gain: bool | None = None,
+    search_gain: bool = False,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
@@ -106,8 +106,8 @@ def design_funnel(
     """
     started = time.perf_counter()
     prepared = partial(
-        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain, limits=limits,
-        uncertain=uncertain, hold=hold, error=error, decay=decay,
+        prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain,
+        limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,
     )  # fmt: skip
     setting = prepared(nominal)
     if decay is not None:
@@ -317,14 +317,16 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
     Those hold in a funnel found without a hold, or in a part of it: below, ρ is found with it.
     """
-    first = _unheld(setting, progress)
-    if setting.searches_gain:
-        first = _with_faster_gain(setting, first, progress)
-    if setting.hold is None:
-        return first
-    found, funnel, _, needed = first
-    expansion, free = setting.expansion, funnel.rho
-    setting = replace(found, expansion=None, needed=needed)
+    expansion = setting.expansion
+    if setting.hold is None or expansion is not None or setting.searches_gain:
+        first = _unheld(setting, progress)
+        if setting.searches_gain:
+            first = _with_faster_gain(setting, first, progress)
+        if setting.hold is None:
+            return first
+        setting, free = replace(first[0], expansion=None, needed=first[3]), first[1].rho
+    else:
+        free = _free(setting, progress)
     setting, hold = replace(setting, free=free), setting.hold
     assert hold is not None
     span = float(setting.policy.t[-1] - setting.policy.t[0])
@@ -409,6 +411,18 @@ def _held(
         "hold (hold='largest' finds one), a smoother plan, a larger goal, or Q and R that decay "
         f"faster ({refusal})"
     ) from refusal
+
+
+def _free(setting: Setting, progress: Progress) -> FloatArray:
+    """ρ (K,) as it is found if nothing is held."""
+    steps, policy, P = setting.steps, setting.policy, setting.P
+    caps = validity_caps(steps.field, policy, P)
+    rho_final = min(setting.rho_final, float(caps[-1]))
+    rho, _ = sweep_rho(
+        steps, sections(steps, policy, P), margin=setting.margin(rho_final),
+        rho_final=rho_final, caps=caps, progress=progress,
+    )  # fmt: skip
+    return rho
 
 
 def _unheld(setting: Setting, progress: Progress) -> _Found:

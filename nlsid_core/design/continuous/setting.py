@@ -120,7 +120,7 @@ def prepare(
     Q: ArrayLike | None,
     R: ArrayLike | None,
     gain: str,
-    search_gain: bool | None = None,
+    search_gain: bool = False,
     limits: ArrayLike | None = None,
     uncertain: ArrayLike | None = None,
     hold: float | Literal["largest"] | None = None,
@@ -154,11 +154,10 @@ def prepare(
     if held is not None:
         held.refuse(field, policy)
     rho_final, target = final_level(steps, policy, S, wanted, expansion)
-    why = unchanged_gain(field, policy, given=given)
-    if search_gain and why:
+    why = unchanged_gain(field, policy, given=given) if search_gain else ""
+    if why:
         raise DataError(f"no other gains are looked for: {why}")
-    searches = not why and (held is not None if search_gain is None else search_gain)
-    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held, searches)
+    return Setting(steps, policy, S, rho_final, target, (Q, R), expansion, held, search_gain)
 
 
 def default_weights(
