@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from nlsid_core.data.trajectory import Dataset
-from nlsid_core.errors import OptionError, SolverError
+from nlsid_core.errors import Infeasible, OptionError, SolverError
 from nlsid_core.identification.fit import Candidate, History, Step
 from nlsid_core.identification.methods import LeastSquares, Rie
 from nlsid_core.identification.noise import Noise
@@ -59,12 +59,16 @@ def fit_in_turn(
     fitted, judged = (train, task.validation) if task.validation else hold_out(train)
     found = white if fitted is train else search(fitted, alone, None).candidates[0]
     steps = [Step("noise taken as white", simulation_percent(found.model, judged))]
+    said = "held-back error [%]"
     try:
         noise = _noise(found.model, fitted, lags)
         while len(steps) <= ROUNDS:
             found = again(fitted, noise)
             error = simulation_percent(found.model, judged)
             if found.proof is None or error > WORSE * steps[0].value:
+                refused = "is not proved" if found.proof is None else f"has {error:.4g} %"
+                how = "white" if len(steps) == 1 else "estimated before"
+                said = f"noise taken as {how}: the next model {refused}; {said}"
                 break
             steps.append(Step(f"noise as the residual shows it, {len(steps)}", error))
             last, noise = noise, _noise(found.model, fitted, lags)
@@ -73,10 +77,12 @@ def fit_in_turn(
         chosen = white
         for _ in steps[1:]:
             chosen = again(train, _noise(chosen.model, train, lags))
+        if chosen.proof is None and white.proof is not None:
+            raise Infeasible("the model with coloured noise has no proof")
     except SolverError as reason:
         log.warning("the noise is taken as white: %s", reason)
         return trail
-    trail.history = History("held-back error [%], noise white, then coloured", tuple(steps))
+    trail.history = History(said, tuple(steps))
     trail.candidates = [chosen if c is white else c for c in trail.candidates]
     return trail
 

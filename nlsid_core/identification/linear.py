@@ -34,9 +34,9 @@ class LinearClass:
     """Linear difference equations of one input and one output. Source: thesis (4.1).
 
     lags: n of both, 1 to 100 samples. noise_lags: samples over which the noise of the output is
-    correlated, 0 to 200; above 0 the error is weighted by what the residual shows of it, if that
-    helps on validation trials. Raises OptionError, which names an option, its value and what is
-    allowed, as every model class does.
+    correlated, 0 to 200; above 0 the error is weighted by what the residual shows of it, unless
+    that raises the simulation error of validation trials. Raises OptionError, which names an
+    option, its value and what is allowed, as every model class does.
     """
 
     lags: int

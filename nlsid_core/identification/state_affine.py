@@ -43,7 +43,7 @@ class StateAffineClass:
     input_range: (low, high) of each input in its unit, where the model is proved (None: the range
     in the data). on_out_of_range: what the model does with an input beyond it, "clip" or "refuse".
     weights: of the squared error of each output in units of its spread, above 0 (None: all equal).
-    noise_lags: as of `LinearClass`, each output's noise by itself.
+    noise_lags: samples over which the noise of each output is correlated, as of `LinearClass`.
     """
 
     lags: int
