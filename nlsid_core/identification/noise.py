@@ -53,4 +53,5 @@ class Noise:
 
 def _products(residuals: Sequence[FloatArray], k: int) -> FloatArray:
     """(n_y,): Σ r(t) r(t - k) over all trials."""
-    return np.sum([np.sum(r[k:] * r[: len(r) - k], axis=0) for r in residuals], axis=0)
+    parts = [np.sum(r[k:] * r[: len(r) - k], axis=0) for r in residuals]
+    return np.asarray(np.sum(parts, axis=0))

@@ -31,16 +31,17 @@ def recorded(seed: int, *, pole: float, samples: int = 1500, name: str = "run") 
     return Trajectory(t=1.0 * np.arange(samples), y=y + noise, u=u, name=name)
 
 
-def fitted(train: Dataset, noise_lags: int, **options: Dataset) -> FloatArray:
+def fitted(train: Dataset, noise_lags: int, *, validation: Dataset | None = None) -> FloatArray:
     model_class = LinearClass(2, noise_lags=noise_lags)
-    model = identify(train, model_class, method=RSE, comparators=(), **options).model
+    found = identify(train, model_class, method=RSE, comparators=(), validation=validation)
+    model = found.model
     return np.concatenate([model.a, model.b])
 
 
 def test_a_covariance_is_toeplitz_in_each_trial_and_each_output_and_zero_between() -> None:
     first, second = np.array([1.0, 0.5, 0.2]), np.array([1.0, -0.4, 0.1])
     noise = Noise(np.array([first, second]))
-    found = sparse(noise.covariance(np.array([0, 1, 2, 3, 0, 1]))).toarray()
+    found = sparse(noise.covariance(np.array([0.0, 1.0, 2.0, 3.0, 0.0, 1.0]))).toarray()
     wanted = np.zeros((12, 12))
     for output, values in enumerate((first, second)):
         whole = toeplitz(np.r_[values, 0.0])
@@ -61,7 +62,7 @@ def test_the_correlation_of_a_residual_is_that_of_its_noise_and_gives_a_definite
     x = near / (lags + 1)
     np.testing.assert_allclose(found[near], 0.8**near * (1 - 6 * x**2 * (1 - x)), atol=0.03)
     short = Noise.of([run[:60] for run in runs], lags)  # few samples, and still definite
-    covariance = sparse(short.covariance(np.arange(200))).toarray()
+    covariance = sparse(short.covariance(np.arange(200.0))).toarray()
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     with pytest.raises(SolverError, match="residual of an output is zero"):
         Noise.of([np.zeros((50, 1))], 5)
@@ -118,10 +119,11 @@ def test_coefficients_are_as_good_as_those_of_maximum_likelihood(pole: float, ga
             return np.asarray(lfilter([1.0, -p[5]], [1.0], left)[5:])
 
         likely = least_squares(innovations, np.r_[TRUE, 0.5], x_scale="jac").x[:5]
-        errors["likelihood"].append(np.linalg.norm(likely - TRUE))
-        errors["white"].append(np.linalg.norm(fitted(Dataset((trial,)), 0) - TRUE))
-        errors["coloured"].append(np.linalg.norm(fitted(Dataset((trial,)), 10) - TRUE))
-    rms = {name: float(np.sqrt(np.mean(np.square(found)))) for name, found in errors.items()}
+        train = Dataset((trial,))
+        found = {"likelihood": likely, "white": fitted(train, 0), "coloured": fitted(train, 10)}
+        for name, coefficients in found.items():
+            errors[name].append(float(np.linalg.norm(coefficients - TRUE)))
+    rms = {name: float(np.sqrt(np.mean(np.square(off)))) for name, off in errors.items()}
     assert rms["coloured"] < rms["white"] / gain
     assert rms["coloured"] < 1.05 * rms["likelihood"]
 
