@@ -225,7 +225,7 @@ class Prepared:
             crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
             at = first.offset - first.record
             content = uncompressed(replace(first, crc=crc), header[at : at + first.size])
-            return content, offsets, _sorted(*offsets.values(), [len(content)])
+            return content, offsets, _sorted(*offsets.values(), np.array([len(content)]))
         here = slice(*np.searchsorted(self._runs[0], (first.offset, last.offset + last.size)))
         starts, ends = (places[here] for places in self._runs)
         after = np.cumsum(ends - starts)
@@ -327,6 +327,6 @@ class Prepared:
         return found
 
 
-def _sorted(*places: Any) -> IntArray:
-    """All of them in order, each once."""
-    return np.unique(np.concatenate([np.empty(0, np.int64), *places]).astype(np.int64))
+def _sorted(*places: IntArray) -> IntArray:
+    """All of them in order."""
+    return np.sort(np.concatenate(places)) if places else np.empty(0, np.int64)
