@@ -341,7 +341,7 @@ class Writer:
 
     def composition(self, problem: Composition) -> None:
         """What the theorem is about, stage by stage, and what is used to decide it."""
-        to, parts = self.to, ("field", "policy", "funnel", "goal")
+        to, parts = self.to, ("field", "policy", "funnel", "goal", "decay")
         stages, proofs = [], []
         for i, stage in enumerate(problem.stages, start=1):
             to.mark = f"stage{i}_"
@@ -397,7 +397,7 @@ class Writer:
         return to.listed(to.named(f"{name}_{k}", row) for k, row in enumerate(rows))
 
     def problem(self, problem: Funnel) -> None:
-        """What the theorem is about: field, policy, funnel, goal."""
+        """What the theorem is about: field, policy, funnel, goal, decay."""
         to, policy, funnel = self.to, problem.policy, problem.funnel
         to.named("field", self.field(problem.field))
         limits = (
@@ -418,6 +418,9 @@ class Writer:
             stated = problem.claim["goal"]
             goal = to.pair(self.nums(stated["centre"]), self.matrix(stated["P"]))
         to.named("goal : option (list num * list (list num))", to.maybe(goal))
+        stated = problem.claim.get("decay")
+        decay = self.ends([stated["rate"], stated["floor"]]) if stated else None
+        to.named("decay : option (num * num)", to.maybe(decay))
 
     def by_interval(self, name: str, problem: Funnel, entries: list[Any], made: Any) -> str:
         """Pieces of each interval, in the order in which they begin."""
@@ -456,7 +459,7 @@ class Writer:
         bases = [self.monomials(proof.get(name, [])) for name in names]
         pushed = "true" if "kappa" in proof else "false"
         least = self.num(proof.get("goal_multiplier", 0))
-        return to.made("Witness", self.num(proof["margin"]), *bases, pieces, pushed, least)
+        return to.made("Witness", self.num(proof.get("margin", 1)), *bases, pieces, pushed, least)
 
     def piece(self, piece: dict[str, Any], kappa: list[Any]) -> str:
         """One part of time, at a vertex and in a mode."""
@@ -488,25 +491,28 @@ class Writer:
 
 
 THEOREM = """\
-Definition data := stated field policy funnel goal.
-Theorem accepted : files_ok field policy funnel goal proof = true.
+Definition data := stated field policy funnel goal decay.
+Theorem accepted : files_ok field policy funnel goal decay proof = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
 Theorem funnel_stays : forall x, solution data x ->
   forall ta, (begin data <= ta <= finish data)%R -> inside data x ta ->
   (forall t, (ta <= t <= finish data)%R -> inside data x t /\\ in_bounds data x t) /\\
-  in_goal data x.
-Proof. exact (funnel_theorem field policy funnel goal proof accepted). Qed.
+  in_goal data x /\\ decays data x ta.
+Proof. exact (funnel_theorem field policy funnel goal decay proof accepted). Qed.
 Print Assumptions funnel_stays.
 """
 HELD = """\
-Definition data := stated field policy funnel goal.
-Theorem accepted : held_files_ok field policy funnel goal period errors proof rates turns = true.
+Definition data := stated field policy funnel goal decay.
+Theorem accepted :
+  held_files_ok field policy funnel goal decay period errors proof rates turns = true.
 Proof. vm_cast_no_check (eq_refl true). Qed.
 Theorem held_stays : forall since x u, held_solution data period errors since x u ->
   (begin data <= since <= finish data)%R -> inside data x since ->
   (forall t, (since <= t <= finish data)%R -> inside data x t /\\ held_in_bounds data x u t) /\\
-  in_goal data x.
-Proof. exact (held_theorem field policy funnel goal period errors proof rates turns accepted). Qed.
+  in_goal data x /\\ decays data x since.
+Proof.
+  exact (held_theorem field policy funnel goal decay period errors proof rates turns accepted).
+Qed.
 Print Assumptions held_stays.
 """
 NEAR = """\
@@ -596,8 +602,8 @@ def trees(writer: Writer, problem: Increments) -> list[str]:
 
 
 ASKED = {
-    "held": "field policy funnel goal period errors proof rates turns",
-    "funnel": "field policy funnel goal proof",
+    "held": "field policy funnel goal decay period errors proof rates turns",
+    "funnel": "field policy funnel goal decay proof",
     "plan": "data tubes proofs a b b0 feedback",
     "tube": "data tubes proofs",
     "stability": "data storage rate proof",

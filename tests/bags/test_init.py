@@ -19,13 +19,16 @@ from typer.testing import CliRunner
 from bags.chain.config import load_config
 from bags.chain.training import decoded
 from bags.commands.cli import app
+from bags.commands.init import said_briefly
 from bags.designs import documents
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
+from bags.setup.proposal import Proposal
 from bags.setup.proposing import choose
+from bags.setup.written import yaml_text
 from bags.tools.fitness import check_fitness
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
@@ -403,10 +406,11 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     assert float(expected[2]) == pytest.approx(spread, rel=5e-3), "run_1 was held back"
 
 
-def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: Path) -> None:
+def two_axes(folder: Path) -> None:
+    """Two numbers that each follow a command of their own, and one that stands still."""
     rng = np.random.default_rng(7)
     kind, number = "std_msgs/msg/Float64", standard_types().types["std_msgs/msg/Float64"]
-    with BagWriter(tmp_path / "bag") as writer:
+    with BagWriter(folder) as writer:
         y, u = np.zeros(2), np.zeros(2)
         for k in range(400):
             u = rng.uniform(-1.0, 1.0, 2) if k % 20 == 0 else u
@@ -416,11 +420,44 @@ def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: 
                 data = bytes(standard_types().serialize_cdr(number(value), kind))
                 stamp = START_NS + k * 100_000_000
                 writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+
+
+def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: Path) -> None:
+    two_axes(tmp_path / "bag")
     found = look([tmp_path / "bag"])
     named = ["/speed_b:data", "/speed_a:data"]
     assert choose(found, named) == (named, ["/cmd_b:data", "/cmd_a:data"])
     with pytest.raises(BagError, match="/speed_c:data follows no command"):
         choose(found, ["/speed_c:data"])
+
+
+def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(tmp_path: Path) -> None:
+    bag, config = tmp_path / "bag", tmp_path / "robot.yaml"
+    two_axes(bag)
+    said = nlsid("init", bag, "--yes", "--out", config)
+    [chosen] = load_config(config).signals.response
+    other = "b" if chosen.path.startswith("/speed_a") else "a"
+    assert f"there are others like it: /speed_{other}:data follows /cmd_{other}:data (+" in said
+    options = "-y '/speed_a:data' -y '/speed_b:data' -u '/cmd_a:data' -u '/cmd_b:data'"
+    assert f"run init with {options}." in said
+
+
+def test_many_bags_are_said_as_their_folder_or_a_pattern(tmp_path: Path) -> None:
+    bags = [tmp_path / f"run_{k}" for k in range(4)]
+    for bag in bags:
+        two_axes(bag)
+    assert said_briefly(bags) == str(tmp_path)
+    assert said_briefly([tmp_path]) == str(tmp_path)
+    assert said_briefly(bags[:2]) == f"{bags[0]} {bags[1]}"
+    two_axes(tmp_path / "other")
+    assert said_briefly(bags) == f"{tmp_path}/run_*"
+    assert said_briefly([*bags[1:], tmp_path / "other"]) == "BAGS"
+
+
+def test_units_keep_their_letters_at_the_head_of_the_file() -> None:
+    proposal = Proposal({}, error=3.0, varies=", in which T varies by 10.5 degC, rms")
+    said = "# Expect 3 % error in simulation (of trials held back, in which T varies by 10.5 degC"
+    assert said in yaml_text(proposal)
 
 
 def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
