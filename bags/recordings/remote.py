@@ -508,4 +508,4 @@ def _short(error: BaseException) -> str:
     for name, value in os.environ.items():
         if len(value) >= SHORTEST_SECRET and re.search("KEY|SECRET|TOKEN|PASSWORD", name):
             line = line.replace(value, "...")
-    return f"{type(error).__name__}: {_SECRET.sub('...', line)}"
+    return f"{type(error).__name__}: {_SECRET.sub('...', line)}".removesuffix(": ")
