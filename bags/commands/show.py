@@ -115,7 +115,7 @@ def gain_lines(found: Gain) -> list[str]:
     bound = f"gain at most {text.above(number)}" if least else (
         f"passivity index at least {text.below(number)}"
     )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model"]
+    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
     if (seen := found.reached) is None:
         lines.append("not compared with simulated runs")
     else:
@@ -128,6 +128,24 @@ def gain_lines(found: Gain) -> list[str]:
         shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
         lines.append(f"{bound}{unit}: {shown}")
     return [*lines, *str(found.verdict).splitlines()]
+
+
+def _gain_conditions(found: Gain) -> str:
+    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
+    outputs, inputs = signals(found.model)
+    scales = [*zip(outputs, found.proof.y_scales, strict=True),
+              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
+    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
+    said = f", {' and '.join(counted)}" if counted else ""
+    if found.proof.box is None:
+        return said
+    ranges = [
+        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
+        f"{signal.unit}".rstrip()
+        for key, group in (("y", outputs), ("u", inputs))
+        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
+    ]
+    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
 
 
 def named_number(given: str) -> tuple[str, float]:
@@ -371,7 +389,8 @@ def replay_lines(replay: Replay) -> Iterator[str]:
     for said in filter(None, (replay.clock, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
     if not replay.judged:
-        yield f"{replay.name}: nothing was judged: {replay.reason}"
+        if not replay.paced:  # said of all such bags together
+            yield f"{replay.name}: nothing was judged: {replay.reason}"
         return
     if replay.starting > len(replay.judged):
         yield (
@@ -386,6 +405,19 @@ def replay_lines(replay: Replay) -> Iterator[str]:
             f"{replay.name}: not judged: {samples} more samples in {len(more)} "
             f"{'place' if len(more) == 1 else 'places'}, the last {more[-1].where}"
         )
+
+
+def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
+    """Once for all bags of which nothing was judged as their samples have another period."""
+    if not (other := [replay for replay in replays if replay.paced]):
+        return
+    named = [f"{replay.name} {replay.paced:.4g} s" for replay in other[:UNJUDGED_SAID]]
+    more = f" and {len(other) - len(named)} more" if len(other) > len(named) else ""
+    bags = "1 bag has samples" if len(other) == 1 else f"{len(other)} bags have samples"
+    yield (
+        f"nothing was judged: {bags} of another period than the model's {other[0].period:g} s: "
+        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs"
+    )
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:

@@ -274,6 +274,7 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert len(errors.collections) == found.trials
 
 
+@pytest.mark.slow
 def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() -> None:
     """Of two outputs; what the monitor says of each alone is counted here by itself."""
     made = follower("two_outputs")

@@ -76,12 +76,11 @@ def whole_way(bags: Path, config: Path, out: Path) -> str:
     return done.output
 
 
+@pytest.mark.slow
+@pytest.mark.pictures
 @pytest.mark.parametrize(
     ("options", "response", "excitation"),
-    [
-        pytest.param((), YAW, "/steering_command:position[name=steering]", marks=pytest.mark.slow),
-        pytest.param(("-u", CMD), SPEED, CMD, marks=pytest.mark.slow),
-    ],
+    [((), YAW, "/steering_command:position[name=steering]"), (("-u", CMD), SPEED, CMD)],
 )
 def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     tmp_path: Path, options: tuple[str, ...], response: str, excitation: str
@@ -108,6 +107,7 @@ def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
     assert max(map(len, lines)) < 160
 
 
+@pytest.mark.slow
 def test_unstamped_commands_are_paired_by_log_times_and_said(tmp_path: Path) -> None:
     """The F1TENTH speed trials with their commands as plain Twist, as nav2 publishes them."""
     bags = [bag for bag in f1tenth() if int(bag.name[-2:]) in (1, 2, 3, 4, 5, 12, 13, 14, 23, 24)]
@@ -166,6 +166,7 @@ def boat(folder: Path, trials: int = 4) -> tuple[Path, Path]:
     return folder / "trials", package
 
 
+@pytest.mark.slow
 def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> None:
     """Neither type nor name says which number drives; the configuration lies elsewhere."""
     bags, package = boat(tmp_path)
@@ -179,6 +180,7 @@ def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> No
     assert "run_3" in whole_way(bags, config, tmp_path / "out"), "the test trial is judged"
 
 
+@pytest.mark.slow
 def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path) -> None:
     types = get_typestore(Stores.ROS1_NOETIC)
     kinds = types.types
@@ -215,6 +217,7 @@ def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path)
     ) == 2, "the test trial alone is monitored"  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pace", "is_said"), [(0.5, True), (1.0, False)])
 def test_simulated_time_at_another_pace_than_the_log_is_said(
     tmp_path: Path, pace: float, is_said: bool
@@ -299,6 +302,7 @@ def test_a_measured_effort_drives_where_nothing_commands() -> None:
     assert excitations == ["/joint_states:effort[name=joint_3]"]
 
 
+@pytest.mark.slow
 def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     nlsid("init", schunk()[0].parent, "--yes", "--out", config)
@@ -309,6 +313,7 @@ def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: P
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     steering = "/steering_command:position[name=steering]"
@@ -324,6 +329,7 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
     config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
@@ -476,6 +482,7 @@ def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -
         choose(look([tmp_path / "bag"]))
 
 
+@pytest.mark.slow
 def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None:
     """Degrees that begin again at 360, without a unit in the type."""
     rng = np.random.default_rng(3)
@@ -500,6 +507,7 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
     assert "if a trial begins near half a turn" in said
 
 
+@pytest.mark.slow
 def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
     """A publisher that does not fill them in: identification would refuse them."""
     rng = np.random.default_rng(4)
@@ -514,6 +522,7 @@ def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
     assert "/odom (nav_msgs/msg/Odometry) has header stamps that are all 0" in said
 
 
+@pytest.mark.slow
 def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(
     tmp_path: Path,
 ) -> None:
@@ -552,6 +561,7 @@ def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
         look([still])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
     """A real pseudo-terminal: the second command, then what follows it best."""
@@ -581,6 +591,7 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
         ("cougars_auv/SO_lastbag_mcap", 24.0),
     ],
 )
+@pytest.mark.pictures
 def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seconds: float) -> None:
     """Each is one recording, which is cut into parts first, as `init` says it should be."""
     bag, parts = SHARED / robot, tmp_path / "parts"
@@ -640,6 +651,7 @@ def heater(folder: Path, *, trials: int, kelvin: int = -1, motions: int = 0) -> 
 SLOW = ("-u", "/power:data", "-y", "/temperature:data")
 
 
+@pytest.mark.slow
 def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Path) -> None:
     bags, config = heater(tmp_path / "bags", trials=5), tmp_path / "robot.yaml"
     said = nlsid("init", bags, "--out", config, *SLOW)
@@ -652,6 +664,7 @@ def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Pa
     assert "run_04" in whole_way(bags, config, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
     bags = heater(tmp_path / "bags", trials=5, kelvin=2)
     said = nlsid("init", bags, "--out", tmp_path / "robot.yaml", *SLOW)
@@ -659,6 +672,7 @@ def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
     assert "mind: run_02: temperature is 29" in said
 
 
+@pytest.mark.slow
 def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None:
     """Two motions in turn, ten bags: every fifth by name would test one of them twice as often."""
     bags, config = heater(tmp_path / "bags", trials=10, motions=2), tmp_path / "robot.yaml"

@@ -53,6 +53,7 @@ def test_what_is_used_is_the_most_that_a_sample_used(last: float) -> None:
     assert np.isnan(replay().assumption)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "method"), [(MonotoneClass(1, delays=(1,)), CertifiedSem()), (LinearClass(2), Rse())]
 )

@@ -34,6 +34,7 @@ from tests.identified_bags import (
     write_coupled_bags,
     write_saturating_bags,
 )
+from tests.marks import slow_among
 
 RUNS = 6
 
@@ -72,7 +73,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow if n == "cells" else ()) for n in (*ONE, *TWO)],
+    slow_among((*ONE, *TWO), {"cells", "state_affine", "block_cascade", "linear_states"}),
 )
 def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     name: str, one: Path, two: Path, tmp_path: Path

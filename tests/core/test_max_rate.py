@@ -27,6 +27,7 @@ from nlsid_core.identification import (
 )
 from nlsid_core.identification.rates import default_max_rate, searched_rate
 from nlsid_core.models import DifferenceEquation
+from tests.marks import slow_among
 from tests.repeated import CLASS, pair
 
 SAMPLES = 300
@@ -66,7 +67,7 @@ def test_an_integrator_is_answered_by_the_slowest_rate_that_is_allowed(
     assert radii_of(unheard).max() > 0.9975, "the limit is what kept the pole"
 
 
-@pytest.mark.parametrize("rate", [0.7, 0.9])
+@pytest.mark.parametrize("rate", slow_among([0.7, 0.9], {0.7}))
 @pytest.mark.parametrize(
     "method", [Rse(), CertifiedSem(), CertifiedRse(4)], ids=["rse", "sem_certified", "certified"]
 )

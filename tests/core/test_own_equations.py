@@ -38,6 +38,7 @@ def upright(knots: int = 9, seconds: float = 1.0) -> Nominal:
     return integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) -> None:
     code = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)[0]
     told = [float(number) for number in re.findall(r"# \[(.*?)\]", code)[0].split()]
@@ -87,6 +88,7 @@ def test_an_oscillator_without_an_input_is_proved() -> None:
 # -- the motion ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
     end = [np.pi / 2, 0.0]
     limits = [[-14.0, 14.0]]
@@ -110,6 +112,7 @@ def test_a_motion_is_planned_for_the_centre_of_what_is_uncertain() -> None:
             plan_motion(pushed, **ends, m=1, uncertain=box)
 
 
+@pytest.mark.slow
 def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
     def rate(x: Any, u: Any, w: Any) -> list[Any]:
         return [x[1], u[0] - np.sin(x[0]) + w[0]]
@@ -131,6 +134,7 @@ def test_inputs_share_what_they_do_by_the_square_of_their_scale() -> None:
         plan_motion(pendulum, start=[0, 0], end=[1, 0], seconds=1, m=2, scale=[1.0, 0.0])
 
 
+@pytest.mark.slow
 def test_what_is_no_motion_is_not_returned() -> None:
     with pytest.raises(Infeasible, match="more seconds"):
         plan_motion(pendulum, start=[0, 0], end=[3, 0], seconds=1, m=1, limits=[[-1, 1]])
@@ -143,6 +147,7 @@ def test_what_is_no_motion_is_not_returned() -> None:
 # -- goals, limits, weights ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
     widths = np.array([0.2, 0.5])
     P = np.diag(widths**-2)
@@ -172,6 +177,7 @@ def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
         design_funnel(pendulum, upright(), **options)
 
 
+@pytest.mark.slow
 def test_limits_are_pairs_too() -> None:
     found = design_funnel(pendulum, upright(), goal=[0.2, 0.5], limits=[[-6, 6]])
     assert found.policy.limits.tolist() == [[0, -6, 6]]
@@ -191,6 +197,7 @@ def blown(x: Any, u: Any, w: Any) -> Any:
     return [x[1], 9.81 * np.sin(x[0]) + u[0] + w[0]]
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_is_too_strong_is_named() -> None:
     text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
     assert "The diagonal of Q is (2e+04, 3.2e+03) and of R is (50)." in text

@@ -38,6 +38,7 @@ def level(found: FunnelDesign, t: float, X: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ni,ij,nj->n", gap, P, gap) / rho)
 
 
+@pytest.mark.slow
 def test_wind_that_no_cost_to_go_holds_is_held_by_what_it_can_reach() -> None:
     motion = lane_change()
     problem = ContinuousTracking(drifting, motion, goal=[1, 0.3], uncertain=[[-WIND, WIND]])
@@ -63,6 +64,7 @@ def test_wind_that_no_cost_to_go_holds_is_held_by_what_it_can_reach() -> None:
     assert (((X - motion.x(2.0)) / [1, 0.3]) ** 2).sum(axis=1).max() <= 1.0
 
 
+@pytest.mark.slow
 def test_a_wind_that_ends_outside_the_goal_is_refused_with_the_first_reason() -> None:
     problem = ContinuousTracking(drifting, lane_change(), goal=[1, 0.3], uncertain=[[-2, 2]])
     with pytest.raises(Infeasible, match="Because of the disturbance w"):
