@@ -146,7 +146,8 @@ class McapFile:
         if len(blocks) > 1:
             where += f", or of one up to byte {blocks[-1].offset},"
         for channel in channels:
-            if len(found := offsets.get(channel, ())):
+            found = offsets.get(channel)
+            if found is not None and len(found):
                 yield channel, messages_at(buffer, found, channel, where, edges)
 
     def content(self, block: Block) -> bytes:
