@@ -96,6 +96,9 @@ EVERYTHING: dict[str, Any] = {
     "division": lambda x, u: [1 / (4 - x[0]) - u[0] / -(3 + x[0])],
     "powers": lambda x, u: [-(x[0] ** 3) * u[0] + x[0] ** 7 - (2 + x[0]) ** -2],
     "roots": lambda x, u: [np.sqrt(2 + x[0] * u[0]) + (3 + u[0]) ** 0.5 + (3 + x[0]) ** -0.5],
+    "squares": lambda x, u: [
+        np.sqrt(x[0] ** 2 - x[0] + 0.4) + 1 / (u[0] ** 2 + 0.3 - x[0] ** 2 / 9)
+    ],
     "tan": lambda x, u: [np.tan(x[0] / 2) - np.tan(3 + u[0] / 4)],
     "exp": lambda x, u: [np.exp(-x[0] * u[0]) + np.log(2 + x[0])],
     "tanh": lambda x, u: [np.tanh(3 * x[0]) - np.arctan(u[0] + 2 * x[0])],
@@ -116,6 +119,19 @@ def test_every_operation_encloses(name: str, size: float) -> None:
     assert left[0] <= bounds[0] + 1e-13
     if size < 0.1:
         assert bounds[0] < 0.02
+
+
+def test_a_square_is_not_taken_to_be_negative() -> None:
+    for drag in (
+        lambda x, u: [u[0] - x[0] * np.sqrt(x[0] ** 2 + 0.25)],
+        lambda x, u: [u[0] - x[0] / (0.25 + x[0] ** 2)],
+        lambda x, u: [u[0] - np.log(0.25 + (x[0] - 0.3) ** 2)],
+    ):
+        centre, radius = np.array([0.1, 0.0]), np.array([0.7, 1.0])
+        cubics, bounds = expanded(drag, centre, radius, states=1)
+        box = np.array([[0.0, 0.1], *np.stack([centre - radius, centre + radius], axis=1)])
+        left = left_over(drag, cubics, box, 1, 1)
+        assert left[0] <= bounds[0], "x0² + 1/4 is no less than 1/4"
 
 
 def test_time_and_disturbances_are_expanded_too() -> None:
