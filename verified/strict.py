@@ -667,6 +667,8 @@ def flow(files: dict[str, tuple[str, Any]]) -> None:
                     whole(entry, name, -SHIFT, SHIFT)
                 else:
                     wide(entry, name)
+    intervals_with = {piece["interval"] for piece in proof["pieces"]}
+    need(len(intervals_with) == intervals, "an interval without a piece")
     if held:
         rates = matrix(proof["rates"], "rates", intervals, m)
         need(all(rate > 0 for row in rates for rate in row), "rates > 0")

@@ -8,6 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
@@ -43,6 +44,7 @@ what it simulates. residual: coloured (not white), follows the input u, or both,
 at 99 %. rate: proved, a sample; forgets: its time constant. time: of the
 processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
+COLUMNS = 80  # of a terminal that is not asked
 UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 STABILITY = "proved rate a sample (time constant)"
 
@@ -115,7 +117,7 @@ def gain_lines(found: Gain) -> list[str]:
     bound = f"gain at most {text.above(number)}" if least else (
         f"passivity index at least {text.below(number)}"
     )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model"]
+    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
     if (seen := found.reached) is None:
         lines.append("not compared with simulated runs")
     else:
@@ -128,6 +130,24 @@ def gain_lines(found: Gain) -> list[str]:
         shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
         lines.append(f"{bound}{unit}: {shown}")
     return [*lines, *str(found.verdict).splitlines()]
+
+
+def _gain_conditions(found: Gain) -> str:
+    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
+    outputs, inputs = signals(found.model)
+    scales = [*zip(outputs, found.proof.y_scales, strict=True),
+              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
+    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
+    said = f", {' and '.join(counted)}" if counted else ""
+    if found.proof.box is None:
+        return said
+    ranges = [
+        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
+        f"{signal.unit}".rstrip()
+        for key, group in (("y", outputs), ("u", inputs))
+        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
+    ]
+    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
 
 
 def named_number(given: str) -> tuple[str, float]:
@@ -290,7 +310,10 @@ CATCHING_CAPTION = (
 
 
 def _after(caught: Caught) -> str:
-    return "-" if math.isnan(caught.after) else f"{caught.after:.2f}"
+    if math.isnan(caught.after):
+        return "-"
+    digits = next((d for d, least in ((0, 100.0), (1, 10.0)) if caught.after >= least), 2)
+    return f"{caught.after:.{digits}f}"
 
 
 def _soon(caught: Caught) -> str:
@@ -371,7 +394,8 @@ def replay_lines(replay: Replay) -> Iterator[str]:
     for said in filter(None, (replay.clock, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
     if not replay.judged:
-        yield f"{replay.name}: nothing was judged: {replay.reason}"
+        if not replay.paced:  # said of all such bags together
+            yield f"{replay.name}: nothing was judged: {replay.reason}"
         return
     if replay.starting > len(replay.judged):
         yield (
@@ -388,8 +412,24 @@ def replay_lines(replay: Replay) -> Iterator[str]:
         )
 
 
+def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
+    """Once for all bags of which nothing was judged as their samples have another period."""
+    if not (other := [replay for replay in replays if replay.paced]):
+        return
+    named = [f"{replay.name} {replay.paced:.4g} s" for replay in other[:UNJUDGED_SAID]]
+    more = f" and {len(other) - len(named)} more" if len(other) > len(named) else ""
+    bags = "1 bag has samples" if len(other) == 1 else f"{len(other)} bags have samples"
+    yield (
+        f"nothing was judged: {bags} of another period than the model's {other[0].period:g} s: "
+        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs"
+    )
+
+
 def replay_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample."""
+    """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample.
+
+    COLUMNS wide or less: where a row is longer, its words go on in the next line, numbers never.
+    """
     table = Table(
         title="held against the funnel",
         caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
@@ -400,40 +440,38 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         show_edge=False,
         padding=0,
     )
-    for column, justify in (
-        ("bag", "left"),
-        ("verdict", "left"),
-        ("margin", "right"),
-        ("at", "right"),
-        ("axis", "left"),
-        ("used", "right"),
-        ("bad from", "right"),
-        ("judged", "right"),
-    ):
-        folded = column in ("bag", "verdict", "axis", "judged")  # on narrow terminals, never cut
-        width = {"bag": 8, "verdict": 10, "axis": 10}.get(column)
+    rows = [_replay_row(replay) for replay in replays]
+    names = ("bag", "verdict", "margin", "at", "axis", "used", "bad from", "judged")
+    cells = zip(names, *rows, strict=True)
+    widths = [max(len(Text.from_markup(cell)) for cell in column) for column in cells]
+    kept = dict(zip(names, widths, strict=True))
+    if sum(widths) + len(widths) > COLUMNS:
+        kept |= {"verdict": 10, "axis": min(kept["axis"], 10), "judged": 8}
+        kept["bag"] = max(COLUMNS + kept["bag"] - sum(kept.values()) - len(kept), 8)
+    for name in names:
+        left = name in ("bag", "verdict", "axis")
         table.add_column(
-            column,
-            justify=justify,  # type: ignore[arg-type]
-            no_wrap=not folded,
-            overflow="fold",
-            min_width=width,
+            name, justify="left" if left else "right", width=kept[name], overflow="fold"
         )
-    for replay in replays:
-        worst, bad = replay.worst, replay.first_bad
-        colour = COLOURS[replay.verdict]
-        alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
-        table.add_row(
-            replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
-            "-" if worst is None else f"{worst.margin:.3f}",
-            "-" if worst is None else f"{worst.t:.3f} s",
-            "-" if worst is None else worst.worst_axis,
-            "-" if worst is None else _percent(replay.assumption),
-            "-" if bad is None else f"{bad.t:.3f} s",
-            f"{replay.judged_span:.1f} of {replay.span:.1f} s",
-        )
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _replay_row(replay: Replay) -> list[str]:
+    worst, bad = replay.worst, replay.first_bad
+    colour = COLOURS[replay.verdict]
+    alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
+    return [
+        escape(replay.name),
+        f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
+        "-" if worst is None else f"{worst.margin:.3f}",
+        "-" if worst is None else f"{worst.t:.3f} s",
+        "-" if worst is None else escape(worst.worst_axis),
+        "-" if worst is None else _percent(replay.assumption),
+        "-" if bad is None else f"{bad.t:.3f} s",
+        f"{replay.judged_span:.1f} of {replay.span:.1f} s",
+    ]
 
 
 def _percent(part: float) -> str:

@@ -30,6 +30,8 @@ STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
 
+OTHER_PACE: Final = 0.02  # of the period: clocks differ by less
+LEAST_PACED: Final = 3  # samples of which a pace is told
 MOST_WIDE: Final = 0.05  # of the samples: a tube wider than the signal in more is said
 
 
@@ -109,6 +111,18 @@ class Replay:
     def judged_span(self) -> float:
         """S of it that were judged."""
         return min(self.period * len(self.judged), self.span)
+
+    @property
+    def paced(self) -> float:
+        """S between samples, the median, where nothing was judged and it is not the period; else 0.
+
+        A sample is judged only on the grid of the period.
+        """
+        stamps = [reading.t for reading in self.readings if reading.reason != LOST]
+        if self.judged or len(stamps) < LEAST_PACED or not self.period:
+            return 0.0
+        pace = float(np.median(np.diff(stamps)))
+        return pace if abs(pace - self.period) > OTHER_PACE * self.period else 0.0
 
     @property
     def fans(self) -> list[list[Forecasted]]:
@@ -245,6 +259,8 @@ class Replay:
         """Why it is not inside; empty if it is."""
         if self.first_bad is not None:
             return self.first_bad.reason
+        if self.paced:
+            return f"its samples come every {self.paced:.4g} s, the model's every {self.period:g} s"
         if self.unjudged:
             return self.unjudged[0].reasons[0]
         return "" if self.judged or not self.readings else self.readings[-1].reason

@@ -16,7 +16,7 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags, read_trials
 from bags.chain.training import load_training
 from bags.commands.cli import app
-from bags.commands.show import replay_lines
+from bags.commands.show import paced_lines, replay_lines
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
@@ -368,6 +368,26 @@ def test_the_stretches_that_were_not_judged_begin_and_end(chain: Path) -> None:
     assert second.why == "6 samples are missing; then no speed at t = 2 s"
     left = found.span - found.judged_span
     assert left == first.samples + second.samples == 11
+
+
+def test_bags_of_another_period_are_said_once_with_both_periods(chain: Path) -> None:
+    whole = replay(chain, trial("05"))
+    off = whole.readings[-1]._replace(status=Status.UNKNOWN, reason="off the grid")
+    slow = [
+        replace(
+            whole,
+            name=f"slow_{k}",
+            readings=tuple(off._replace(t=1.2 * whole.period * i) for i in range(20)),
+        )
+        for k in range(5)
+    ]
+    assert slow[0].paced == pytest.approx(1.2 * whole.period)
+    assert slow[0].reason == "its samples come every 0.03 s, the model's every 0.025 s"
+    assert not any(replay_lines(slow[0]))
+    [said] = paced_lines([whole, *slow])
+    assert "5 bags have samples of another period than the model's 0.025 s: " in said
+    assert "slow_0 0.03 s, slow_1 0.03 s, slow_2 0.03 s and 2 more;" in said
+    assert (whole.paced, list(paced_lines([whole]))) == (0.0, [])
 
 
 def test_a_recording_that_hardly_outlasts_the_start_says_how_little_was_judged(

@@ -1,5 +1,6 @@
 """Running against tubes around a model's simulation: for ever, over gaps, several at once."""
 
+import re
 import sys
 import time
 import tracemalloc
@@ -21,6 +22,7 @@ from nlsid_core.models import BlockCascade
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stepping import Stepper
+from nlsid_core.running.tubes import WATCHED
 from tests import implicit_models
 from tests.core.kernel.tube_claims import LONG, MODELS, dataset, design, recorded
 from tests.marks import slow_among
@@ -111,7 +113,32 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
         reading = run(Monitor(made.model, None, wide), replace(trial, y=y))[k]
         assert reading.status is status
         assert ("one sample's innovation energy" in reading.reason) == (part > 1.0)
+        assert (f"assumed ({WATCHED})," in reading.reason) == (part > 1.0)
         assert reading.assumption >= part**2 * (1.0 - 1e-6)
+
+
+def test_a_reason_has_units_and_says_what_the_tube_does_not_rest_on() -> None:
+    made, trial = design("linear"), trial_of("linear")
+    [signal] = monitor_of("linear")._tubes._stepper.y
+    tube, response = made.funnel.tubes[0], made.funnel.response
+    assert tube.peak is not None
+    assert response is not None
+    y = trial.y.copy()
+    y[60:] += 3.0 * response.half_widths
+    unit = signal.unit
+    bad = [r for r in run(monitor_of("linear"), replace(trial, y=y)) if r.reason and r.t > 0.0]
+    energies = [r.reason for r in bad if "above the level" in r.reason]
+    number = r"[-+.\de]+"
+    squared = re.escape(f" ({unit})²")
+    assert re.search(
+        f"energy {number}{squared} above the level {number}{squared} at t", energies[0]
+    )
+    wide = replace(tube, level=1e6 * tube.level, peak=replace(tube.peak, level=1e6))
+    alone = Monitor(made.model, None, replace(made.funnel, tubes=(wide,), cusum=None))
+    reasons = [r.reason for r in run(alone, replace(trial, y=y))]
+    beside = next(reason for reason in reasons if "from the simulation" in reason)
+    said = f"is {number} {re.escape(unit)} from the simulation, above {number} {re.escape(unit)}"
+    assert re.search(rf"{said}, which is assumed \({WATCHED}\), at t", beside)
 
 
 @EVERY

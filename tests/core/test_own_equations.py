@@ -20,7 +20,7 @@ from nlsid_core.design import (
     plan_motion,
 )
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
-from nlsid_core.dynamics import Nominal, Rates
+from nlsid_core.dynamics import Nominal, PiecewisePolynomial, Rates
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.proofs import check
 
@@ -213,6 +213,58 @@ def test_a_refusal_tells_of_the_place_that_was_not_passed_however_often_it_was_t
     found = re.search(r"lets V fall by (\S+) 1/s, and the disturbance w takes (\S+) 1/s", text)
     assert found
     assert float(found[1]) < float(found[2]), "else nothing was in the way"
+
+
+@pytest.mark.slow
+def test_a_goal_wider_than_the_equations_are_defined_gets_a_narrower_funnel() -> None:
+    level = integrate_nominal(tank, lambda _: [1.0], t=np.linspace(0, 1, 5), start=[1.0])
+    found = design(ContinuousTracking(tank, level, goal=[1.5]))
+    assert 0.5 < found.funnel.widths(1.0)[0] < 1.0, "below an empty tank there is no root"
+    assert found.verdict.margin > 0
+
+
+def tank(x: Any, u: Any) -> Any:
+    """A level, and what flows in."""
+    return [u[0] - np.sqrt(x[0])]
+
+
+def test_what_cannot_be_expanded_is_told_with_its_line_time_and_state() -> None:
+    def filled(x: Any, u: Any) -> Any:
+        return [u[0], np.log(x[0]) - x[1]]
+
+    t = np.linspace(0, 1, 3)
+    inflow, wet = np.full((2, 2, 1), 1.0), np.stack([[[0.0], [0.5]], [[0.5], [1.0]]])
+    x = np.concatenate([wet, 0 * wet], axis=2)
+    motion = Nominal(PiecewisePolynomial(t, x), PiecewisePolynomial(t, inflow))
+    text = refusal(filled, motion, goal=[0.1, 0.1])
+    assert re.search(r"cannot be expanded between 0 and 0\.0\d+ s: the logarithm of a value", text)
+    assert "in `return [u[0], np.log(x[0]) - x[1]]`, because of x0 in [-" in text
+
+
+def test_a_jump_of_rounding_is_none() -> None:
+    t = np.linspace(0, 1, 3)
+    x = PiecewisePolynomial(t, np.zeros((2, 2, 1)))
+    for jump, kept in ((1e-17, False), (1e-9, True)):
+        u = np.full((2, 2, 1), 0.1)
+        u[1, 0] += jump + np.spacing(0.1)
+        assert Nominal(x, PiecewisePolynomial(t, u)).u.is_continuous() is not kept
+    with pytest.raises(DataError, match=r"x0 jumps by 1e-09 at 0\.5 s"):
+        Nominal(PiecewisePolynomial(t, u - 0.1), x)
+
+
+def lagging(x: Any, u: Any, w: Any) -> Any:
+    """A position whose speed lags its command, and is pushed."""
+    return [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]
+
+
+@pytest.mark.slow
+def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
+    t = np.linspace(0, 3, 45)
+    still = integrate_nominal(
+        lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
+    )
+    found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
+    assert found.found.tried.startswith("found with 0.25 R: with R as it is by default")
 
 
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:

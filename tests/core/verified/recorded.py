@@ -1,9 +1,9 @@
-"""A pytest plugin: keeps every proof that the first kernel decides in a session, with what it said.
+"""A pytest plugin: keeps the files of every proof that a session asks the first kernel about.
 
     RECORDED=FOLDER python -m pytest -p tests.core.verified.recorded tests/...
 
-Each lies in a folder of its own, named by its content, with the files that it is about; `said`
-beside them is "proved" or the refusal. `benchmarks.verified --forgeries` asks the second kernel.
+Each proof lies in a folder of its own, named by its content, with the files that it is about.
+`benchmarks.verified` asks both kernels about them.
 """
 
 import hashlib
@@ -13,36 +13,30 @@ from pathlib import Path
 from typing import Any
 
 from nlsid_core import files, kernel, proofs
-from nlsid_core.errors import CertificateMismatch, CertificateRejected
 
-PROOF, SAID = "claim.proof.json", "said"
+FOLDER = "RECORDED"
+PROOF = "claim.proof.json"
 MOST = 10_000_000  # bytes of the files of one
 
 
-def keep(contents: Mapping[str, bytes], said: str) -> None:
+def keep(contents: Mapping[str, bytes]) -> None:
     """The proof and its files by name, in a folder."""
     if sum(map(len, contents.values())) > MOST:
         return
     name = hashlib.sha256(repr(sorted(contents.items())).encode()).hexdigest()[:16]
-    folder = Path(os.environ["RECORDED"]) / name
+    folder = Path(os.environ[FOLDER]) / name
     folder.mkdir(parents=True, exist_ok=True)
     for file, content in contents.items():
         if Path(file).name == file:
             (folder / file).write_bytes(content)
-    (folder / SAID).write_text(said)
 
 
 def recorded(decided: Any, contents: Any) -> Any:
-    """The function, whose verdicts are kept with the contents of what they are about."""
+    """The function, which keeps the contents of what it decides."""
 
     def record(*given: Any) -> Any:
-        try:
-            verdict = decided(*given)
-        except (kernel.Rejected, CertificateMismatch, CertificateRejected) as refusal:
-            keep(contents(*given), f"{type(refusal).__name__}: {refusal}")
-            raise
-        keep(contents(*given), "proved")
-        return verdict
+        keep(contents(*given))
+        return decided(*given)
 
     return record
 
@@ -62,5 +56,6 @@ def in_folder(path: Path | str) -> dict[str, bytes]:
     return {**beside, PROOF: Path(path).read_bytes()}
 
 
-proofs.decide = recorded(proofs.decide, in_memory)
-kernel.check = recorded(kernel.check, in_folder)
+if FOLDER in os.environ:
+    proofs.decide = recorded(proofs.decide, in_memory)
+    kernel.check = recorded(kernel.check, in_folder)

@@ -1,5 +1,6 @@
 """The second kernel: Coq builds it, accepts what is true, and refuses what is forged."""
 
+import copy
 import hashlib
 import json
 import random
@@ -585,6 +586,25 @@ def test_every_forged_held_funnel_is_refused(program: Path, tmp_path: Path) -> N
     for what in HELD_FORGERIES:
         proof = write(forged_held(files, what), tmp_path)
         assert second.opinion(proof, program).verdict == "refused", what
+
+
+@needs_coq
+@pytest.mark.coq
+@pytest.mark.parametrize(
+    "options", [{}, {"hold": 0.01, "error": [0.002, 0.01]}], ids=["pushed", "held"]
+)
+def test_a_decay_and_its_smallest_forgeries(options: Json, program: Path, tmp_path: Path) -> None:
+    """A little faster and a little lower than was proved: both kernels refuse."""
+    files = saved_design(design(tracking(decay=0.5, **options)), tmp_path)
+    assert second.opinion(write(files, tmp_path), program).verdict == "accepted"
+    for member, factor in (("rate", 1.2), ("floor", 0.5)):
+        more = copy.deepcopy(files)
+        more[PROOF]["claim"]["decay"][member] *= factor
+        bind(more)
+        proof = write(more, tmp_path)
+        with pytest.raises(CertificateRejected, match="not positive"):
+            proofs.check(proof)
+        assert second.opinion(proof, program).verdict == "refused", member
 
 
 @needs_coq
