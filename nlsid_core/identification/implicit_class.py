@@ -8,11 +8,13 @@ Source: thesis (2.4), (2.7).
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.implicit_sets import Names
@@ -148,6 +150,25 @@ class ImplicitRows:
     def states(self) -> int:
         """The number of states."""
         return len(self.y_scale[0]) * self.model_class.lags
+
+    @cached_property
+    def driven(self) -> BoolArray:
+        """(m,) which terms of f hold no state: no inequality of any set has them."""
+        return np.asarray(~self.right[:, : self.states].any(axis=1))
+
+    @cached_property
+    def reduced(self) -> tuple[FloatArray, FloatArray]:
+        """(R, F) for the coefficients c of [e; -f] that are not `driven`, (k,) an equation.
+
+        The least of the squared equation error over the driven ones is |R c|², at F c.
+        """
+        driven = np.concatenate([np.zeros(len(self.left), dtype=bool), self.driven])
+        first = int(driven.sum())
+        ordered = np.column_stack([self.R[:, driven], self.R[:, ~driven]])
+        factor = np.asarray(np.linalg.qr(ordered, mode="r"))
+        return factor[first:, first:], -solve_triangular(
+            factor[:first, :first], factor[:first, first:]
+        )
 
     @property
     def weight(self) -> FloatArray:
