@@ -126,6 +126,15 @@ def monomials(n: int, degrees: Sequence[int]) -> IntArray:
     return np.array(rows, dtype=np.int64).reshape(len(rows), n)
 
 
+def added(polynomials: Sequence[Polynomial]) -> Polynomial:
+    """The sum of one or more polynomials, made in one step."""
+    names = tuple(dict.fromkeys(name for p in polynomials for name in p.names))
+    exact = any(p.is_exact for p in polynomials)
+    parts = [p.over(names).exact() if exact else p.over(names) for p in polynomials]
+    exponents = np.concatenate([p.exponents for p in parts])
+    return Polynomial(exponents, np.concatenate([p.coefficients for p in parts]), names)
+
+
 def combinations(weights: FloatArray, polynomials: Sequence[Polynomial]) -> NDArray[Any]:
     """weights (m, k) times k polynomials: an object array (m,), each entry made in one step."""
     names = tuple(dict.fromkeys(name for p in polynomials for name in p.names))
