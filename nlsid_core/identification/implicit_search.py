@@ -9,8 +9,8 @@ Each term bounds the robust identification error of its sample, (2.28):
     2.10, 2.11: -|ν|²_S - 2ν'ε ≤ |ε|²_{S⁻¹};  else: |a + ε|²_{P⁻¹} ≤ |a|²_{(P-S)⁻¹} + |ε|²_{S⁻¹}.
 With linear models it is equal to it (Claim 2.18: a weighted equation error). S is one for all
 samples, so what the data say is the triangular factor of their monomials, however many there are.
-Terms of f in the inputs alone are in no inequality and cost a search nothing: for any e, S and other
-terms of f, least squares gives the best.
+Terms of f in the inputs alone are in no inequality and cost a search nothing: for any e, S and
+other terms of f, least squares gives the best.
 """
 
 from dataclasses import dataclass, replace
@@ -19,12 +19,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import Infeasible
+from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification import conditions
 from nlsid_core.identification.conditions import GAP, Inequality, constraint
-from nlsid_core.identification.implicit_class import DELAYED, FARTHEST, ImplicitRows
+from nlsid_core.identification.implicit_class import (
+    DELAYED,
+    FARTHEST,
+    LARGEST_BLOCK,
+    SLOW,
+    ImplicitRows,
+)
 from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit, storage_template
 from nlsid_core.identification.implicit_sets import Names
+from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.polynomial.algebra import as_polynomial
@@ -34,6 +41,7 @@ from nlsid_core.sos import (
     NormBound,
     Program,
     Solution,
+    compile_program,
     forms_of,
     matrix_sum_of_squares,
     solve,
@@ -86,6 +94,19 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
             "a box, or more data"
         )
     return ImplicitFit(model, proof, bound, *best)
+
+
+def refuse_large_program(rows: ImplicitRows) -> None:
+    """DataError if a semidefinite block of the set's program is larger than `LARGEST_BLOCK`."""
+    e, f = unknowns(rows)
+    S = symmetric_template("S", len(e))
+    program = Program(indeterminates_of(rows.names), tuple(set_constraints(rows, e, f, S, 1.0)))
+    size = max(cone.size for cone in compile_program(program).layout.cones if cone.kind == "psd")
+    if size > LARGEST_BLOCK:
+        raise DataError(
+            f"a semidefinite block of order {size} in set {rows.model_class.set}, more than "
+            f"{LARGEST_BLOCK}: {SLOW}; {FEWER}"
+        )
 
 
 def kept_in_set(
