@@ -18,12 +18,13 @@ PYTHON ?= $(shell \
 # Else every process of the tests compiles them again: a third of the time that collecting them takes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check lint docs benchmarks clean help
+.PHONY: demo test test-slow check lint docs benchmarks clean help
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make demo   run the chain on the shipped bags'
-	@echo 'make test   run the tests that need no ROS'
+	@echo 'make test   run the quick tests that need no ROS'
+	@echo 'make test-slow  run the tests that need no ROS and take longer'
 	@echo 'make check  ruff, mypy and make test'
 	@echo 'make docs   build the site, running every block of its tutorials'
 	@echo 'make benchmarks  run them all: one JSON file each in benchmarks/results'
@@ -35,6 +36,9 @@ demo: $(VENV)/.demo
 # One process a core, each with one thread for its matrices: more threads than cores only wait.
 test: $(VENV)/.test
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal --durations 25
+
+test-slow: $(VENV)/.test
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m 'slow and not (ros or colcon or coq)' -n auto --dist loadfile --durations 25
 
 check: lint test
 

@@ -1,16 +1,18 @@
 """The second kernel (verified/): proofs of the examples in Coq and extracted; mutants of both.
 
-    python -m benchmarks.verified [--json] [--mutations N] [--no-designs]
+    python -m benchmarks.verified [--json] [--mutations N] [--no-designs] [--no-tests]
 
 Needs Debian's coq, libcoq-bignums, ocaml-findlib and libzarith-ocaml-dev. Seconds are processor
 seconds: of make with one theorem, the theory being built, and of the extracted checker with the
 generator. A mutant is that of tests/core/kernel; those that the second kernel does not cover cannot
-disagree. A disagreement is listed by what each kernel said of it.
+disagree. A disagreement is listed by what each kernel said of it. Recorded are the files that the
+first kernel's tests ask it about, forged or not; both are asked again.
 """
 
 import argparse
 import importlib
 import json
+import os
 import re
 import resource
 import subprocess
@@ -26,12 +28,21 @@ from benchmarks.machine import describe
 from benchmarks.shipped import shipped
 from nlsid_core import files, kernel, second
 from tests.core.kernel import mutations
+from tests.core.verified import recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 VERIFIED = ROOT / "verified"
 MUTATIONS = 10_000
 SEED = 4
 KINDS = ("continuous_funnel", "tube", "stability", "sampled_funnel", "funnel_composition")
+TESTS = (
+    "tests/core/kernel", "tests/core/test_decay.py", "tests/core/test_funnel_composition.py",
+    "tests/core/test_funnel_forgeries.py", "tests/core/test_held_funnels.py",
+    "tests/core/test_implicit_proofs.py", "tests/core/test_linear_states.py",
+    "tests/core/test_sampled_funnel.py", "tests/core/test_sampled_funnel_implicit.py",
+    "tests/core/test_saturated_funnels.py", "tests/core/test_trajectory_funnels.py",
+    "tests/core/test_uncertain_funnels.py",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -39,7 +50,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--mutations", type=int, default=MUTATIONS)
-    parser.add_argument("--no-designs", action="store_true", help="mutations only")
+    parser.add_argument("--no-designs", action="store_true", help="without the examples' proofs")
+    parser.add_argument("--no-tests", action="store_true", help="without the tests' files")
     arguments = parser.parse_args()
     theory = [path.read_text().splitlines() for path in VERIFIED.glob("*.v")]
     result: dict[str, Any] = {"lines": sum(bool(line.strip()) for text in theory for line in text)}
@@ -51,6 +63,8 @@ def main() -> None:
         program = build / "nlsid-second"
         if not arguments.no_designs:
             result |= decided(Path(folder), make, program)
+        if not arguments.no_tests:
+            result |= tested(Path(folder) / "recorded", build / "second")
         result |= mutated(arguments.mutations, Path(folder) / "mutant", build / "second")
     print(describe())
     for key, value in result.items():
@@ -89,29 +103,63 @@ def mutated(count: int, folder: Path, checker: Path) -> dict[str, Any]:
     both: Counter[str] = Counter()
     differ: Counter[str] = Counter()
     for k in range(count):
-        forged = mutations.mutant(cases[k % len(cases)], rng)
+        case = cases[k % len(cases)]
+        forged = mutations.mutant(case, rng)
         try:
             for name, document in {**forged.about, mutations.PROOF: forged.document}.items():
                 (folder / name).write_bytes(files.encode(document))
         except (ValueError, TypeError):  # it cannot even be written
             continue
-        said = "proved"
-        try:
-            kernel.check(folder / mutations.PROOF)
-        except kernel.Rejected as refusal:
-            said = str(refusal)
-        status, why = generate.decided(folder / mutations.PROOF, checker=checker)
-        verdict = {0: "accepted", 1: "refused", 3: "not covered"}[status]
-        both[f"{verdict} {cases[k % len(cases)].kind}"] += 1
-        if status != 3 and (status == 0) != (said == "proved"):
-            told = f"{verdict} {why}, but {said}"
-            differ[re.sub(r"[0-9.e+-]*[0-9]", "#", told)[:160]] += 1
+        _proved, verdict, told = opinions(folder / mutations.PROOF, generate, checker)
+        both[f"{verdict} {case.kind}"] += 1
+        differ.update([told] if told else [])
     return {
         "mutations": count,
         "decided": dict(sorted(both.items())),
         "disagreements": sum(differ.values()),
         "differ": dict(differ.most_common()),
     }
+
+
+def tested(folder: Path, checker: Path) -> dict[str, Any]:
+    """The same of the files that the first kernel's tests ask it about, forged or not."""
+    generate = generator()
+    subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", recorded.__name__, *TESTS],
+        check=True, cwd=ROOT, env={**os.environ, recorded.FOLDER: str(folder)},
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    both: Counter[str] = Counter()
+    differ: Counter[str] = Counter()
+    for case in sorted(folder.iterdir()):
+        proved, verdict, told = opinions(case / recorded.PROOF, generate, checker)
+        both[f"{'proved' if proved else 'refused'} and {verdict}"] += 1
+        differ.update([told] if told else [])
+    return {
+        "recorded": dict(sorted(both.items())),
+        "recorded_disagreements": sum(differ.values()),
+        "recorded_differ": dict(differ.most_common()),
+    }
+
+
+def opinions(proof: Path, generate: Any, checker: Path) -> tuple[bool, str, str]:
+    """Whether the first kernel proves it, the second's verdict; what was said if they differ."""
+    said = "proved"
+    try:
+        kernel.check(proof)
+    except kernel.Rejected as refusal:
+        said = str(refusal)
+    status, why = generate.decided(proof, checker=checker)
+    verdict = {0: "accepted", 1: "refused", 3: "not covered"}[status]
+    differ = status != 3 and (status == 0) != (said == "proved")
+    told = re.sub(r"[0-9.e+-]*[0-9]", "#", f"{verdict} {why}, but {said}")[:160] if differ else ""
+    return said == "proved", f"{verdict}{named(why) if status == 3 else ''}", told
+
+
+def named(why: str) -> str:
+    """What is not covered, without the numbers of a case."""
+    said = re.sub(r"'.*|: .*|[0-9.e+-]*[0-9]", "#", why.removeprefix("not covered: "))
+    return f" ({said.rstrip('#')})"
 
 
 def generator() -> Any:

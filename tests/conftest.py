@@ -24,7 +24,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and under nohup those that a clo
 
 # Tests in which pages and pictures are drawn. In others the commands find no matplotlib, as where
 # it is not installed: drawing takes half of their time.
-DRAW = {"pictures", "slow", "ros", "colcon", "coq"}
+DRAW = {"pictures", "ros", "colcon", "coq"}
 
 # Thousands of collected tests live to the end: nothing of them is garbage, and to look for it among
 # them takes a quarter of the collection's time.

@@ -53,14 +53,21 @@ Definition rho' (g : segment) : R := val (level (stop g)) - val (level (start g)
 Definition growth (g : segment) (s : R) (x u w : list R) : R :=
   let z := deviation g s x in
   form (P' g) z z + 2 * form (P g s) z (relative g s x u w) - rho' g.
+(* [most]: what growth is at most *)
 Definition condition (margin : num) (limits : list (option (num * num))) (mode : list side)
-  (delta vertex : list num) (g : segment) (s : R) (x : list R) (mu : R) (taus : list R) : R :=
+  (g : segment) (s : R) (x : list R) (most mu : R) (taus : list R) : R :=
   let z := deviation g s x in
-  let us := wanted g s z in
-  -1 * growth g s x (moved (map val delta) (applied limits mode us)) (map val vertex)
-    - val margin * (duration g * rho g s)
+  -1 * most - val margin * (duration g * rho g s)
     + mu * (rho g s - form (P g s) z z)
-    - dot taus (held limits mode us).
+    - dot taus (held limits mode (wanted g s z)).
+(* With a decay: on all of the funnel above its floor, times rho. *)
+Definition decaying (pace floor : num) (limits : list (option (num * num))) (mode : list side)
+  (g : segment) (s : R) (x : list R) (most outer inner : R) (taus : list R) : R :=
+  let z := deviation g s x in
+  let W := form (P g s) z z in
+  rho g s * (-1 * most + val pace * (duration g * (val floor * rho g s - W)))
+    - (rho g s - W) * (rho' g + outer) - inner * (W - val floor * rho g s)
+    - dot taus (held limits mode (wanted g s z)).
 
 Section Condition.
 Context {K : Ints}.
@@ -159,23 +166,40 @@ Definition frelative (limits : list (option (num * num))) (mode : list side)
   let f := map (fun e => frate e table) (equations g) in
   let dx0 := map (fun c => fcurve' B (map fnum c)) (nominal g) in
   zip (fun f d => fsub (fmul h f) d) f dx0.
-Definition fcondition (margin : num) (limits : list (option (num * num))) (mode : list side)
-  (delta vertex : list num) (g : segment) (depth index : Z) (mu : F) (taus : list F) : F :=
+Definition fduration (g : segment) : F := fsub (fnum (time (stop g))) (fnum (time (start g))).
+Definition flevel' (g : segment) : F := fsub (fnum (level (stop g))) (fnum (level (start g))).
+Definition fgrowth (limits : list (option (num * num))) (mode : list side)
+  (delta vertex : list num) (g : segment) (depth index : Z) : F :=
   let B := fbernstein (fplace depth index) (fremaining depth index) in
   let z := fdeviation g in
-  let P := fshape B g in
-  let h := fsub (fnum (time (stop g))) (fnum (time (start g))) in
-  let us := fwanted B g in
-  let v := frelative limits mode delta vertex g depth index in
   let P' := zip (zip (fun a b => fsub (fnum b) (fnum a))) (shape (start g)) (shape (stop g)) in
+  let v := frelative limits mode delta vertex g depth index in
+  fsub (fadd (fform P' z z) (fscale 2 (fform (fshape B g) z v))) (flevel' g).
+Definition fcondition (margin : num) (limits : list (option (num * num))) (mode : list side)
+  (g : segment) (depth index : Z) (most mu : F) (taus : list F) : F :=
+  let B := fbernstein (fplace depth index) (fremaining depth index) in
+  let z := fdeviation g in
   let rho := flevel B g in
-  let rho' := fsub (fnum (level (stop g))) (fnum (level (start g))) in
-  let growth := fsub (fadd (fform P' z z) (fscale 2 (fform P z v))) rho' in
   fsub
     (fadd
-      (fsub (fscale (-1) growth) (fmul (fnum margin) (fmul h rho)))
-      (fmul mu (fsub rho (fform P z z))))
-    (fdot taus (fheld limits mode us)).
+      (fsub (fscale (-1) most) (fmul (fnum margin) (fmul (fduration g) rho)))
+      (fmul mu (fsub rho (fform (fshape B g) z z))))
+    (fdot taus (fheld limits mode (fwanted B g))).
+Definition fdecaying (pace floor : num) (limits : list (option (num * num))) (mode : list side)
+  (g : segment) (depth index : Z) (most outer inner : F) (taus : list F) : F :=
+  let B := fbernstein (fplace depth index) (fremaining depth index) in
+  let z := fdeviation g in
+  let rho := flevel B g in
+  let W := fform (fshape B g) z z in
+  let low := fmul (fnum floor) rho in
+  fsub
+    (fsub
+      (fsub
+        (fmul rho (fadd (fscale (-1) most)
+          (fmul (fnum pace) (fmul (fduration g) (fsub low W)))))
+        (fmul (fsub rho W) (fadd (flevel' g) outer)))
+      (fmul inner (fsub W low)))
+    (fdot taus (fheld limits mode (fwanted B g))).
 
 Section At.
 Variables (s r : R) (z : list R) (depth index : Z).
@@ -334,7 +358,7 @@ Proof.
 Qed.
 
 Section Segment.
-Variables (margin : num) (limits : list (option (num * num))) (mode : list side)
+Variables (limits : list (option (num * num))) (mode : list side)
   (delta vertex : list num) (g : segment) (x : list R).
 Hypothesis Hz : z = deviation g s x.
 Hypothesis Hx : length x = length (nominal g).
@@ -401,26 +425,48 @@ Proof.
   2:{ apply Forall2_map2. intros c. apply means_curve'. apply Forall2_map2, means_fnum. }
   intros a a' b b' Ha Hb. apply means_sub; auto. apply means_mul; auto. apply means_duration.
 Qed.
-Lemma means_condition mu m taus ts : means mu m -> Forall2 means taus ts ->
-  means (fcondition margin limits mode delta vertex g depth index mu taus)
-    (condition margin limits mode delta vertex g s x m ts).
+Lemma means_growth : means (fgrowth limits mode delta vertex g depth index)
+  (growth g s x (moved (map val delta) (applied limits mode (wanted g s z))) (map val vertex)).
 Proof.
-  intros Hmu Htau. pose proof means_deviation as Hd.
-  pose proof means_duration as Hh.
-  unfold fcondition, condition, growth. rewrite <- Hz.
+  pose proof means_deviation as Hd. unfold fgrowth, growth. rewrite <- Hz.
+  apply means_sub; [apply means_add|].
+  - apply means_fform; auto.
+    eapply Forall2_zip; [|apply Forall2_same|apply Forall2_same].
+    intros a ? b ? <- <-. eapply Forall2_zip; [|apply Forall2_same|apply Forall2_same].
+    intros u ? v ? <- <-. apply means_sub; apply means_fnum.
+  - apply (means_scale _ _ 2). apply means_fform; auto; [apply means_shape|].
+    apply means_relative.
+  - apply means_sub; apply means_fnum.
+Qed.
+Lemma means_W : means (fform (fshape B g) (fdeviation g) (fdeviation g)) (form (P g s) z z).
+Proof. apply means_fform; try apply means_deviation. apply means_shape. Qed.
+Lemma means_condition margin most a mu m taus ts : means most a -> means mu m ->
+  Forall2 means taus ts ->
+  means (fcondition margin limits mode g depth index most mu taus)
+    (condition margin limits mode g s x a m ts).
+Proof.
+  intros Ha Hmu Htau. pose proof means_W. unfold fcondition, condition. rewrite <- Hz.
   apply means_sub; [apply means_add; [apply means_sub|]|].
-  - apply (means_scale _ _ (-1)).
-    apply means_sub; [apply means_add|].
-    + apply means_fform; auto.
-      eapply Forall2_zip; [|apply Forall2_same|apply Forall2_same].
-      intros a ? b ? <- <-. eapply Forall2_zip; [|apply Forall2_same|apply Forall2_same].
-      intros u ? v ? <- <-. apply means_sub; apply means_fnum.
-    + apply (means_scale _ _ 2). apply means_fform; auto; [apply means_shape|].
-      apply means_relative.
-    + apply means_sub; apply means_fnum.
-  - apply means_mul; [apply means_fnum|]. apply means_mul; auto. apply means_level.
-  - apply means_mul; auto. apply means_sub; [apply means_level|].
-    apply means_fform; auto. apply means_shape.
+  - now apply (means_scale _ _ (-1)).
+  - apply means_mul; [apply means_fnum|]. apply means_mul; [apply means_duration|apply means_level].
+  - apply means_mul; auto. apply means_sub; auto. apply means_level.
+  - apply means_fdot; auto. apply means_held, means_wanted.
+Qed.
+Lemma means_decaying pace floor most a outer o inner i taus ts : means most a -> means outer o ->
+  means inner i -> Forall2 means taus ts ->
+  means (fdecaying pace floor limits mode g depth index most outer inner taus)
+    (decaying pace floor limits mode g s x a o i ts).
+Proof.
+  intros Ha Ho Hi Htau. pose proof means_W. pose proof means_level.
+  assert (Hl : means (fmul (fnum floor) (flevel B g)) (val floor * rho g s)).
+  { apply means_mul; auto. apply means_fnum. }
+  unfold fdecaying, decaying. rewrite <- Hz.
+  apply means_sub; [apply means_sub; [apply means_sub|]|].
+  - apply means_mul; auto. apply means_add; [now apply (means_scale _ _ (-1))|].
+    apply means_mul; [apply means_fnum|]. apply means_mul; [apply means_duration|].
+    now apply means_sub.
+  - apply means_mul; [now apply means_sub|]. apply means_add; auto. apply means_sub; apply means_fnum.
+  - apply means_mul; auto. now apply means_sub.
   - apply means_fdot; auto. apply means_held, means_wanted.
 Qed.
 End Segment.

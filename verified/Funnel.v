@@ -30,6 +30,7 @@ Definition cases (w : witness) (box : list (num * num)) (off : list num)
 Definition num_eqb (a b : num) : bool :=
   andb (Z.eqb (fst a) (fst b)) (Pos.eqb (snd a) (snd b)).
 Definition num_ltb (a b : num) : bool := (fst a * Zpos (snd b) <? fst b * Zpos (snd a))%Z.
+Definition num_leb (a b : num) : bool := negb (num_ltb b a).
 Fixpoint list_eqb {A : Type} (f : A -> A -> bool) (a b : list A) : bool :=
   match a, b with
   | [], [] => true
@@ -60,18 +61,33 @@ Fixpoint all_expanded (rows : list mono) (l : list (list Z * squares)) : option 
 Definition kappa_ok (d : problem) (g : segment) (p : piece) (skipped : nat) : bool :=
   andb (forallb (pushes_only skipped) (equations g))
     (andb (Nat.eqb (length (kappa p)) (length (box d))) (forallb (num_ltb (0%Z, xH)) (kappa p))).
+(* What has to be positive on a piece. With a decay the first two of its sums of squares are for
+   rho - W and W - floor rho. *)
+Definition falling (d : problem) (w : witness) (g : segment) (m : list side) (p : piece) (most : F)
+  (taus : list F) : option F :=
+  match decay d, taus with
+  | None, _ =>
+      let f := fmu (multiplier w) (mu p) in
+      if ipos (den f)
+      then Some (fcondition (margin w) (limits d) m g (depth p) (index p) most f taus) else None
+  | Some (pace, floor), outer :: inner :: taus' =>
+      Some (fdecaying pace floor (limits d) m g (depth p) (index p) most outer inner taus')
+  | _, _ => None
+  end.
 Definition piece_ok (d : problem) (w : witness) (products : choices) (g : segment) (off : list num)
   (p : piece) : bool :=
   match nth_error (cases w (box d) off) (vertex p), nth_error (modes (limits d)) (mode p),
     all_expanded (sides w) (tau p) with
   | Some (delta, v), Some m, Some taus =>
-      let f := fmu (multiplier w) (mu p) in
       let skipped := (1 + length (nominal g) + length (limits d))%nat in
-      let c := fcondition (margin w) (limits d) m delta v g (depth p) (index p) f taus in
-      andb (andb (andb (0 <=? depth p)%Z (ipos (den f)))
-             (if pushed w then kappa_ok d g p skipped else true))
-        (is_positive (basis w) products (columns p) (gram_factors p)
-          (if pushed w then fsub c (fpushed (kappa p) (box d) g (depth p) (index p) skipped) else c))
+      let growth := fgrowth (limits d) m delta v g (depth p) (index p) in
+      let most := if pushed w
+        then fadd growth (fpushed (kappa p) (box d) g (depth p) (index p) skipped) else growth in
+      andb (andb (0 <=? depth p)%Z (if pushed w then kappa_ok d g p skipped else true))
+        match falling d w g m p most taus with
+        | Some c => is_positive (basis w) products (columns p) (gram_factors p) c
+        | None => false
+        end
   | _, _, _ => false
   end.
 
@@ -123,11 +139,17 @@ Fixpoint linked (gs : list segment) : bool :=
   | _ => true
   end.
 
+Definition falls (d : problem) (w : witness) : bool :=
+  match decay d with
+  | None => num_ltb (0%Z, xH) (margin w)
+  | Some (pace, floor) => andb (num_ltb (0%Z, xH) pace)
+      (andb (num_leb (0%Z, xH) floor) (num_ltb floor (1%Z, xH)))
+  end.
 (* [offs]: by segment, what the inputs are off by at most. *)
 Definition check (d : problem) (offs : list (list num)) (w : witness) : bool :=
   let n := match segments d with [] => O | g :: _ => length (nominal g) end in
   let products := products (basis w) in
-  andb (andb (andb (num_ltb (0%Z, xH) (margin w)) (linked (segments d)))
+  andb (andb (andb (falls d w) (linked (segments d)))
          (forallb (fun l => match l with Some (a, b) => num_ltb a b | None => true end) (limits d)))
     (andb (andb (Nat.eqb (length (pieces w)) (length (segments d)))
         (Nat.eqb (length offs) (length (segments d))))
@@ -356,35 +378,47 @@ Proof.
   pose proof (Rmult_le_pos _ _ Hx Hy). pose proof (IH b Hb). lra.
 Qed.
 
-(* mu at a place, and a bound on all of them that is continuous *)
-Definition mu_at (rows : list mono) (p : piece) (s : R) (z : list R) : R :=
-  pval (s * IZR (2 ^ depth p) - IZR (index p)) (env z) (Polynomials.num (fmu rows (mu p)))
-    / r (den (fmu rows (mu p))).
-Fixpoint mu_bound (rows : list mono) (ps : list piece) (s : R) (z : list R) : R :=
+(* The multiplier of rho - W at a place, and a bound on all of them that is continuous *)
+Definition outer (d : problem) (w : witness) (p : piece) : F :=
+  match decay d with
+  | None => fmu (multiplier w) (mu p)
+  | Some _ => match all_expanded (sides w) (tau p) with Some (f :: _) => f | _ => fone end
+  end.
+Definition outer_at (d : problem) (w : witness) (p : piece) (s : R) (z : list R) : R :=
+  pval (s * IZR (2 ^ depth p) - IZR (index p)) (env z) (Polynomials.num (outer d w p))
+    / r (den (outer d w p)).
+Fixpoint outer_bound (d : problem) (w : witness) (ps : list piece) (s : R) (z : list R) : R :=
   match ps with
   | [] => 0
-  | p :: ps' => 1 + mu_at rows p s z * mu_at rows p s z + mu_bound rows ps' s z
+  | p :: ps' => 1 + outer_at d w p s z * outer_at d w p s z + outer_bound d w ps' s z
   end.
-Lemma mu_bound_nonneg rows ps s z : 0 <= mu_bound rows ps s z.
+Lemma outer_bound_nonneg d w ps s z : 0 <= outer_bound d w ps s z.
 Proof.
-  induction ps as [|p ps IH]; cbn; [lra|]. pose proof (Rle_0_sqr (mu_at rows p s z)).
+  induction ps as [|p ps IH]; cbn; [lra|]. pose proof (Rle_0_sqr (outer_at d w p s z)).
   unfold Rsqr in *. lra.
 Qed.
-Lemma mu_bound_above rows ps p s z : In p ps ->
-  - mu_at rows p s z <= mu_bound rows ps s z.
+Lemma outer_bound_above d w ps p s z : In p ps ->
+  Rabs (outer_at d w p s z) <= outer_bound d w ps s z.
 Proof.
   induction ps as [|q ps IH]; cbn; [tauto|]. intros [->|H].
-  - pose proof (mu_bound_nonneg rows ps s z). pose proof (Rle_0_sqr (mu_at rows p s z + 1)).
+  - pose proof (outer_bound_nonneg d w ps s z). apply Rabs_le.
+    pose proof (Rle_0_sqr (outer_at d w p s z + 1)). pose proof (Rle_0_sqr (outer_at d w p s z - 1)).
     unfold Rsqr in *. nra.
-  - specialize (IH H). pose proof (Rle_0_sqr (mu_at rows q s z)). unfold Rsqr in *. lra.
+  - specialize (IH H). pose proof (Rle_0_sqr (outer_at d w q s z)). unfold Rsqr in *. lra.
 Qed.
+Definition pace (d : problem) : R := match decay d with None => 0 | Some (l, _) => val l end.
+Definition bottom (d : problem) : R := match decay d with None => 1 | Some (_, f) => val f end.
+Definition bound_at (d : problem) (w : witness) (g : segment) (ps : list piece) (s : R) (z : list R)
+  : R :=
+  (Rabs (rho' g) + outer_bound d w ps s z)
+    * (1 + / val (level (start g)) + / val (level (stop g))).
 
-(* The heart: outside the funnel, W grows relative to rho by less than a bounded multiple of the
-   excess. *)
+(* The heart: where W is above c rho, c from the bottom to 1, it grows relative to c rho by less than
+   a bounded multiple of the excess, if c falls towards the bottom at its pace. *)
 Section Segment.
 Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
-Hypothesis Hmargin : 0 < val (margin w).
+Hypothesis Hfalls : falls d w = true.
 Hypothesis Hok : segment_ok n d g = true.
 Hypothesis Hoff : off_ok n d g off = true.
 Hypothesis Hcov : covered d w off ps = true.
@@ -445,7 +479,7 @@ Proof.
   - apply Forall_forall. intros p Hp. rewrite forallb_forall in Hps. specialize (Hps p Hp).
     unfold piece_ok in Hps. destruct (nth_error _ _) as [[? ?]|]; [|discriminate].
     destruct (nth_error _ _); [|discriminate]. destruct (all_expanded _ _); [|discriminate].
-    apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _]. apply andb_prop in X as [X _].
+    apply andb_prop in Hps as [X _]. apply andb_prop in X as [X _].
     now apply Z.leb_le in X.
   - apply IZR_le in Hcov. change (IZR (2 ^ 16)) with 65536 in Hcov. lra.
   - change (2 ^ 16)%Z with 65536%Z in Hcov. lia.
@@ -456,14 +490,113 @@ Qed.
 Definition within_off (a u : list R) : Prop :=
   match off with [] => u = a | _ => exists delta, in_box delta (around off) /\ u = zip Rplus a delta end.
 
-Lemma growth_bounded s x u w0 : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
-  within_off (input d g s x) u ->
-  let z := deviation g s x in
-  0 < form (P g s) z z - rho g s ->
-  growth g s x u w0
-    < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s).
+Lemma fall_facts : 0 <= pace d /\ bottom d <= 1 /\ (decay d = None -> 0 < val (margin w)).
 Proof.
-  intros Hs Hx Hw Hu z Hgap. destruct segment_facts.
+  unfold pace, bottom. pose proof Hfalls as F. unfold falls in F. destruct (decay d) as [[l f]|].
+  - apply andb_prop in F as [A B]. apply andb_prop in B as [_ B]. apply num_ltb_lt in A, B.
+    rewrite val_zero in A. unfold val at 2 in B. cbn in B. repeat split; try lra. discriminate.
+  - apply num_ltb_lt in F. rewrite val_zero in F. repeat split; try lra.
+Qed.
+
+Lemma falling_enough s x z m p most a taus ts fc share : 0 <= s <= 1 -> holds p s ->
+  z = deviation g s x -> length x = n -> In p ps -> (0 <= depth p)%Z ->
+  means (s * IZR (2 ^ depth p) - IZR (index p)) (env z) most a ->
+  all_expanded (sides w) (tau p) = Some taus ->
+  Forall2 (means (s * IZR (2 ^ depth p) - IZR (index p)) (env z)) taus ts ->
+  Forall (fun q => 0 <= q) ts -> Forall (fun q => 0 <= q) (held (limits d) m (wanted g s z)) ->
+  falling d w g m p most taus = Some fc ->
+  (forall c, means (s * IZR (2 ^ depth p) - IZR (index p)) (env z) fc c -> 0 < c) ->
+  bottom d <= share <= 1 -> 0 < form (P g s) z z - share * rho g s ->
+  a + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
+    < bound_at d w g ps s z * (form (P g s) z z - share * rho g s).
+Proof.
+  intros Hs Hh Hz Hx Hp Hd Ha Etau Hts Hns Hheld Hf Hpos Hsh Hgap. destruct segment_facts.
+  set (r0 := s * IZR (2 ^ depth p) - IZR (index p)) in *.
+  pose proof (rho_pos s Hs) as Hrho.
+  assert (Hdur : 0 < duration g) by (unfold duration; lra).
+  destruct fall_facts as [Hpace [Hbot Hmargin]].
+  pose proof (Rinv_0_lt_compat _ f_start0) as I0. pose proof (Rinv_0_lt_compat _ f_stop0) as I1.
+  assert (Big : 1 <= rho g s * (1 + / val (level (start g)) + / val (level (stop g)))).
+  { set (l0 := val (level (start g))) in *. set (l1 := val (level (stop g))) in *.
+    assert (E0 : l0 * / l0 = 1) by (apply Rinv_r; lra).
+    assert (E1 : l1 * / l1 = 1) by (apply Rinv_r; lra).
+    assert (M0 : 0 <= (1 - s) * l0 * / l1).
+    { apply Rmult_le_pos; [apply Rmult_le_pos|]; lra. }
+    assert (M1 : 0 <= s * l1 * / l0).
+    { apply Rmult_le_pos; [apply Rmult_le_pos|]; lra. }
+    assert (R1 : rho g s * (1 + / l0 + / l1) = rho g s + (1 - s) * (l0 * / l0) + s * l1 * / l0
+      + (1 - s) * l0 * / l1 + s * (l1 * / l1)).
+    { unfold rho, line. fold l0 l1. ring. }
+    rewrite R1, E0, E1. lra. }
+  pose proof (outer_bound_above d w ps p s z Hp) as Hab. pose proof (Rabs_pos (rho' g)) as Hr0.
+  pose proof (outer_bound_nonneg d w ps s z) as Hob.
+  set (gap := form (P g s) z z - share * rho g s) in *.
+  set (K0 := 1 + / val (level (start g)) + / val (level (stop g))) in *.
+  assert (Lx : length x = length (nominal g)) by congruence.
+  unfold falling in Hf. unfold bound_at. fold K0. unfold pace, bottom in *.
+  revert Hf Hsh Hpace Hbot Hmargin. destruct (decay d) as [[l f]|] eqn:Ed; intros Hf Hsh Hpace Hbot Hmargin.
+  - destruct taus as [|o [|i taus]]; try discriminate. injection Hf as <-.
+    inversion Hts as [|? to ? ts1 Ho Hts1]; subst ts. subst. inversion Hts1 as [|? ti ? ts2 Hi Hts2]; subst.
+    inversion Hns as [|? ? No Hns1]; subst. inversion Hns1 as [|? ? Ni Hns2]; subst.
+    pose proof (means_decaying s r0 _ (depth p) (index p) Hd ltac:(unfold r0; ring) (limits d) m g x
+      eq_refl Lx l f _ _ _ _ _ _ _ _ Ha Ho Hi Hts2) as Hc.
+    specialize (Hpos _ Hc). unfold decaying in Hpos.
+    pose proof (dot_nonneg _ Hns2 _ Hheld) as Hdot.
+    assert (Eo : outer_at d w p s (deviation g s x) = to).
+    { unfold outer_at, outer. rewrite Ed, Etau. fold r0. destruct Ho as [D E]. rewrite E. field. lra. }
+    rewrite Eo in Hab. pose proof (Rle_abs to) as Hto. pose proof (Rle_abs (rho' g)) as Hrr.
+    set (W := form (P g s) _ _) in *. set (rh := rho g s) in *. set (rp := rho' g) in *.
+    set (ob := outer_bound _ _ _ _ _) in *.
+    assert (N1 : 0 <= ti * (W - val f * rh)).
+    { apply Rmult_le_pos; auto. pose proof (Rmult_le_compat_r rh _ _ (Rlt_le _ _ Hrho) (proj1 Hsh)).
+      unfold gap in Hgap. lra. }
+    assert (N2 : 0 <= val l * duration g * rh * gap).
+    { pose proof (Rmult_le_pos _ _ Hpace (Rlt_le _ _ Hdur)) as A1.
+      pose proof (Rmult_le_pos _ _ A1 (Rlt_le _ _ Hrho)) as A2.
+      exact (Rmult_le_pos _ _ A2 (Rlt_le _ _ Hgap)). }
+    assert (N3 : to * (W - rh) <= ob * gap).
+    { apply Rle_trans with (to * gap).
+      - apply Rmult_le_compat_l; auto. unfold gap.
+        pose proof (Rmult_le_compat_r rh _ _ (Rlt_le _ _ Hrho) (proj2 Hsh)). lra.
+      - apply Rmult_le_compat_r; lra. }
+    assert (N4 : rp * gap <= Rabs rp * gap) by (apply Rmult_le_compat_r; lra).
+    assert (N5 : (Rabs rp + ob) * gap <= (Rabs rp + ob) * gap * (rh * K0)).
+    { rewrite <- (Rmult_1_r ((Rabs rp + ob) * gap)) at 1. apply Rmult_le_compat_l; auto.
+      apply Rmult_le_pos; lra. }
+    apply (Rmult_lt_reg_l rh); auto.
+    replace (rh * ((Rabs rp + ob) * K0 * gap)) with ((Rabs rp + ob) * gap * (rh * K0)) by ring.
+    eapply Rlt_le_trans; [|exact N5].
+    apply Rle_lt_trans with (rh * a + (1 - share) * rh * rp
+      + val l * duration g * rh * ((share - val f) * rh)); [right; ring|].
+    unfold gap in *. nra.
+  - destruct (ipos (den (fmu (multiplier w) (mu p)))) eqn:Eden; [|discriminate]. injection Hf as <-.
+    apply r_pos in Eden. specialize (Hmargin eq_refl).
+    assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (outer_at d w p s z)).
+    { unfold outer_at, outer. rewrite Ed. split; auto. fold r0. field. lra. }
+    subst z. pose proof (means_condition s r0 _ (depth p) (index p) Hd ltac:(unfold r0; ring) (limits d) m
+      g x eq_refl Lx (margin w) _ _ _ _ _ _ Ha Hmu Hts) as Hc.
+    specialize (Hpos _ Hc). unfold condition in Hpos.
+    pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
+    pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
+    assert (share = 1) by lra. subst share.
+    set (W := form (P g s) _ _) in *. set (ob := outer_bound _ _ _ _ _) in *.
+    set (mu0 := outer_at _ _ _ _ _) in *.
+    assert (N1 : - mu0 * gap <= ob * gap).
+    { apply Rmult_le_compat_r; [lra|]. pose proof (Rle_abs (- mu0)). rewrite Rabs_Ropp in *. lra. }
+    assert (N2 : ob * gap <= (Rabs (rho' g) + ob) * K0 * gap).
+    { apply Rmult_le_compat_r; [lra|]. rewrite <- (Rmult_1_r ob) at 1.
+      apply Rmult_le_compat; unfold K0; lra. }
+    unfold gap in *. lra.
+Qed.
+
+Lemma growth_bounded s x u w0 share : 0 <= s <= 1 -> length x = n -> in_box w0 (box d) ->
+  within_off (input d g s x) u -> bottom d <= share <= 1 ->
+  let z := deviation g s x in
+  0 < form (P g s) z z - share * rho g s ->
+  growth g s x u w0 + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
+    < bound_at d w g ps s z * (form (P g s) z z - share * rho g s).
+Proof.
+  intros Hs Hx Hw Hu Hsh z Hgap. pose proof segment_facts as SF. destruct SF.
   set (us := wanted g s z).
   assert (Hus : length us = length (limits d)).
   { unfold us, wanted. rewrite zip_length; congruence. }
@@ -473,55 +606,44 @@ Proof.
   assert (Lapp : length (applied (limits d) m us) = length (limits d)).
   { rewrite Happ. rewrite zip_length; congruence. }
   apply In_nth_error in Hm as [im Him].
+  set (target := bound_at d w g ps s z * (form (P g s) z z - share * rho g s)
+    - ((1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s)).
+  enough (Enough : growth g s x u w0 < target) by (unfold target in Enough; lra).
   assert (At : forall iv delta v, nth_error (cases w (box d) off) iv = Some (delta, v) -> exists p,
     (pushed w = true -> kappa_ok d g p (1 + n + length (limits d)) = true) /\
     growth g s x (moved (map val delta) (applied (limits d) m us)) (map val v)
-      + (if pushed w then cost (kappa p) (box d) g s z (1 + n + length (limits d)) else 0)
-      < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s)).
+      + (if pushed w then cost (kappa p) (box d) g s z (1 + n + length (limits d)) else 0) < target).
   { intros iv delta v Hiv. destruct (piece_at iv im s Hs) as [p [Hp [Ev [Em Hh]]]].
     { apply nth_error_Some. congruence. } { apply nth_error_Some. congruence. }
-    exists p. rewrite forallb_forall in Hps. specialize (Hps p Hp). unfold piece_ok in Hps.
-    rewrite Ev, Em, Hiv, Him in Hps.
+    exists p. pose proof Hps as Hps'. rewrite forallb_forall in Hps'. specialize (Hps' p Hp).
+    unfold piece_ok in Hps'. rewrite Ev, Em, Hiv, Him in Hps'.
     destruct (all_expanded (sides w) (tau p)) as [taus|] eqn:Etau; [|discriminate].
-    cbn zeta in Hps. rewrite f_nominal0 in Hps. set (skipped := (1 + n + length (limits d))%nat) in *.
-    apply andb_prop in Hps as [A B]. apply andb_prop in A as [A A3]. apply andb_prop in A as [A1 A2].
-    apply Z.leb_le in A1. apply r_pos in A2. split. { intros E. now rewrite E in A3. }
+    cbn zeta in Hps'. rewrite f_nominal0 in Hps'. set (skipped := (1 + n + length (limits d))%nat) in *.
+    apply andb_prop in Hps' as [A B]. apply andb_prop in A as [A1 A3]. apply Z.leb_le in A1.
+    split. { intros E. now rewrite E in A3. }
+    destruct (falling _ _ _ _ _ _ _) as [fc|] eqn:Ef; [|discriminate].
     set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
     assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
     destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
-    assert (Hmu : means r0 (env z) (fmu (multiplier w) (mu p)) (mu_at (multiplier w) p s z)).
-    { split; auto. unfold mu_at. fold r0. field. lra. }
-    pose proof (means_condition s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring) (margin w)
-      (limits d) m delta v g x eq_refl ltac:(congruence) _ _ _ _ Hmu Hts) as Hc.
-    assert (Hall : means r0 (env z)
-      (if pushed w
-       then fsub (fcondition (margin w) (limits d) m delta v g (depth p) (index p)
-              (fmu (multiplier w) (mu p)) taus)
-              (fpushed (kappa p) (box d) g (depth p) (index p) skipped)
-       else fcondition (margin w) (limits d) m delta v g (depth p) (index p)
-              (fmu (multiplier w) (mu p)) taus)
-      (condition (margin w) (limits d) m delta v g s x (mu_at (multiplier w) p s z) ts
-        - (if pushed w then cost (kappa p) (box d) g s z skipped else 0))).
-    { destruct (pushed w).
-      - apply means_sub; [exact Hc|]. apply means_fpushed; auto; try congruence.
+    pose proof (means_growth s r0 z (depth p) (index p) A1 ltac:(unfold r0; ring)
+      (limits d) m delta v g x eq_refl ltac:(congruence)) as Hg0. fold us in Hg0.
+    set (top := growth g s x (moved (map val delta) (applied (limits d) m us)) (map val v)
+      + (if pushed w then cost (kappa p) (box d) g s z skipped else 0)).
+    enough (E : top + (1 - share) * rho' g + duration g * pace d * (share - bottom d) * rho g s
+      < bound_at d w g ps s z * (form (P g s) z z - share * rho g s)) by (unfold target; lra).
+    refine (falling_enough s x z m p _ top taus ts fc share Hs Hh eq_refl Hx Hp A1 _ Etau Hts Hns Hheld
+      Ef _ Hsh Hgap).
+    - unfold top. destruct (pushed w).
+      + apply means_add; [exact Hg0|]. apply means_fpushed; auto; try congruence.
         { unfold r0. ring. }
         unfold kappa_ok in A3. apply andb_prop in A3 as [_ A3]. apply andb_prop in A3 as [_ A3].
         apply Forall_forall. intros k Hk. rewrite forallb_forall in A3. specialize (A3 k Hk).
         apply num_ltb_lt in A3. now rewrite val_zero in A3.
-      - eapply means_equal; [exact Hc|ring]. }
-    pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hall) as Hpos.
-    unfold condition in Hpos. fold z in Hpos. fold us in Hpos.
-    pose proof (dot_nonneg _ Hns _ Hheld) as Hdot.
-    pose proof (rho_pos s Hs) as Hrho.
-    assert (Hdur : 0 < duration g) by (unfold duration; lra).
-    pose proof (Rmult_lt_0_compat _ _ Hmargin (Rmult_lt_0_compat _ _ Hdur Hrho)) as Hm0.
-    pose proof (mu_bound_above (multiplier w) ps p s z Hp) as Hab.
-    pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hgap) Hab) as Hab'.
-    set (cst := if pushed w then _ else 0) in *. nra. }
+      + eapply means_equal; [exact Hg0|ring].
+    - intros c Hc. exact (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hc). }
   (* at a corner of what the inputs are off by, for every w *)
   assert (Corner : forall delta, In delta (vertices (around off)) ->
-    growth g s x (moved (map val delta) (applied (limits d) m us)) w0
-      < mu_bound (multiplier w) ps s z * (form (P g s) z z - rho g s)).
+    growth g s x (moved (map val delta) (applied (limits d) m us)) w0 < target).
   { intros delta Hd.
     assert (Case : forall v, In v (corners w (box d)) -> exists iv,
       nth_error (cases w (box d) off) iv = Some (delta, v)).

@@ -62,18 +62,6 @@ Definition held_ok (d : problem) (period : num) (errors : list num) (w : witness
           (forallb (fun e => let '(g, row, off, qs) := e in rates_ok d w (pushing r) g off row qs)
             (combine (combine (combine (segments d) (rates r)) offs) (turns r))))))).
 
-(* One after the other. *)
-Lemma after g gs : linked (g :: gs) = true -> Forall (fun g => begins g < ends g) (g :: gs) ->
-  forall h, In h gs -> ends g <= begins h.
-Proof.
-  revert g. induction gs as [|g1 gs IH]; intros g Hl Ht h Hh; [destruct Hh|].
-  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk _].
-  apply knot_eqb_eq in Hk. inversion Ht as [|? ? H1 H2]; subst. inversion H2; subst.
-  assert (E : ends g = begins g1) by (unfold ends, begins; now rewrite Hk).
-  destruct Hh as [<-|Hh]; [lra|]. specialize (IH g1 Hl2 H2 h Hh). lra.
-Qed.
-Lemma linked_tail g gs : linked (g :: gs) = true -> linked gs = true.
-Proof. destruct gs; auto. cbn [linked]. intros H. now apply andb_prop in H. Qed.
 Lemma disjoint gs : linked gs = true -> Forall (fun g => begins g < ends g) gs ->
   forall g h, In g gs -> In h gs -> g = h \/ ends g <= begins h \/ ends h <= begins g.
 Proof.
@@ -518,16 +506,19 @@ Proof.
   eapply Rle_trans; [apply Rabs_triang|]. lra.
 Qed.
 
-Lemma inside_until c : since <= c <= finish d -> (forall t, since <= t < c -> good t) ->
-  forall t, since <= t <= c -> inside d x t.
+Lemma followed c : since <= c <= finish d -> (forall t, since <= t < c -> good t) ->
+  follows d offs x (fun _ => u) since c.
 Proof.
-  intros Hc G t Hr.
-  refine (stays_until d offs w H_checked x (fun _ => u) since c ltac:(lra) _ since t ltac:(lra)
-    ltac:(lra) Hinside).
-  destruct Hsol as [_ [S1 S2]]. split; [apply x_length|]. split.
+  intros Hc G. destruct Hsol as [_ [S1 S2]]. split; [apply x_length|]. split.
   - intros s Hs. apply S1. lra.
   - intros g off s Hin Hs Hr'. split; [apply (G s ltac:(lra) g off); auto|].
     destruct (S2 g s (in_combine_l _ _ _ _ Hin) Hs) as [_ M]. apply M. lra.
+Qed.
+Lemma inside_until c : since <= c <= finish d -> (forall t, since <= t < c -> good t) ->
+  forall t, since <= t <= c -> inside d x t.
+Proof.
+  intros Hc G t Hr. exact (stays_until d offs w H_checked x (fun _ => u) since c ltac:(lra)
+    (followed c Hc G) since t ltac:(lra) ltac:(lra) Hinside).
 Qed.
 
 (* Along the solution the policy is continuous, and turns at its rate. *)
@@ -782,6 +773,11 @@ Proof.
 Qed.
 Lemma held_stays t : since <= t <= finish d -> inside d x t.
 Proof. intros Hr. apply (inside_until (finish d)); auto; [lra|]. intros s Hs. now apply good_always. Qed.
+Lemma held_decays : decays d x since.
+Proof.
+  apply (decays_until d offs w H_checked x (fun _ => u)); auto; [lra|].
+  apply followed; [lra|exact good_always].
+Qed.
 
 Lemma bounds_here t : since <= t <= finish d -> held_in_bounds d x u t.
 Proof.
@@ -833,10 +829,11 @@ Proof.
 Qed.
 End Solution.
 
-(* What starts inside stays inside, within its bounds, and ends in its goal. *)
+(* What starts inside stays inside, within its bounds, ends in its goal, and decays. *)
 Theorem held_proved since x u : held_solution d period errors since x u ->
   begin d <= since <= finish d -> inside d x since ->
-  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x.
+  (forall t, since <= t <= finish d -> inside d x t /\ held_in_bounds d x u t) /\ in_goal d x /\
+  decays d x since.
 Proof.
   intros Hs Hr Hi. destruct held_parts as [_ [Hg [Hne _]]].
   assert (E : exists g0 gs0, segments d = g0 :: gs0).
@@ -846,7 +843,8 @@ Proof.
   { intros t Ht'. now apply (held_stays since x u g0 gs0 E Hs Hr Hi). }
   split.
   - intros t Ht'. split; auto. now apply (bounds_here since x u g0 gs0 E Hs Hr Hi).
-  - apply (goal_reached d w (goal_multiplier w) C Hg); auto.
+  - split; [|exact (held_decays since x u g0 gs0 E Hs Hr Hi)].
+    apply (goal_reached d w (goal_multiplier w) C Hg); auto.
     + exact (x_length since x u g0 gs0 E Hs).
     + apply S. lra.
 Qed.
@@ -856,20 +854,20 @@ End Problem.
 Definition pushing_of (f : field_file) : list bool :=
   map (fun j => forallb (forallb (alone (1 + states f + inputs f + j))) (spans f))
     (seq 0 (length (uncertain f))).
-Definition held_files_ok f p u g (period : num) (errors : list num) (w : witness)
+Definition held_files_ok f p u g e (period : num) (errors : list num) (w : witness)
   (rs : list (list num)) (ts : list (list rate_piece)) : bool :=
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))
-    (andb (held_ok (stated f p u g) period errors w (Rates rs (pushing_of f) ts))
+    (andb (held_ok (stated f p u g e) period errors w (Rates rs (pushing_of f) ts))
       (if pushed w then forallb (forallb (pushes_only (1 + states f + inputs f))) (spans f)
        else true)).
 
-Theorem held_theorem f p u g period errors w rs ts :
-  held_files_ok f p u g period errors w rs ts = true ->
-  forall since x act, held_solution (stated f p u g) period errors since x act ->
-  begin (stated f p u g) <= since <= finish (stated f p u g) -> inside (stated f p u g) x since ->
-  (forall t, since <= t <= finish (stated f p u g) ->
-    inside (stated f p u g) x t /\ held_in_bounds (stated f p u g) x act t) /\
-  in_goal (stated f p u g) x.
+Theorem held_theorem f p u g e period errors w rs ts :
+  held_files_ok f p u g e period errors w rs ts = true ->
+  forall since x act, held_solution (stated f p u g e) period errors since x act ->
+  begin (stated f p u g e) <= since <= finish (stated f p u g e) -> inside (stated f p u g e) x since ->
+  (forall t, since <= t <= finish (stated f p u g e) ->
+    inside (stated f p u g e) x t /\ held_in_bounds (stated f p u g e) x act t) /\
+  in_goal (stated f p u g e) x /\ decays (stated f p u g e) x since.
 Proof.
   unfold held_files_ok. intros H since x act Hx Hr Hi. apply andb_prop in H as [_ H].
   apply andb_prop in H as [H _]. now apply (held_proved _ period errors w (Rates rs (pushing_of f) ts)).

@@ -42,10 +42,42 @@ Proof.
   apply (c_mult (fun u => bval (S u) a)); [now apply c_bval|now apply c_mval].
 Qed.
 
+(* A share of rho that falls from the bottom and c more, at t1, to the bottom; 1 without a decay. *)
+Definition share (d : problem) (c t1 t : R) : R := bottom d + c * exp (- pace d * (t - t1)).
+Lemma share_between d w c t1 t : falls d w = true -> 0 <= c <= 1 - bottom d -> t1 <= t ->
+  bottom d <= share d c t1 t <= 1.
+Proof.
+  intros F Hc Ht. destruct (fall_facts d w F) as [Hp _]. unfold share.
+  pose proof (exp_pos (- pace d * (t - t1))) as E0.
+  assert (E1 : exp (- pace d * (t - t1)) <= 1).
+  { rewrite <- exp_0. destruct (Req_dec (- pace d * (t - t1)) 0) as [->|N]; [right; reflexivity|].
+    left. apply exp_increasing. pose proof (Rmult_le_pos _ (t - t1) Hp ltac:(lra)). lra. }
+  split; [nra|]. pose proof (Rmult_le_compat_l c _ _ (proj1 Hc) E1). lra.
+Qed.
+Lemma share_first d c t1 : share d c t1 t1 = bottom d + c.
+Proof. unfold share. rewrite Rminus_diag_eq, Rmult_0_r, exp_0 by auto. ring. Qed.
+Lemma d_share d c t1 t :
+  derivable_pt_lim (share d c t1) t (- pace d * (share d c t1 t - bottom d)).
+Proof.
+  unfold share. eapply limit_equal.
+  { apply (d_plus (fun _ => bottom d)); [apply d_const|].
+    apply (d_mult (fun _ => c)); [apply d_const|].
+    apply (derivable_pt_lim_comp (fun u => - pace d * (u - t1)) exp).
+    - apply (d_mult (fun _ => - pace d)); [apply d_const|].
+      apply (d_minus id (fun _ => t1)); [apply derivable_pt_lim_id|apply d_const].
+    - apply derivable_pt_lim_exp. }
+  cbn beta. ring.
+Qed.
+(* W <= c rho *)
+Definition under (c : R -> R) (g : segment) (x : list (R -> R)) (t : R) : Prop :=
+  let s := place g t in
+  let z := deviation g s (at_time x t) in
+  form (P g s) z z <= c t * rho g s.
+
 Section Segment.
 Variables (d : problem) (w : witness) (g : segment) (off : list num) (ps : list piece) (n : nat).
 Hypothesis Hlimits : Forall proper (limits d).
-Hypothesis Hmargin : 0 < val (margin w).
+Hypothesis Hfalls : falls d w = true.
 Hypothesis Hok : segment_ok n d g = true.
 Hypothesis Hoff : off_ok n d g off = true.
 Hypothesis Hcov : covered d w off ps = true.
@@ -205,47 +237,80 @@ Proof.
   apply c_pval; [apply place_continuous|now apply dev_continuous].
 Qed.
 Lemma bound_continuous t : begins g <= t <= ends g -> lo <= t <= hi ->
-  continuity_pt (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g) t.
+  continuity_pt (fun u => bound_at d w g ps (place g u) (dev u) * / duration g) t.
 Proof.
-  intros Ht Hr. apply (c_mult (fun u => mu_bound (multiplier w) ps (place g u) (dev u)));
+  intros Ht Hr. apply (c_mult (fun u => bound_at d w g ps (place g u) (dev u))); [|apply c_const].
+  unfold bound_at. apply (c_mult (fun u => Rabs (rho' g) + outer_bound d w ps (place g u) (dev u)));
     [|apply c_const].
-  clear Hcov Hps. induction ps as [|p l IH]; cbn [mu_bound]; [apply c_const|].
-  assert (C : continuity_pt (fun u => mu_at (multiplier w) p (place g u) (dev u)) t).
-  { unfold mu_at. apply (c_mult (fun u => pval (place g u * IZR (2 ^ depth p) - IZR (index p))
-      (env (dev u)) (Polynomials.num (fmu (multiplier w) (mu p))))); [|apply c_const].
+  apply (c_plus (fun _ => Rabs (rho' g))); [apply c_const|].
+  clear Hcov Hps. induction ps as [|p l IH]; cbn [outer_bound]; [apply c_const|].
+  assert (C : continuity_pt (fun u => outer_at d w p (place g u) (dev u)) t).
+  { unfold outer_at. apply (c_mult (fun u => pval (place g u * IZR (2 ^ depth p) - IZR (index p))
+      (env (dev u)) (Polynomials.num (outer d w p)))); [|apply c_const].
     apply (c_pval (fun u => place g u * IZR (2 ^ depth p) - IZR (index p)) (fun u => env (dev u)));
       [|now apply dev_continuous].
     apply (c_minus (fun u => place g u * IZR (2 ^ depth p)) (fun _ => IZR (index p)));
       [|apply c_const].
     apply (c_mult (place g)); [apply place_continuous|apply c_const]. }
-  apply (c_plus (fun u => 1 + mu_at (multiplier w) p (place g u) (dev u)
-    * mu_at (multiplier w) p (place g u) (dev u))); auto.
+  apply (c_plus (fun u => 1 + outer_at d w p (place g u) (dev u)
+    * outer_at d w p (place g u) (dev u))); auto.
   apply (c_plus (fun _ => 1)); [apply c_const|].
-  now apply (c_mult (fun u => mu_at (multiplier w) p (place g u) (dev u))).
+  now apply (c_mult (fun u => outer_at d w p (place g u) (dev u))).
 Qed.
 
-Lemma segment_stays ta t : begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
-  inside_segment g x ta -> inside_segment g x t.
+(* the excess over a share of rho that falls *)
+Lemma d_excess c t1 t : begins g < t < ends g -> forall ut w0,
+  Forall2 (fun f v => derivable_pt_lim f t v) x (field g t (at_time x t) ut w0) ->
+  derivable_pt_lim (fun u => gap u + (1 - share d c t1 u) * rho g (place g u)) t
+    ((growth g (place g t) (at_time x t) ut w0 + (1 - share d c t1 t) * rho' g
+      + duration g * pace d * (share d c t1 t - bottom d) * rho g (place g t)) * / duration g).
 Proof.
-  intros Ha Hlo Ht Hhi H. assert (G : gap t <= 0); [|unfold gap, dev in G; unfold inside_segment; lra].
-  apply (barrier gap (fun u => mu_bound (multiplier w) ps (place g u) (dev u) * / duration g)
+  intros Ht ut w0 Hd. pose proof duration_pos as D. eapply limit_equal.
+  { apply (d_plus gap); [exact (d_gap t Ht ut w0 Hd)|].
+    apply (d_mult (fun u => 1 - share d c t1 u) (fun u => rho g (place g u))).
+    - apply (d_minus (fun _ => 1)); [apply d_const|apply d_share].
+    - unfold rho, line. apply (d_plus (fun u => (1 - place g u) * val (level (start g)))
+        (fun u => place g u * val (level (stop g)))).
+      + apply (d_mult (fun u => 1 - place g u) (fun _ => val (level (start g)))); [|apply d_const].
+        apply (d_minus (fun _ => 1) (place g)); [apply d_const|apply d_place].
+      + apply (d_mult (place g) (fun _ => val (level (stop g)))); [apply d_place|apply d_const]. }
+  cbn beta. unfold rho, line, rho'. field. lra.
+Qed.
+Lemma segment_stays c t1 ta t : 0 <= c <= 1 - bottom d -> t1 <= ta ->
+  begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
+  under (share d c t1) g x ta -> under (share d c t1) g x t.
+Proof.
+  intros Hc H1 Ha Hlo Ht Hhi H.
+  set (excess := fun u => gap u + (1 - share d c t1 u) * rho g (place g u)).
+  assert (E : forall u, excess u = form (P g (place g u)) (dev u) (dev u)
+    - share d c t1 u * rho g (place g u)) by (intros u; unfold excess, gap; ring).
+  assert (G : excess t <= 0); [|rewrite E in G; unfold under; fold (dev t); lra].
+  apply (barrier excess (fun u => bound_at d w g ps (place g u) (dev u) * / duration g)
     ta t); auto; try lra.
-  - intros v Hv. apply gap_continuous; lra.
+  - intros v Hv. apply (c_plus gap); [apply gap_continuous; lra|].
+    apply (c_mult (fun u => 1 - share d c t1 u) (fun u => rho g (place g u))).
+    + apply (c_minus (fun _ => 1)); [apply c_const|]. eapply d_continuous, d_share.
+    + unfold rho, line. apply (c_plus (fun u => (1 - place g u) * val (level (start g)))
+        (fun u => place g u * val (level (stop g)))).
+      * apply (c_mult (fun u => 1 - place g u)); [|apply c_const].
+        apply (c_minus (fun _ => 1)); [apply c_const|apply place_continuous].
+      * apply (c_mult (place g)); [apply place_continuous|apply c_const].
   - intros v Hv. apply bound_continuous; lra.
   - intros v Hv. destruct (Dx v ltac:(lra) ltac:(lra)) as [Hu [w0 [Hw Hd]]].
-    eexists. split; [apply (d_gap v ltac:(lra) (act v) w0 Hd)|]. intros Hpos.
-    pose proof (growth_bounded d w g off ps n Hlimits Hmargin Hok Hoff Hcov Hps (place g v)
-      (at_time x v) (act v) w0 (place_in v ltac:(lra)) (at_time_length v) Hw Hu Hpos) as B.
+    eexists. split; [apply (d_excess c t1 v ltac:(lra) (act v) w0 Hd)|]. rewrite E. intros Hpos.
+    pose proof (growth_bounded d w g off ps n Hlimits Hfalls Hok Hoff Hcov Hps (place g v)
+      (at_time x v) (act v) w0 (share d c t1 v) (place_in v ltac:(lra)) (at_time_length v) Hw Hu
+      (share_between d w c t1 v Hfalls Hc ltac:(lra)) Hpos) as B.
     pose proof (Rinv_0_lt_compat _ duration_pos) as D.
-    apply (Rmult_lt_compat_r _ _ _ D) in B. unfold gap. fold (dev v) in B. nra.
-  - unfold gap, dev. unfold inside_segment in H. lra.
+    apply (Rmult_lt_compat_r _ _ _ D) in B. fold (dev v) in B. nra.
+  - rewrite E. unfold under in H. fold (dev ta) in H. lra.
 Qed.
 End Segment.
 
 (* Segments joined. *)
-Definition member_stays (x : list (R -> R)) (lo hi : R) (g : segment) : Prop :=
+Definition member_stays (c : R -> R) (x : list (R -> R)) (lo hi : R) (g : segment) : Prop :=
   forall ta t, begins g <= ta -> lo <= ta -> ta <= t <= ends g -> t <= hi ->
-  inside_segment g x ta -> inside_segment g x t.
+  under c g x ta -> under c g x t.
 Lemma place_start g : place g (begins g) = 0.
 Proof. unfold place. unfold Rdiv. ring. Qed.
 Lemma place_end g : begins g < ends g -> place g (ends g) = 1.
@@ -286,15 +351,30 @@ Lemma line_0 a b : line 0 a b = val a.
 Proof. unfold line. ring. Qed.
 Lemma line_1 a b : line 1 a b = val b.
 Proof. unfold line. ring. Qed.
-Lemma linked_inside n d g g' x : segment_ok n d g = true -> segment_ok n d g' = true ->
-  stop g = start g' -> map last_of (nominal g) = map first_of (nominal g') ->
-  inside_segment g x (ends g) -> inside_segment g' x (ends g).
+(* One after the other. *)
+Lemma after g gs : linked (g :: gs) = true -> Forall (fun g => begins g < ends g) (g :: gs) ->
+  forall h, In h gs -> ends g <= begins h.
 Proof.
-  intros H H' Hk Hn. destruct (segment_facts d g n H) as [_ _ _ _ C T _ _ [_ S] _].
+  revert g. induction gs as [|g1 gs IH]; intros g Hl Ht h Hh; [destruct Hh|].
+  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk _].
+  apply knot_eqb_eq in Hk. inversion Ht as [|? ? H1 H2]; subst. inversion H2; subst.
+  assert (E : ends g = begins g1) by (unfold ends, begins; now rewrite Hk).
+  destruct Hh as [<-|Hh]; [lra|]. specialize (IH g1 Hl2 H2 h Hh). lra.
+Qed.
+Lemma linked_tail g gs : linked (g :: gs) = true -> linked gs = true.
+Proof. destruct gs; auto. cbn [linked]. intros H. now apply andb_prop in H. Qed.
+Lemma linked_same n d g g' x : segment_ok n d g = true -> segment_ok n d g' = true ->
+  linked [g; g'] = true -> let z g := deviation g (place g (ends g)) (at_time x (ends g)) in
+  let z' := deviation g' (place g' (ends g)) (at_time x (ends g)) in
+  form (P g (place g (ends g))) (z g) (z g) = form (P g' (place g' (ends g))) z' z' /\
+  rho g (place g (ends g)) = rho g' (place g' (ends g)).
+Proof.
+  intros H H' Hl z z'. cbn [linked] in Hl. rewrite Bool.andb_true_r in Hl.
+  apply andb_prop in Hl as [Hk Hn]. apply knot_eqb_eq in Hk. apply (list_eqb_eq _ num_eqb_eq) in Hn.
+  destruct (segment_facts d g n H) as [_ _ _ _ C T _ _ [S0 S] _].
   destruct (segment_facts d g' n H') as [_ _ _ _ C' T' _ _ [S' S''] _].
   assert (E : ends g = begins g') by (unfold ends, begins; now rewrite Hk).
-  destruct (segment_facts d g n H) as [_ _ _ _ _ _ _ _ [S0 _] _].
-  unfold inside_segment. rewrite (place_end g T).
+  unfold z, z'. rewrite (place_end g T).
   replace (place g' (ends g)) with 0 by (rewrite E; symmetry; apply place_start).
   assert (Dev : deviation g 1 (at_time x (ends g)) = deviation g' 0 (at_time x (ends g))).
   { unfold deviation. f_equal.
@@ -306,45 +386,64 @@ Proof.
   rewrite Dev. unfold P, rho. rewrite line_0, line_1.
   rewrite (zip_line n 1 line_1 _ _ S0 S), (zip_line_left n 0 line_0 _ _ S' S''), Hk. auto.
 Qed.
+Lemma V_same n d x t gs : linked gs = true -> Forall (fun g => segment_ok n d g = true) gs ->
+  forall g h, In g gs -> In h gs -> begins g <= t <= ends g -> begins h <= t <= ends h ->
+  V g x t = V h x t.
+Proof.
+  induction gs as [|g0 gs IH]; intros Hl Hok; [intros g h []|].
+  assert (Times : Forall (fun g => begins g < ends g) (g0 :: gs)).
+  { eapply Forall_impl; [|exact Hok]. intros g Hg. now destruct (segment_facts d g n Hg). }
+  assert (First : forall h, In h gs -> begins g0 <= t <= ends g0 -> begins h <= t <= ends h ->
+    V g0 x t = V h x t).
+  { intros h Hh R0 Rh. pose proof (after g0 gs Hl Times h Hh) as A.
+    destruct gs as [|g1 gs]; [destruct Hh|].
+    pose proof (after g1 gs (linked_tail _ _ Hl)) as A1.
+    inversion Hok as [|? ? K0 Hok1]; subst. inversion Hok1 as [|? ? K1 _]; subst.
+    inversion Times as [|? ? _ T1]; subst. specialize (A1 T1). inversion T1; subst.
+    pose proof (after g0 (g1 :: gs) Hl Times g1 (or_introl eq_refl)) as A2.
+    destruct Hh as [<-|Hh]; [|specialize (A1 h Hh); lra].
+    assert (t = ends g0) as -> by lra. unfold V.
+    assert (L : linked [g0; g1] = true).
+    { cbn [linked] in *. apply andb_prop in Hl as [Hl _]. now rewrite Hl. }
+    destruct (linked_same n d g0 g1 x K0 K1 L) as [E1 E2]. now rewrite E1, E2. }
+  intros g h [<-|Hg] [<-|Hh] Rg Rh; auto.
+  - symmetry. now apply First.
+  - apply IH; auto. + now apply (linked_tail g0). + now inversion Hok.
+Qed.
 
-Lemma chain n d x lo hi gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
-  Forall (member_stays x lo hi) gs ->
+Lemma chain n d c x lo hi gs : Forall (fun g => segment_ok n d g = true) gs -> linked gs = true ->
+  Forall (member_stays c x lo hi) gs ->
   forall g0, In g0 gs ->
   forall ta t, (match gs with g :: _ => begins g | [] => ta end) <= ta <= t -> lo <= ta -> t <= hi ->
-  (forall g, In g gs -> begins g <= ta <= ends g -> inside_segment g x ta) ->
-  begins g0 <= t <= ends g0 -> inside_segment g0 x t.
+  (forall g, In g gs -> begins g <= ta <= ends g -> under c g x ta) ->
+  begins g0 <= t <= ends g0 -> under c g0 x t.
 Proof.
   induction gs as [|g gs IH]; intros Hok Hl Hs g0 H0 ta t Ht Hlo Hhi Hin Hg0; [destruct H0|].
   inversion Hok as [|? ? Hok1 Hok2]; subst. inversion Hs as [|? ? Hs1 Hs2]; subst.
   destruct H0 as [<-|H0].
   { apply (Hs1 ta t); try lra. apply Hin; [now left|]. lra. }
   destruct gs as [|g' gs]; [destruct H0|].
-  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk Hn].
-  apply knot_eqb_eq in Hk. apply (list_eqb_eq _ num_eqb_eq) in Hn.
+  inversion Hok2 as [|? ? Hok3 _]; subst.
+  assert (Times : Forall (fun g => begins g < ends g) (g' :: gs)).
+  { eapply Forall_impl; [|exact Hok2]. intros h Hh. now destruct (segment_facts d h n Hh). }
+  pose proof (after g' gs (linked_tail _ _ Hl) Times) as Order.
+  assert (L : linked [g; g'] = true).
+  { cbn [linked] in *. apply andb_prop in Hl as [Hl1 _]. now rewrite Hl1. }
+  pose proof (linked_tail _ _ Hl) as Hl2.
+  cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 _]. apply andb_prop in Hl1 as [Hk _].
+  apply knot_eqb_eq in Hk.
   assert (E : ends g = begins g') by (unfold ends, begins; now rewrite Hk).
-  (* segments follow each other *)
-  assert (Order : forall gs g, linked (g :: gs) = true ->
-    Forall (fun g => segment_ok n d g = true) (g :: gs) ->
-    forall h, In h gs -> ends g <= begins h).
-  { clear. induction gs as [|g1 gs IH]; intros g Hl Hok h Hh; [destruct Hh|].
-    cbn [linked] in Hl. apply andb_prop in Hl as [Hl1 Hl2]. apply andb_prop in Hl1 as [Hk _].
-    apply knot_eqb_eq in Hk. inversion Hok as [|? ? H1 H2]; subst.
-    inversion H2 as [|? ? H3 H4]; subst.
-    assert (E : ends g = begins g1) by (unfold ends, begins; now rewrite Hk).
-    destruct Hh as [<-|Hh]; [lra|]. destruct (segment_facts d g1 n H3).
-    specialize (IH g1 Hl2 H2 h Hh). lra. }
+  inversion Times as [|? ? T' _]; subst.
   assert (Hb : begins g' <= begins g0).
-  { destruct H0 as [<-|H0]; [lra|]. pose proof (Order gs g' Hl2 Hok2 g0 H0).
-    inversion Hok2; subst. destruct (segment_facts d g' n); auto. lra. }
-  destruct (Rle_lt_dec (begins g') ta) as [C|C].
+  { destruct H0 as [<-|H0]; [lra|]. pose proof (Order g0 H0). lra. }
+  destruct (Rle_lt_dec (begins g') ta) as [B|B].
   - apply (IH Hok2 Hl2 Hs2 g0 H0 ta t); auto; try lra. intros h Hh. apply Hin. now right.
   - apply (IH Hok2 Hl2 Hs2 g0 H0 (begins g') t); auto; try lra.
-    intros h Hh Hr. destruct Hh as [<-|Hh].
-    + rewrite <- E. apply (linked_inside n d g g' x); auto.
-      { now inversion Hok2. }
-      apply (Hs1 ta (ends g)); try lra. apply Hin; [now left|]. lra.
-    + exfalso. pose proof (Order gs g' Hl2 Hok2 h Hh). inversion Hok2; subst.
-      destruct (segment_facts d g' n); auto. lra.
+    intros h Hh Hr. destruct Hh as [<-|Hh]; [|specialize (Order h Hh); lra].
+    rewrite <- E. assert (U : under c g x (ends g)).
+    { apply (Hs1 ta (ends g)); try lra. apply Hin; [now left|]. lra. }
+    unfold under in *. destruct (linked_same n d g g' x Hok1 Hok3 L) as [E1 E2].
+    cbn zeta in E1. now rewrite <- E1, <- E2.
 Qed.
 
 Lemma last_end gs g : In g gs -> linked gs = true ->
@@ -399,7 +498,7 @@ Qed.
 
 (* What the other theorems read of a funnel that was decided. *)
 Record checked (d : problem) (w : witness) : Prop := {
-  c_margin : 0 < val (margin w);
+  c_falls : falls d w = true;
   c_limits : Forall proper (limits d);
   c_linked : linked (segments d) = true;
   c_segments : Forall (fun g => segment_ok (first_size d) d g = true) (segments d);
@@ -409,8 +508,7 @@ Lemma check_facts d offs w : check d offs w = true -> checked d w.
 Proof.
   intros H. destruct (checked_segments d offs w H) as [Hok _].
   unfold check in H. apply andb_prop in H as [H1 _]. apply andb_prop in H1 as [H1 H3].
-  apply andb_prop in H1 as [Hm Hl]. apply num_ltb_lt in Hm. rewrite val_zero in Hm.
-  set (n := first_size d) in *.
+  apply andb_prop in H1 as [Hm Hl]. set (n := first_size d) in *.
   assert (Hlim : Forall proper (limits d)).
   { apply Forall_forall. intros l Hin'. rewrite forallb_forall in H3. specialize (H3 l Hin').
     destruct l as [[a b]|]; cbn; auto. now apply num_ltb_lt. }
@@ -429,12 +527,16 @@ Definition follows (d : problem) (offs : list (list num)) (x : list (R -> R))
   forall g off t, In (g, off) (combine (segments d) offs) -> begins g < t < ends g -> lo < t < hi ->
     within_off off (input d g (place g t) (at_time x t)) (u g t) /\ moves d g x (u g) t.
 
-Theorem stays_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
-  follows d offs x u lo hi -> forall ta t, lo <= ta -> ta <= t <= hi -> inside d x ta -> inside d x t.
+Lemma under_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
+  follows d offs x u lo hi -> forall c ta t, 0 <= c <= 1 - bottom d -> lo <= ta -> ta <= t <= hi ->
+  (forall g, In g (segments d) -> begins g <= ta <= ends g -> under (share d c ta) g x ta) ->
+  forall g, In g (segments d) -> begins g <= t <= ends g -> under (share d c ta) g x t.
 Proof.
-  intros H x u lo hi Hb [Lx [Cx Dx]] ta t Ha Ht Hin. destruct (checked_segments d offs w H) as [Hok [Lo Each]].
+  intros H x u lo hi Hb [Lx [Cx Dx]] c ta t Hc Ha Ht Hin.
+  destruct (checked_segments d offs w H) as [Hok [Lo Each]].
   destruct (check_facts d offs w H) as [Hm Hlim Hl _ Times Range]. set (n := first_size d) in *.
-  intros g Hg Hgt. apply (chain n d x lo hi (segments d) Hok Hl) with (ta := ta); auto; try lra.
+  intros g Hg Hgt. apply (chain n d (share d c ta) x ta hi (segments d) Hok Hl) with (ta := ta);
+    auto; try lra.
   2:{ unfold begin in Hb. destruct (segments d); lra. }
   apply Forall_forall. intros h Hh.
   assert (G : exists off, In (h, off) (combine (segments d) offs)).
@@ -443,9 +545,60 @@ Proof.
     destruct (IH os Hg) as [q Hq]; eauto. }
   destruct G as [off G]. destruct (Each h off G) as [ps [O [B C]]].
   assert (A : segment_ok n d h = true) by (rewrite Forall_forall in Hok; auto).
-  destruct (Range h Hh) as [R1 R2].
   intros ta' t' Ha' Hlo Ht' Hhi Hin'.
-  apply (segment_stays d w h off ps n Hlim Hm A O B C x (u h) lo hi Lx) with (ta := ta'); auto.
+  apply (segment_stays d w h off ps n Hlim Hm A O B C x (u h) ta hi Lx) with (ta := ta'); auto.
+  - intros v _ Hv. apply Cx. lra.
+  - intros v Hv Hv'. apply Dx; auto. lra.
+Qed.
+Theorem stays_until d offs w : check d offs w = true -> forall x u lo hi, begin d <= lo ->
+  follows d offs x u lo hi -> forall ta t, lo <= ta -> ta <= t <= hi -> inside d x ta -> inside d x t.
+Proof.
+  intros H x u lo hi Hb F ta t Ha Ht Hin g Hg Hgt.
+  destruct (check_facts d offs w H) as [Hm _ _ Hok _ _]. destruct (fall_facts d w Hm) as [_ [Hbot _]].
+  pose proof (under_until d offs w H x u lo hi Hb F (1 - bottom d) ta t ltac:(lra) Ha Ht) as U.
+  assert (U' : under (share d (1 - bottom d) ta) g x t).
+  { apply U; auto. intros h Hh Hr. specialize (Hin h Hh Hr). unfold under, inside_segment in *.
+    rewrite share_first. lra. }
+  unfold under in U'. unfold inside_segment. eapply Rle_trans; [exact U'|].
+  rewrite Forall_forall in Hok. specialize (Hok g Hg).
+  pose proof (rho_pos d g _ Hok (place g t) (place_in d g _ Hok t Hgt)) as Hrho.
+  destruct (share_between d w (1 - bottom d) ta t Hm ltac:(lra) ltac:(lra)) as [_ S].
+  pose proof (Rmult_le_compat_r _ _ _ (Rlt_le _ _ Hrho) S). lra.
+Qed.
+Theorem decays_until d offs w : check d offs w = true -> forall x u lo, begin d <= lo ->
+  follows d offs x u lo (finish d) -> inside d x lo -> decays d x lo.
+Proof.
+  intros H x u lo Hb F Hin. unfold decays. destruct (decay d) as [[l f]|] eqn:Ed; auto.
+  intros g h t1 t2 Hg Hh Hg1 Hh2 Ht.
+  destruct (check_facts d offs w H) as [Hm _ Hl Hok Times Range].
+  destruct (Range h Hh) as [_ Rh].
+  assert (In1 : forall k, In k (segments d) -> begins k <= t1 <= ends k -> inside_segment k x t1).
+  { intros k Hk Hr. apply (stays_until d offs w H x u lo (finish d) Hb F lo t1); auto; lra. }
+  assert (Rho : forall k t, In k (segments d) -> begins k <= t <= ends k -> 0 < rho k (place k t)).
+  { intros k t Hk Hr. rewrite Forall_forall in Hok. specialize (Hok k Hk).
+    exact (rho_pos d k _ Hok (place k t) (place_in d k _ Hok t Hr)). }
+  assert (Eb : bottom d = val f) by (unfold bottom; now rewrite Ed).
+  assert (Ep : pace d = val l) by (unfold pace; now rewrite Ed).
+  destruct (fall_facts d w Hm) as [_ [Hbot _]].
+  set (c := Rmax 0 (V g x t1 - val f)).
+  assert (Same : forall k, In k (segments d) -> begins k <= t1 <= ends k -> V k x t1 <= val f + c).
+  { intros k Hk Hr. enough (E : V k x t1 = V g x t1).
+    { rewrite E. unfold c. pose proof (Rmax_r 0 (V g x t1 - val f)). lra. }
+    exact (V_same _ d x t1 (segments d) Hl Hok k g Hk Hg Hr Hg1). }
+  assert (Hc : 0 <= c <= 1 - bottom d).
+  { unfold c. split; [apply Rmax_l|]. apply Rmax_lub; [lra|]. rewrite Eb.
+    specialize (In1 g Hg Hg1). unfold inside_segment in In1. pose proof (Rho g t1 Hg Hg1) as R0.
+    enough (V g x t1 <= 1) by lra. unfold V. apply (Rmult_le_reg_r (rho g (place g t1))); auto.
+    unfold Rdiv. rewrite Rmult_assoc, Rinv_l by lra. lra. }
+  pose proof (under_until d offs w H x u lo (finish d) Hb F c t1 t2 Hc ltac:(lra) ltac:(lra)) as U.
+  assert (U' : under (share d c t1) h x t2).
+  { apply U; auto. intros k Hk Hr. unfold under. rewrite share_first, Eb.
+    pose proof (Rho k t1 Hk Hr) as R0. specialize (Same k Hk Hr). unfold V in Same.
+    apply (Rmult_le_compat_r _ _ _ (Rlt_le _ _ R0)) in Same.
+    unfold Rdiv in Same. rewrite Rmult_assoc, Rinv_l in Same by lra. lra. }
+  unfold under, share in U'. rewrite Eb, Ep in U'. pose proof (Rho h t2 Hh Hh2) as R0.
+  unfold V at 1. apply (Rmult_le_reg_r (rho h (place h t2))); auto.
+  unfold Rdiv. rewrite Rmult_assoc, Rinv_l by lra. fold c. lra.
 Qed.
 
 Lemma solution_length d w x : checked d w -> (0 < length (segments d))%nat -> solution d x ->
@@ -459,14 +612,16 @@ Proof.
   apply Condition.Forall2_length in F. unfold field in F. rewrite map_length in F. congruence.
 Qed.
 Theorem stays d w : check d (unmoved d) w = true -> (0 < length (segments d))%nat ->
-  forall x, solution d x ->
-  forall ta t, begin d <= ta -> ta <= t <= finish d -> inside d x ta -> inside d x t.
+  forall x, solution d x -> forall ta, begin d <= ta -> inside d x ta ->
+  (forall t, ta <= t <= finish d -> inside d x t) /\ decays d x ta.
 Proof.
-  intros H Hne x Hx ta t Ha Ht. pose proof (check_facts _ _ _ H) as C.
+  intros H Hne x Hx ta Ha Hin. pose proof (check_facts _ _ _ H) as C.
   pose proof (solution_length d w x C Hne Hx) as Lx. destruct Hx as [Cx Dx].
-  apply (stays_until d (unmoved d) w H x (fun g v => input d g (place g v) (at_time x v))
-    (begin d) (finish d)); try lra.
-  split; [|split]; auto. intros g off v Hg Hv _.
+  set (u := fun g v => input d g (place g v) (at_time x v)).
+  assert (F : follows d (unmoved d) x u ta (finish d)).
+  2:{ split; [intros t Ht; apply (stays_until d _ w H x u ta (finish d) Ha F ta t); auto; lra|].
+      exact (decays_until d _ w H x u ta Ha F Hin). }
+  split; [|split]; auto; [intros t Ht; apply Cx; lra|]. intros g off v Hg Hv _.
   assert (Eo : off = []).
   { apply in_combine_r in Hg. unfold unmoved in Hg. apply in_map_iff in Hg as [? [<- _]]. reflexivity. }
   subst off. split; [reflexivity|]. apply in_combine_l in Hg. exact (Dx g v Hg Hv).

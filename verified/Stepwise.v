@@ -649,6 +649,9 @@ Proof.
 Qed.
 End Stepwise.
 
-Theorem sampled_theorem {K : Ints} m p s w : sampled_ok m p s w = true ->
+Section Sampled.
+Context {K : Ints}.
+Theorem sampled_theorem m p s w : sampled_ok m p s w = true ->
   stays_in_tube m p s /\ arrives_from_inlet m p s.
 Proof. intros H. split; [exact (tube_stays m p s w H)|exact (inlet_arrives m p s w H)]. Qed.
+End Sampled.

@@ -7,7 +7,6 @@ Open Scope R_scope.
 Section Valid.
 Context {K : Ints}.
 
-Definition num_leb (a b : num) : bool := negb (num_ltb b a).
 Definition nmin (a b : num) : num := if num_ltb a b then a else b.
 (* the upper triangle of q P - rho g g' *)
 Fixpoint spread (q rho : num) (P : list (list num)) (g : list num) : list (list num) :=

@@ -182,10 +182,14 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
         ]
         for f in spans
     ]
-    claim: dict[str, Any] = {"goal": None}
+    claim: dict[str, Any] = {"goal": None, "decay": None}
+    for rate, floor in _maybe(terms["decay"]):
+        claim["decay"] = {"rate": number(rate), "floor": number(floor)}
     for centre, P in _maybe(terms["goal"]):
         claim["goal"] = {"centre": number(centre), "P": number(P)}
     proof = _witness(terms["proof"], len(clips), states, files["proof"][1]["proof"]["pieces"])
+    if claim["decay"]:
+        proof["pieces"] = [_unmultiplied(piece) for piece in proof["pieces"]]
     if claim["goal"] is None:
         proof["goal_multiplier"] = None
     if "turns" in terms:
@@ -209,7 +213,7 @@ def funnel(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str
 def composed(terms: dict[str, Any], files: dict[str, tuple[str, Any]]) -> dict[str, Any]:
     """The files of funnels that follow each other, and their proofs."""
     documents: dict[str, Any] = {"proof": {"proof": {"multipliers": number(terms["multipliers"])}}}
-    parts = ("field", "policy", "funnel", "goal")
+    parts = ("field", "policy", "funnel", "goal", "decay")
     for i, (stage, proof) in enumerate(zip(terms["stages"], terms["proofs"], strict=True), start=1):
         own = dict(zip(parts, stage.terms, strict=True)) | {"proof": proof}
         printed = funnel(own, {"proof": files[f"stage{i}.proof"]})
@@ -257,9 +261,9 @@ def _held(
         for turn in row:
             i, up, part = turn.terms
             piece = _piece(k, part, limited) | {"input": i, "sign": 1 if up.name == "true" else -1}
-            if part.terms[4] or piece.pop("mu")["shifts"]:
+            if part.terms[4]:
                 raise Differs("a rate piece with more than the file has")
-            found.setdefault(_place(piece), []).append(piece)
+            found.setdefault(_place(piece), []).append(_unmultiplied(piece))
     order = like["proof"].get("rate_pieces", [])
     pieces = [found[_place(piece)].pop(0) for piece in order if found.get(_place(piece))]
     if any(found.values()):
@@ -269,6 +273,13 @@ def _held(
         raise Differs("rates of what is not held")
     absent = "error" not in like["claim"] and not any(errors)
     return {"hold": period or None, "error": None if absent else errors}, held
+
+
+def _unmultiplied(piece: dict[str, Any]) -> dict[str, Any]:
+    """A piece that has no mu."""
+    if piece["mu"]["shifts"]:
+        raise Differs("a multiplier that the file does not have")
+    return {name: value for name, value in piece.items() if name != "mu"}
 
 
 def _place(piece: dict[str, Any]) -> str:

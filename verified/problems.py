@@ -28,8 +28,6 @@ class Funnel:
 
     def __init__(self, document: Any, content: str, folder: Path) -> None:
         self.claim, self.proof = document["claim"], document["proof"]
-        if "decay" in self.claim:
-            raise NotCovered("not covered by the second kernel: decay")
         self.files: Files = {"proof": (content, document)}
         roles = "vector_field policy funnel"
         files, digests = _bound(self.claim.get("about"), folder, roles, self.files)

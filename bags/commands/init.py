@@ -1,8 +1,11 @@
 """`nlsid init`: a first configuration from bags, asked for on a terminal or said by options."""
 
 import os
+import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 
 import typer
@@ -17,10 +20,12 @@ from bags.setup.proposing import choose, propose
 from bags.setup.written import yaml_text
 from bags.signals.expressions import parse_factors
 from bags.signals.reader import expanded
-from nlsid_core.errors import DataError
+from nlsid_core.errors import BagError, DataError
 from nlsid_core.files import write_atomically
 
 SHOWN = 9  # candidates in a question
+NAMED = 3  # bags that a command names one by one
+MANY = "BAGS"
 
 
 def run_init(
@@ -77,6 +82,7 @@ def run_init(
         definitions=definitions,
         types=types,
         widen=not excitations and not asked,
+        alone=not (responses or asked),
     )
     if definitions:  # a configuration's paths are seen from where it is
         proposal.content["definitions"] = [
@@ -91,7 +97,9 @@ def run_init(
         console.print(f"mind: {wall}", soft_wrap=True, markup=False, style="dark_orange3")
     console.print(proposal.expectation, soft_wrap=True, markup=False)
     console.print(f"wrote {target}; next:", soft_wrap=True, markup=False)
-    given = "TRIALS" if live else " ".join(map(str, bags))
+    given = "TRIALS" if live else said_briefly(bags)
+    if given == MANY:
+        console.print(f"  {MANY} stands for the {len(bags)} bags that you gave to init")
     if live:
         topics = dict.fromkeys(
             factor.path.topic for text in taken for factor in parse_factors(text)
@@ -117,6 +125,21 @@ def run_init(
     for step in steps:
         console.print(f"  {step}", soft_wrap=True, markup=False, highlight=False)
     return proposal
+
+
+def said_briefly(bags: Sequence[Path]) -> str:
+    """The bags in a command: by name if they are few, else their folder or a pattern, else MANY."""
+    if len(bags) <= NAMED:
+        return " ".join(shlex.quote(str(bag)) for bag in bags)
+    folder, meant = bags[0].parent, set(expand_bags(bags))
+    letters = takewhile(
+        lambda column: len(set(column)) == 1, zip(*(b.name for b in bags), strict=False)
+    )
+    for pattern in (folder, folder / f"{''.join(column[0] for column in letters)}*"):
+        with suppress(BagError):
+            if set(expand_bags([pattern])) == meant:
+                return str(pattern)
+    return MANY
 
 
 def _ask(

@@ -111,6 +111,8 @@ def monitor(
         seen = show.forecasts(entry, proved.design) if forecast else ()
         for line in (*seen, *show.replay_lines(entry)):
             out.print(line, soft_wrap=True, markup=False, highlight=False)
+    for line in () if as_json else show.paced_lines(replays):
+        out.print(line, soft_wrap=True, markup=False, highlight=False)
     if falsify is not None:
         bad = [f for f, r in zip(folders, replays, strict=True) if r.first_bad is not None]
         for said in (line for f in bad for line in falsified(funnel, f, falsify, types)):

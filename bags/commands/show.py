@@ -8,6 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from bags.chain.choosing import Compared, Selected
 from bags.chain.config import Config
@@ -38,10 +39,12 @@ COLOURS = {
     Status.UNKNOWN.value: "magenta",
 }
 COMPARISON_CAPTION = """\
-free run: simulated; +k: predicted k samples ahead. residual: coloured (not
-white), follows the input u, or both, at 99 %. rate: proved, a sample; forgets:
-its time constant. time: of the processor."""
+free run: simulated; +k: predicted k samples ahead, - of a class that predicts
+what it simulates. residual: coloured (not white), follows the input u, or both,
+at 99 %. rate: proved, a sample; forgets: its time constant. time: of the
+processor."""
 MOST_SAID = 100.0  # of what is assumed: nobody reads more of it
+COLUMNS = 80  # of a terminal that is not asked
 UNJUDGED_SAID = 3  # of the samples of a bag that are not judged, then their number
 STABILITY = "proved rate a sample (time constant)"
 
@@ -114,7 +117,7 @@ def gain_lines(found: Gain) -> list[str]:
     bound = f"gain at most {text.above(number)}" if least else (
         f"passivity index at least {text.below(number)}"
     )  # fmt: skip
-    lines = [f"{bound}{unit}{fading}: proved, of the model"]
+    lines = [f"{bound}{unit}{fading}: proved, of the model{_gain_conditions(found)}"]
     if (seen := found.reached) is None:
         lines.append("not compared with simulated runs")
     else:
@@ -127,6 +130,24 @@ def gain_lines(found: Gain) -> list[str]:
         shown = f"two simulated runs, a wave of {seen.frequency:.4g} Hz, {where}"
         lines.append(f"{bound}{unit}: {shown}")
     return [*lines, *str(found.verdict).splitlines()]
+
+
+def _gain_conditions(found: Gain) -> str:
+    """In which units signals count, and where the runs have to stay; empty if neither is stated."""
+    outputs, inputs = signals(found.model)
+    scales = [*zip(outputs, found.proof.y_scales, strict=True),
+              *zip(inputs, found.proof.u_scales, strict=True)]  # fmt: skip
+    counted = [f"{s.name} in units of {by:g} {s.unit}".rstrip() for s, by in scales if by != 1.0]
+    said = f", {' and '.join(counted)}" if counted else ""
+    if found.proof.box is None:
+        return said
+    ranges = [
+        f"{signal.name} in [{text.above(Fraction(low))}, {text.below(Fraction(high))}] "
+        f"{signal.unit}".rstrip()
+        for key, group in (("y", outputs), ("u", inputs))
+        for signal, (low, high) in zip(group, found.proof.box.get(key, []), strict=False)
+    ]
+    return f"{said}, for runs that stay in a box: {', '.join(ranges)}"
 
 
 def named_number(given: str) -> tuple[str, float]:
@@ -163,7 +184,7 @@ def comparison_table(compared: Compared) -> Group:
     """Every method of every class, scored on the same samples: a table a class, 80 columns."""
     left_out = f"after their first {compared.skipped_at_start} samples"
     parts: list[Table | str] = [f"{len(compared.trials.test)} test trials {left_out}; errors in %"]
-    horizons = list(compared.rows[0].scores.prediction_percent)
+    horizons = sorted({k for row in compared.rows for k in row.scores.prediction_percent})
     for label in dict.fromkeys(row.label for row in compared.rows):
         table = Table(title=escape(label), title_justify="left", box=SIMPLE_HEAD, padding=0)
         table.add_column("method", min_width=13, no_wrap=True)
@@ -189,10 +210,13 @@ def _compared(row: Scored, horizons: Sequence[int]) -> list[str]:
     if candidate.proof is not None:
         rate, _, rest = stated_rate(candidate.proof, candidate.model.period).partition(" (")
         rate, forgets = (f"[green]{rate}", rest.rstrip(")")) if rest else ("[green]proved", "")
-    errors = (scores.simulation_percent, *(scores.prediction_percent[k] for k in horizons))
+    ahead = [scores.prediction_percent.get(k) for k in horizons]
     return [
         candidate.method.name,
-        *(percent(error).removesuffix(" %") for error in errors),
+        *(
+            "-" if error is None else percent(error).removesuffix(" %")
+            for error in (scores.simulation_percent, *ahead)
+        ),
         flaws.get((scores.white, scores.independent), "both"),
         rate,
         forgets,
@@ -286,7 +310,10 @@ CATCHING_CAPTION = (
 
 
 def _after(caught: Caught) -> str:
-    return "-" if math.isnan(caught.after) else f"{caught.after:.2f}"
+    if math.isnan(caught.after):
+        return "-"
+    digits = next((d for d, least in ((0, 100.0), (1, 10.0)) if caught.after >= least), 2)
+    return f"{caught.after:.{digits}f}"
 
 
 def _soon(caught: Caught) -> str:
@@ -311,7 +338,7 @@ def say_catching(console: Console, catching: Catching, require: float | None) ->
             "robot; calibrate on more trials like those it will run, or raise safety_factor",
             soft_wrap=True, markup=False, highlight=False, style="dark_orange3",
         )  # fmt: skip
-    for line in catching.beyond:
+    for line in (*catching.beyond, *catching.still):
         said = f"warning: {line}"
         console.print(said, soft_wrap=True, markup=False, highlight=False, style="dark_orange3")
     wide = catching.warnings(WIDE if require is None else require)
@@ -366,19 +393,43 @@ def replay_lines(replay: Replay) -> Iterator[str]:
         yield f"{replay.name}: from {alarm.t:.3f} s on, {alarm.alarm}"
     for said in filter(None, (replay.clock, replay.said_filled, replay.said_wide)):
         yield f"{replay.name}: {said}"
-    for reading in replay.unjudged[:UNJUDGED_SAID]:
-        yield f"{replay.name}: not judged from {reading.t:.3f} s on: {reading.reason}"
-    if more := replay.unjudged[UNJUDGED_SAID:]:
-        yield (
-            f"{replay.name}: not judged later either: {len(more)} more, the last from "
-            f"{more[-1].t:.3f} s on"
-        )
     if not replay.judged:
-        yield f"{replay.name}: nothing was judged: {replay.reason}"
+        if not replay.paced:  # said of all such bags together
+            yield f"{replay.name}: nothing was judged: {replay.reason}"
+        return
+    if replay.starting > len(replay.judged):
+        yield (
+            f"{replay.name}: only {len(replay.judged)} of {len(replay.readings)} samples were "
+            f"judged: the first {replay.starting} start the run"
+        )
+    for stretch in replay.unjudged[:UNJUDGED_SAID]:
+        yield f"{replay.name}: not judged: {stretch.where}: {stretch.why}"
+    if more := replay.unjudged[UNJUDGED_SAID:]:
+        samples = sum(stretch.samples for stretch in more)
+        yield (
+            f"{replay.name}: not judged: {samples} more samples in {len(more)} "
+            f"{'place' if len(more) == 1 else 'places'}, the last {more[-1].where}"
+        )
+
+
+def paced_lines(replays: Sequence[Replay]) -> Iterator[str]:
+    """Once for all bags of which nothing was judged as their samples have another period."""
+    if not (other := [replay for replay in replays if replay.paced]):
+        return
+    named = [f"{replay.name} {replay.paced:.4g} s" for replay in other[:UNJUDGED_SAID]]
+    more = f" and {len(other) - len(named)} more" if len(other) > len(named) else ""
+    bags = "1 bag has samples" if len(other) == 1 else f"{len(other)} bags have samples"
+    yield (
+        f"nothing was judged: {bags} of another period than the model's {other[0].period:g} s: "
+        f"{', '.join(named)}{more}; record at the model's, or identify a model at theirs"
+    )
 
 
 def replay_table(replays: Sequence[Replay]) -> Table:
-    """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample."""
+    """One row per bag: verdict, worst margin, when, nearest bound, assumption, first bad sample.
+
+    COLUMNS wide or less: where a row is longer, its words go on in the next line, numbers never.
+    """
     table = Table(
         title="held against the funnel",
         caption="margin: worst; 1 on the nominal, 0 on the boundary of the tube. used: of what is "
@@ -389,40 +440,38 @@ def replay_table(replays: Sequence[Replay]) -> Table:
         show_edge=False,
         padding=0,
     )
-    for column, justify in (
-        ("bag", "left"),
-        ("verdict", "left"),
-        ("margin", "right"),
-        ("at", "right"),
-        ("axis", "left"),
-        ("used", "right"),
-        ("bad from", "right"),
-        ("judged", "right"),
-    ):
-        folded = column in ("bag", "verdict", "axis", "judged")  # on narrow terminals, never cut
-        width = {"bag": 8, "verdict": 10, "axis": 10}.get(column)
+    rows = [_replay_row(replay) for replay in replays]
+    names = ("bag", "verdict", "margin", "at", "axis", "used", "bad from", "judged")
+    cells = zip(names, *rows, strict=True)
+    widths = [max(len(Text.from_markup(cell)) for cell in column) for column in cells]
+    kept = dict(zip(names, widths, strict=True))
+    if sum(widths) + len(widths) > COLUMNS:
+        kept |= {"verdict": 10, "axis": min(kept["axis"], 10), "judged": 8}
+        kept["bag"] = max(COLUMNS + kept["bag"] - sum(kept.values()) - len(kept), 8)
+    for name in names:
+        left = name in ("bag", "verdict", "axis")
         table.add_column(
-            column,
-            justify=justify,  # type: ignore[arg-type]
-            no_wrap=not folded,
-            overflow="fold",
-            min_width=width,
+            name, justify="left" if left else "right", width=kept[name], overflow="fold"
         )
-    for replay in replays:
-        worst, bad = replay.worst, replay.first_bad
-        colour = COLOURS[replay.verdict]
-        alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
-        table.add_row(
-            replay.name,
-            f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
-            "-" if worst is None else f"{worst.margin:.3f}",
-            "-" if worst is None else f"{worst.t:.3f} s",
-            "-" if worst is None else worst.worst_axis,
-            "-" if worst is None else _percent(replay.assumption),
-            "-" if bad is None else f"{bad.t:.3f} s",
-            f"{replay.judged_span:.1f} of {replay.span:.1f} s",
-        )
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def _replay_row(replay: Replay) -> list[str]:
+    worst, bad = replay.worst, replay.first_bad
+    colour = COLOURS[replay.verdict]
+    alarm = ", alarm" if bad is None and replay.first_alarm is not None else ""
+    return [
+        escape(replay.name),
+        f"[{colour}]{replay.verdict}[/{colour}]{alarm}",
+        "-" if worst is None else f"{worst.margin:.3f}",
+        "-" if worst is None else f"{worst.t:.3f} s",
+        "-" if worst is None else escape(worst.worst_axis),
+        "-" if worst is None else _percent(replay.assumption),
+        "-" if bad is None else f"{bad.t:.3f} s",
+        f"{replay.judged_span:.1f} of {replay.span:.1f} s",
+    ]
 
 
 def _percent(part: float) -> str:

@@ -47,9 +47,9 @@ class Judged:
     was broken first, without numbers. spent: the largest part of what is assumed that was used
     (None: not measured), at spent_at, s of the run. margin: the least (None: nothing judged),
     margin_at: s. start: the bag's first log time, spent_when, and bad_from: of the first bad
-    sample, all ISO 8601 in UTC; bad_at: s of the run. alarm: of the second alarm. unjudged: from
-    where on it was not judged, and why, also of a bag that is bad. clock: where its stamps go back.
-    judged, span: s. filled: samples nobody measured. digest: of the recording.
+    sample, all ISO 8601 in UTC; bad_at: s of the run. alarm: of the second alarm. unjudged: the
+    first samples that were not judged, and why, also of a bag that is bad. clock: where its stamps
+    go back. judged, span: s. filled: samples nobody measured. digest: of the recording.
     """
 
     bag: str
@@ -145,7 +145,7 @@ def _unjudged(replay: Replay) -> str:
     if not replay.unjudged:
         return ""
     first, *more = replay.unjudged
-    said = f"from {first.t:.3f} s on: {first.reason}"
+    said = f"{first.where}: {first.why}"
     return f"{said} (and later in {len(more)} more places)" if more else said
 
 

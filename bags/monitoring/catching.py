@@ -177,7 +177,7 @@ class Width:
 
     range: of the trials given, in the output's unit as are the others. error: of the simulation.
     half_width: on average over the calibration trials, where it follows the commands between
-    `least` and `most`.
+    `least` and `most`. moves: its range within a calibration trial, the median of them.
     """
 
     name: str
@@ -187,6 +187,7 @@ class Width:
     error: float
     least: float | None = None
     most: float | None = None
+    moves: float = float("inf")
 
     @property
     def said(self) -> str:
@@ -241,6 +242,19 @@ class Catching:
             "says nothing there"
             for width in self.widths
             if width.most is not None and width.most > width.range
+        ]
+
+    @property
+    def still(self) -> list[str]:
+        """What to know of a tube that is narrow in the range and wide in most trials."""
+        return [
+            f"the half-width of {width.name} is {_up(width.half_width)} {width.unit}, and within a "
+            f"calibration trial {width.name} moves by {width.moves:.3g} {width.unit} (the median): "
+            "even if it stood still in the middle of such a trial, it would not leave the tube, "
+            "which can hardly tell anything there. What is caught is then caught by what is "
+            "assumed, which the monitor watches too (violated, above)"
+            for width in self.widths
+            if width.share <= WIDE and width.half_width > WIDE * width.moves
         ]
 
     def warnings(self, most: float = WIDE) -> list[str]:
@@ -358,10 +372,16 @@ def what_it_catches(
     if len(following):
         half_widths = following.mean(axis=0).tolist()
         limits = list(zip(following.min(axis=0), following.max(axis=0), strict=True))
-    named = zip(first.y_names, first.y_units, half_widths, ranges, errors, limits, strict=True)
+    moves = np.median([np.ptp(trial.y, axis=0) for trial in calibration], axis=0)
+    named = zip(
+        first.y_names, first.y_units, half_widths, ranges, errors, limits, moves, strict=True
+    )
     shares = {trial.name: run.share for trial, run in zip(calibration, scaling, strict=True)}
     return Catching(
-        tuple(Width(n, u, float(w), float(r), float(e), *ends) for n, u, w, r, e, ends in named),
+        tuple(
+            Width(n, u, float(w), float(r), float(e), least, most, float(m))
+            for n, u, w, r, e, (least, most), m in named
+        ),
         tuple(rows),
         len(held_back),
         factor,

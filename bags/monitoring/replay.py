@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +30,50 @@ STRING = "std_msgs/msg/String"
 RUN_TOPIC = "/run"  # how the topic of a controller's announcement ends
 
 
+OTHER_PACE: Final = 0.02  # of the period: clocks differ by less
+LEAST_PACED: Final = 3  # samples of which a pace is told
 MOST_WIDE: Final = 0.05  # of the samples: a tube wider than the signal in more is said
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Samples that were not judged, from `start` to `end` s: how many, and why, as it came.
+
+    starting: the last of them, from which a new run was started.
+    """
+
+    start: float
+    end: float
+    samples: int
+    reasons: tuple[str, ...]
+    starting: int = 0
+
+    @property
+    def where(self) -> str:
+        """How many samples, and when."""
+        if self.samples == 1:
+            return f"1 sample at {self.start:.3f} s"
+        return f"{self.samples} samples from {self.start:.3f} to {self.end:.3f} s"
+
+    @property
+    def why(self) -> str:
+        """The reasons one after another, and what a new run needed."""
+        started = f"{self.starting} to start a new run"
+        return "; then ".join([*self.reasons, started] if self.starting else self.reasons)
+
+
+def _joined(row: Sequence[Stretch]) -> Stretch:
+    """Stretches that follow each other as one; a cause is said where it comes first."""
+    reasons = {cause(why): why for part in reversed(row) for why in reversed(part.reasons)}
+    starting = sum(1 for _ in takewhile(lambda part: not part.reasons, reversed(row)))
+    samples = sum(part.samples for part in row)
+    return Stretch(
+        row[0].start,
+        max(part.end for part in row),
+        samples,
+        tuple(reversed(reasons.values())),
+        starting,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +103,26 @@ class Replay:
         return stamps[-1] - stamps[0] + self.period if stamps else 0.0
 
     @property
+    def starting(self) -> int:
+        """Of how many samples the run's start is made."""
+        return sum(1 for _ in takewhile(lambda reading: reading.starts, self.readings))
+
+    @property
     def judged_span(self) -> float:
         """S of it that were judged."""
         return min(self.period * len(self.judged), self.span)
+
+    @property
+    def paced(self) -> float:
+        """S between samples, the median, where nothing was judged and it is not the period; else 0.
+
+        A sample is judged only on the grid of the period.
+        """
+        stamps = [reading.t for reading in self.readings if reading.reason != LOST]
+        if self.judged or len(stamps) < LEAST_PACED or not self.period:
+            return 0.0
+        pace = float(np.median(np.diff(stamps)))
+        return pace if abs(pace - self.period) > OTHER_PACE * self.period else 0.0
 
     @property
     def fans(self) -> list[list[Forecasted]]:
@@ -110,17 +171,30 @@ class Replay:
         )
 
     @property
-    def unjudged(self) -> tuple[Reading, ...]:
-        """The first reading of every stretch that was not judged, starts left out.
+    def unjudged(self) -> tuple[Stretch, ...]:
+        """Every stretch that was not judged, starts left out that are no part of one.
 
-        Of samples that never came, one that says so; of filled ones, one where they are more than
-        MOST_FILLED of all.
+        Filled samples are one stretch where they are more than MOST_FILLED of all.
         """
-        said, found = "", []
+        found: list[Stretch] = []
         if self.filled > MOST_FILLED * len(self.readings):
-            first = next(filter(_filled, self.readings))
+            times = [reading.t for reading in self.readings if _filled(reading)]
             reason = f"{self.said_filled}: more than {100 * MOST_FILLED:g} %"
-            found.append(first._replace(reason=reason))
+            found.append(Stretch(times[0], times[-1], len(times), (reason,)))
+        row: list[Stretch] = []
+        for part, opens in (*self._parts(), (None, False)):
+            if part is not None and (row or opens):
+                row.append(part)
+            elif row:
+                found.append(_joined(row))
+                row = []
+        return tuple(found)
+
+    def _parts(self) -> Iterator[tuple[Stretch | None, bool]]:
+        """Sample by sample what was not judged, None if it was, and whether that is a loss.
+
+        Samples that never came are one part; those that start a run and filled ones are no loss.
+        """
         before: Reading | None = None
         for reading in self.readings:
             if reading.reason == LOST:
@@ -129,14 +203,13 @@ class Replay:
             if before is not None and self.period > 0.0 and not starts:
                 lost = round((reading.t - before.t) / self.period) - 1
                 if lost > 0:
-                    reason = f"{lost} samples are missing"
-                    t = before.t + self.period
-                    found.append(Reading(t, Status.UNKNOWN, reason=reason))
-            again, said = said, cause(reading.reason) if _unjudged(reading) else ""
-            if said and said != again:
-                found.append(reading)
+                    said = "1 sample is" if lost == 1 else f"{lost} samples are"
+                    first, last = before.t + self.period, before.t + lost * self.period
+                    yield Stretch(first, last, lost, (f"{said} missing",)), True
+            why = () if reading.starts else (reading.reason,)
+            unknown = reading.status is Status.UNKNOWN
+            yield Stretch(reading.t, reading.t, 1, why) if unknown else None, _unjudged(reading)
             before = reading
-        return tuple(found)
 
     @property
     def judged(self) -> tuple[Reading, ...]:
@@ -186,8 +259,10 @@ class Replay:
         """Why it is not inside; empty if it is."""
         if self.first_bad is not None:
             return self.first_bad.reason
+        if self.paced:
+            return f"its samples come every {self.paced:.4g} s, the model's every {self.period:g} s"
         if self.unjudged:
-            return self.unjudged[0].reason
+            return self.unjudged[0].reasons[0]
         return "" if self.judged or not self.readings else self.readings[-1].reason
 
 

@@ -13,7 +13,7 @@ from bags.pictures.plots import BLUE, GREY, INK, LINE, ORANGE, RED, tidy
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.identification import Candidate, Fit, History, Model, Validation, simulate_trial
-from nlsid_core.identification.prediction import history
+from nlsid_core.identification.prediction import history, learns
 from nlsid_core.models import BlockCascade, CellNetwork, DifferenceEquation, MonotoneEquation
 from nlsid_core.models.monotone_equation import solve_increasing
 
@@ -75,6 +75,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
     figure = Figure(figsize=(3.3 * (2 + n_u), 2.7 * n_y + 0.4), layout="constrained")
     grid = figure.subplots(n_y, 2 + n_u, squeeze=False)
     start = max(history(chosen.model), chosen.transient)
+    predicts = learns(chosen.model)
     for i in range(n_y):
         over_time, auto, *crossed = grid[i]
         for trial in test:
@@ -86,7 +87,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
         lags = np.arange(1, scores.one_step.autocorrelation.shape[1] + 1)
         _correlations(
             auto, lags, scores.one_step.autocorrelation[i], scores.simulation.autocorrelation[i],
-            scores.one_step.band,
+            scores.one_step.band, predicts=predicts,
         )  # fmt: skip
         auto.set_title("autocorrelation", fontsize=8, loc="left")
         both = np.arange(-len(lags), len(lags) + 1)
@@ -94,6 +95,7 @@ def residuals(chosen: Candidate[Model], scores: Validation, test: Dataset) -> Fi
             _correlations(
                 axes, both, scores.one_step.cross_correlation[i, j],
                 scores.simulation.cross_correlation[i, j], scores.one_step.cross_band[i, j],
+                predicts=predicts,
             )  # fmt: skip
             axes.set_title(f"with {first.u_names[j]}", fontsize=8, loc="left")
         for axes in grid[i, 1:]:
@@ -194,11 +196,20 @@ def _poles(axes: Axes, groups: Sequence[tuple[str, np.ndarray]], chosen: Candida
 
 
 def _correlations(
-    axes: Axes, lags: np.ndarray, one_step: FloatArray, simulated: FloatArray, band: float
+    axes: Axes,
+    lags: np.ndarray,
+    one_step: FloatArray,
+    simulated: FloatArray,
+    band: float,
+    *,
+    predicts: bool,
 ) -> None:
-    axes.axhspan(-band, band, color=GREY, alpha=0.3, lw=0, label="99 % of one-step values")
-    axes.vlines(lags, 0.0, one_step, color=BLUE, lw=LINE, label="one step ahead")
-    axes.plot(lags, one_step, ".", color=BLUE, ms=4)
+    """predicts: whether one step ahead is more than the simulation."""
+    bounded = f"99 % of {'one-step' if predicts else 'white'} values"
+    axes.axhspan(-band, band, color=GREY, alpha=0.3, lw=0, label=bounded)
+    if predicts:
+        axes.vlines(lags, 0.0, one_step, color=BLUE, lw=LINE, label="one step ahead")
+        axes.plot(lags, one_step, ".", color=BLUE, ms=4)
     axes.plot(lags, simulated, color=ORANGE, lw=LINE, label="simulated")
     axes.axhline(0.0, color=INK, lw=0.5)
 

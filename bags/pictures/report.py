@@ -102,7 +102,8 @@ def _catching(catching: Catching, drawn: str) -> str:
         f"{escape(w.name)} {escape(w.said)}, {escape(w.part)}" for w in catching.widths
     )
     wide = "".join(
-        f'<p class="not">{escape(line)}</p>' for line in [*catching.beyond, *catching.warnings()]
+        f'<p class="not">{escape(line)}</p>'
+        for line in (*catching.beyond, *catching.still, *catching.warnings())
     )
     return f"""
 <h2>The funnel: what it can catch</h2>

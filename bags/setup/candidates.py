@@ -103,6 +103,11 @@ class Candidate:
         return self.text.partition(":")[0]
 
     @property
+    def kind(self) -> tuple[str, str, str]:
+        """What numbers of several joints or sensors have in common: type, unit and operations."""
+        return self.msgtype, self.unit, self.text.partition("|")[2]
+
+    @property
     def is_position(self) -> bool:
         """Whether it is a position or an angle, which may add up what drives it for ever."""
         named = POSITION.search(_field(self.text)) or "|unwrap" in self.text

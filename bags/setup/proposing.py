@@ -77,11 +77,13 @@ def propose(
     definitions: Sequence[Path] = (),
     types: Mapping[str, Definition] | None = None,
     widen: bool = False,
+    alone: bool = False,
 ) -> Proposal:
     """A configuration of these signals for these bags, tried on them.
 
     widen: where models of one excitation are poor, take those too that the response follows
-    besides, if that is better. Raises BagError and DataError if the bags cannot be read as any
+    besides, if that is better. alone: nobody chose the one response, and others like it are said.
+    Raises BagError and DataError if the bags cannot be read as any
     configuration says.
     """
     texts = [*responses, *excitations]
@@ -128,6 +130,7 @@ def propose(
             bags, found, responses=responses, excitations=[*excitations, *others], robot=robot,
             definitions=definitions, types=types,
         )  # fmt: skip
+        wider.walls += _beside(wider, found) if alone else []
         if wider.error < proposal.error:
             without = f"; without it models are off by {proposal.error:.3g} %"
             wider.why |= {text: wider.why[text] + without for text in others}
@@ -136,7 +139,43 @@ def propose(
         say_class(proposal, trials.train)
     if POOR < proposal.error < math.inf:
         _say_poor(proposal, found)
+    proposal.walls += _beside(proposal, found) if alone else []
     return proposal
+
+
+def _beside(proposal: Proposal, found: Found) -> list[str]:
+    """How the responses of the chosen one's kind are added, with what each of them follows."""
+    signals = proposal.content["signals"]
+    responses, excitations = (
+        [signal["path"] for signal in signals[role]] for role in ("response", "excitation")
+    )
+    chosen = next((c for c in found.candidates if c.text == responses[0]), None)
+    others = {
+        pair.response.text: pair
+        for pair in reversed(found.pairs)  # the best of each response stays
+        if chosen is not None
+        and pair.response.text not in (*responses, *excitations)
+        and pair.response.kind == chosen.kind
+        and pair.command.text not in responses
+        and abs(pair.correlation) >= RELATED
+    }
+    if not others:
+        return []
+    said = "; ".join(
+        f"{text} follows {pair.command.text} ({pair.correlation:+.2f})"
+        for text, pair in sorted(others.items())
+    )
+    every_u = dict.fromkeys([*excitations, *(pair.command.text for pair in others.values())])
+    options = " ".join(
+        f"{option} '{text}'"
+        for option, texts in (("-y", sorted([*responses, *others])), ("-u", sorted(every_u)))
+        for text in texts
+    )
+    return [
+        f"only one response is modelled here, and there are others like it: {said}. If they move "
+        f"each other, one model of all of them is better: run init with {options}. If not, make a "
+        "configuration of each, with its own -y and -u"
+    ]
 
 
 def _say_poor(proposal: Proposal, found: Found) -> None:

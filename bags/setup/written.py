@@ -19,7 +19,8 @@ HEAD: Final = (
 
 def yaml_text(proposal: Proposal) -> str:
     """The whole file; what the later steps will meet stands at its head."""
-    lines = [*_comment(HEAD), *_comment(f"{proposal.expectation}.".capitalize())]
+    expected = proposal.expectation
+    lines = [*_comment(HEAD), *_comment(f"{expected[0].upper()}{expected[1:]}.")]
     for wall in dict.fromkeys(proposal.walls):
         lines += _comment(f"Mind: {wall}")
     return "\n".join([*lines, *_section(proposal.content, Config, proposal.why, 0)]) + "\n"

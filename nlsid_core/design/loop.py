@@ -40,6 +40,13 @@ def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path,
         if not is_gain(path):
             raise CertificateRejected(f"{path} is no proof of a gain")
         document = files.load_document(path)
+        supply = document["claim"].get("supply")
+        kind = supply.get("kind") if isinstance(supply, dict) else None
+        if kind != "gain":
+            raise CertificateRejected(
+                f"{path} proves {kind or 'something else'}, not a gain: a loop is proved by two "
+                "gains, which `nlsid gain` finds without --passivity"
+            )
         binding = files.member(document["claim"]["about"], "model", dict, source=str(path))
         name = files.member(binding, "file", str, source=str(path))
         beside = path.parent / name
@@ -50,7 +57,7 @@ def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path,
         proof = files.encode(document)
         contents |= {f"{role}.model.json": beside.read_bytes(), f"{role}.proof.json": proof}
         about[role] = {"file": f"{role}.proof.json", "digest": files.digest(proof)}
-        numbers.append(document["claim"].get("supply", {}).get("number", 0.0))
+        numbers.append(supply.get("number", 0.0))
     one, two = numbers
     if one * two >= 1.0:
         raise Infeasible(

@@ -15,7 +15,7 @@ SAMPLES = 9  # per interval, where a defect is looked for
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """x: states (n,), continuous; u: inputs (m,); the same knots.
+    """x: states (n,), continuous; u: inputs (m,); the same knots. A jump of rounding is closed.
 
     Raises ShapeError or DataError if they do not fit together.
     """
@@ -28,8 +28,15 @@ class Nominal:
             raise ShapeError("nominal states and inputs should be vectors")
         if not np.array_equal(self.x.t, self.u.t):
             raise DataError("nominal states and inputs should have the same knots")
+        for name in ("x", "u"):
+            object.__setattr__(self, name, getattr(self, name).joined())
         if not self.x.is_continuous():
-            raise DataError("the nominal states should be continuous")
+            jump = np.abs(self.x.control[1:, 0] - self.x.control[:-1, -1])
+            k, i = np.unravel_index(int(jump.argmax()), jump.shape)
+            raise DataError(
+                f"the nominal states should be continuous: x{i} jumps by {jump[k, i]:.3g} at "
+                f"{self.t[k + 1]:.6g} s"
+            )
 
     @property
     def t(self) -> FloatArray:

@@ -15,6 +15,7 @@ from nlsid_core.arrays import ArrayLike, FloatArray, Json, keep
 from nlsid_core.errors import DataError, ShapeError
 
 MAX_DEGREE = 3  # what the checker restricts to sub-intervals exactly
+ROUNDING = 1e-12  # of an entry's largest value: what a hundred roundings may make of no jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +103,18 @@ class PiecewisePolynomial:
                 pieces.append(control)
             t.append(float(self.t[k + 1]))
         return PiecewisePolynomial(np.array(t), np.array(pieces))
+
+    def joined(self) -> "PiecewisePolynomial":
+        """The same function without jumps that are no larger than rounding."""
+        first, last = self.control[1:, 0], self.control[:-1, -1]
+        jump = np.abs(first - last)
+        size = np.abs(self.control).max(axis=(0, 1), initial=0.0)
+        small = (jump > 0) & (jump <= ROUNDING * size)
+        if not small.any():
+            return self
+        control = self.control.copy()
+        control[1:, 0] = np.where(small, last, first)
+        return PiecewisePolynomial(self.t, control)
 
     def is_continuous(self) -> bool:
         """True if every piece begins exactly where the one before ends."""

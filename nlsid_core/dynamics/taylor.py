@@ -4,7 +4,6 @@
 are cubics as they are written stay what they are; every other one has a bounded w of its own.
 """
 
-import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -15,7 +14,7 @@ import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
-from nlsid_core.dynamics.vector_field import ARGUMENTS, VectorField, variable_names
+from nlsid_core.dynamics.vector_field import VectorField, arguments, variable_names
 from nlsid_core.errors import DataError, NlsidError, NotPolynomial, ShapeError
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.polynomial.algebra import as_polynomial, variables
@@ -61,9 +60,7 @@ class Rates:
         """Look at the function once, with symbols."""
         box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
         _refuse_box(box)
-        given = tuple(inspect.signature(function).parameters)
-        if not given or not set(given) <= set(ARGUMENTS):
-            raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        given = arguments(function)
         if len(box) and "w" not in given:
             raise DataError("uncertain has rows, but the dynamics have no argument w")
         if "w" in given and not len(box):
@@ -85,14 +82,14 @@ class Rates:
         """Only for values at points: nothing is asked of the function but numbers."""
         box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
         _refuse_box(box)
-        if "w" in inspect.signature(function).parameters and not len(box):
+        if "w" in arguments(function) and not len(box):
             raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
         return cls(function, n, m, box, (), ())
 
     @property
     def depends_on_time(self) -> bool:
         """True if the function has an argument t."""
-        return "t" in inspect.signature(self.function).parameters
+        return "t" in arguments(self.function)
 
     @property
     def inexact(self) -> list[int]:
@@ -113,9 +110,7 @@ class Rates:
         parts = {"t": z[0], "x": held[1 : 1 + n], "u": held[1 + n : 1 + n + m],
                  "w": held[1 + n + m :]}  # fmt: skip
         try:
-            rows = self.function(
-                *(parts[name] for name in inspect.signature(self.function).parameters)
-            )
+            rows = self.function(**{name: parts[name] for name in arguments(self.function)})
             rows = list(np.asarray(rows, dtype=object).reshape(-1)) if isinstance(
                 rows, np.ndarray) else list(rows)  # fmt: skip
         except NlsidError:
@@ -138,11 +133,11 @@ class Rates:
         X, U = (np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in (X, U))
         given = self.uncertain.mean(axis=1) if W is None else np.asarray(W, dtype=np.float64)
         W = np.broadcast_to(given, (len(X), len(self.uncertain)))
-        names = tuple(inspect.signature(self.function).parameters)
+        names = arguments(self.function)
 
         def called(x: FloatArray, u: FloatArray, w: FloatArray) -> Any:
             parts = {"t": t, "x": x, "u": u, "w": w}
-            return self.function(*(parts[name] for name in names))
+            return self.function(**{name: parts[name] for name in names})
 
         first = np.asarray(called(X[0], U[0], W[0]), dtype=np.float64).reshape(-1)
         if first.shape != (self.n,):

@@ -135,19 +135,19 @@ class TaylorModel:
 
     def sin(self) -> "TaylorModel":
         """Its sine."""
-        c = self.centre
-        left = min(1.0, abs(sin(c)) + self._spread()) / 24
+        c, b = self._around()
+        left = min(1.0, abs(sin(c)) + b) / 24
         return self._composed([sin(c), cos(c), -sin(c) / 2, -cos(c) / 6], left)
 
     def cos(self) -> "TaylorModel":
         """Its cosine."""
-        c = self.centre
-        left = min(1.0, abs(cos(c)) + self._spread()) / 24
+        c, b = self._around()
+        left = min(1.0, abs(cos(c)) + b) / 24
         return self._composed([cos(c), -sin(c), -cos(c) / 2, sin(c) / 6], left)
 
     def tan(self) -> "TaylorModel":
         """Its tangent. Raises DataError if the box reaches a pole."""
-        c, b = self.centre, self._spread()
+        c, b = self._around()
         from_pole = pi / 2 - abs((c + pi / 2) % pi - pi / 2)
         if b * SUMMED >= from_pole - CLEAR_OF_POLE:
             raise DataError(f"the tangent of a value that may be at a pole, {c:.3g} ± {b:.3g}")
@@ -158,32 +158,32 @@ class TaylorModel:
 
     def exp(self) -> "TaylorModel":
         """Its exponential."""
-        c = self.centre
+        c, b = self._around()
         E = exp(c)
-        return self._composed([E, E, E / 2, E / 6], exp(c + self._spread()) * SUMMED / 24)
+        return self._composed([E, E, E / 2, E / 6], exp(c + b) * SUMMED / 24)
 
     def log(self) -> "TaylorModel":
         """Its natural logarithm. Raises DataError unless it is positive on the box."""
-        c, least = self.centre, self._least("the logarithm of")
+        c, least = self._positive("the logarithm of")
         return self._composed([log(c), 1 / c, -1 / (2 * c**2), 1 / (3 * c**3)], 1 / (4 * least**4))
 
     def sqrt(self) -> "TaylorModel":
         """Its root. Raises DataError unless it is positive on the box."""
-        c, least = self.centre, self._least("the root of")
+        c, least = self._positive("the root of")
         r = sqrt(c)
         series = [r, 1 / (2 * r), -1 / (8 * r * c), 1 / (16 * r * c * c)]
         return self._composed(series, 5 / 128 / (sqrt(least) * least**3))
 
     def tanh(self) -> "TaylorModel":
         """Its hyperbolic tangent."""
-        T = tanh(self.centre)
+        T = tanh(self._around()[0])
         one = 1 - T * T
         series = [T, one, -T * one, -one * (1 - 3 * T * T) / 3]
         return self._composed(series, MOST_FOURTH["tanh"], cancelled=1.0)
 
     def arctan(self) -> "TaylorModel":
         """Its arc tangent."""
-        c = self.centre
+        c, _ = self._around()
         q = 1 + c * c
         series = [atan(c), 1 / q, -c / q**2, (3 * c * c - 1) / (3 * q**3)]
         return self._composed(series, MOST_FOURTH["arctan"], cancelled=1.0)
@@ -194,7 +194,7 @@ class TaylorModel:
         return _angle(self, x)
 
     def __abs__(self) -> "TaylorModel":
-        c, b = self.centre, self._spread()
+        c, b = self._around()
         if abs(c) >= b:
             return self if c >= 0 else -self
         most = self.size  # |s| is between s²/most and s²/most + most/4
@@ -209,39 +209,56 @@ class TaylorModel:
 
     def reciprocal(self) -> "TaylorModel":
         """One over it. Raises DataError if it may be zero on the box."""
-        c = self.centre
-        if c < 0:
+        if self._around()[0] < 0:
             return -((-self).reciprocal())
-        least = self._least("division by", "may be zero")
+        c, least = self._positive("division by", "may be zero")
         return self._composed([1 / c, -1 / c**2, 1 / c**3, -1 / c**4], 1 / least**5)
 
-    def _least(self, what: str, otherwise: str = "may not be positive") -> float:
-        """A positive lower bound, or DataError."""
-        least = (self.centre - self._spread() * SUMMED) / SUMMED
+    def _positive(self, what: str, otherwise: str = "may not be positive") -> tuple[float, float]:
+        """The middle of its values and a positive lower bound, or DataError."""
+        c, b = self._around()
+        least = (c - b * SUMMED) / SUMMED
         if least <= 0:
-            raise DataError(f"{what} a value that {otherwise} in the box around {self.centre:.3g}")
-        return least
+            raise DataError(f"{what} a value that {otherwise} in the box around {c:.3g}")
+        return c, least
 
     def _spread(self) -> float:
         """A bound of how far from its centre it is."""
         return (float(np.abs(self.coefficients[1:]).sum()) + self.error) * SUMMED
 
+    def _around(self) -> tuple[float, float]:
+        """c, b with all its values within b of c: where squares have a sign, c is not its centre.
+
+        pd + qd² is between its values at d = ±1, and -p²/4q where |p| < 2|q|.
+        """
+        squares, lines, others = _alone(self.keys.tobytes())
+        q = self.coefficients[squares]
+        if not q.any():
+            return self.centre, self._spread()
+        p = np.where(lines > 0, np.abs(self.coefficients[lines]), 0.0)
+        inside = p < 2 * np.abs(q)
+        vertex = np.divide(-(p**2), 4 * q, out=np.zeros_like(q), where=inside)
+        low = np.where(inside & (q > 0), vertex, q - p)
+        high = np.where(inside & (q < 0), vertex, q + p)
+        c = self.centre + float((low + high).sum()) / 2
+        rest = float((high - low).sum()) / 2 + float(np.abs(self.coefficients[others]).sum())
+        return c, (rest + self.error) * SUMMED + (SUMMED - 1) * self.size
+
     def _composed(
         self, series: list[float], fourth: float, *, cancelled: float = 0.0
     ) -> "TaylorModel":
-        """Σ series_i δ^i, δ = self - centre, and what is left: `fourth`·δ⁴ at most.
+        """Σ series_i δ^i, δ = self - c of `_around`, and what is left: `fourth`·δ⁴ at most.
 
         cancelled: the size of what a coefficient of the series is a difference of.
         """
-        without = self.coefficients.copy()
-        without[0] = 0.0
-        delta = TaylorModel(self.keys, without, self.error)
+        c, within = self._around()
+        delta = self + -c
         b = delta.size
         result = delta * series[3] + series[2]
         for term in (series[1], series[0]):
             result = result * delta + term
         lost = ROUNDING * sum((abs(term) + cancelled) * b**i for i, term in enumerate(series))
-        error = (result.error + fourth * SUMMED * b**4 + lost) * SUMMED
+        error = (result.error + fourth * SUMMED * within**4 + lost) * SUMMED
         return TaylorModel(result.keys, result.coefficients, error)
 
     def _scaled(self, factor: float, exact: bool) -> "TaylorModel":
@@ -312,6 +329,19 @@ def _digits(keys: IntArray) -> IntArray:
 def variables_of(key: int) -> tuple[int, ...]:
     """The variables, counted from 0, of one monomial; twice where squared."""
     return tuple(int(d) - 1 for d in _digits(np.array(key)) if d)
+
+
+@lru_cache(maxsize=4096)
+def _alone(a: bytes) -> tuple[IntArray, IntArray, IntArray]:
+    """Where squares d_j² are, where d_j is (0: nowhere), and where what is neither is."""
+    keys = np.frombuffer(a, dtype=np.int64)
+    digits = _digits(keys)
+    squares = np.flatnonzero((digits[:, 0] == 0) & (digits[:, 1] > 0)
+                             & (digits[:, 1] == digits[:, 2]))  # fmt: skip
+    places = {key: k for k, key in enumerate(keys.tolist())}
+    lines = np.array([places.get(j, 0) for j in digits[squares, 2].tolist()], dtype=np.int64)
+    others = np.setdiff1d(np.arange(1, len(keys)), np.concatenate([squares, lines]))
+    return squares, lines, others
 
 
 @lru_cache(maxsize=4096)

@@ -110,16 +110,14 @@ class VectorField:
         Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
         """
         bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
-        given = tuple(inspect.signature(function).parameters)
-        if not given or not set(given) <= set(ARGUMENTS):
-            raise DataError(f"dynamics should be a function of some of t, x, u, w, is of {given}")
+        given = arguments(function)
         if len(bounds) and "w" not in given:
             raise DataError("uncertain has rows, but the dynamics have no argument w")
         sizes = {"t": 1, "x": n, "u": m, "w": len(bounds)}
 
         def called(*vectors: Any) -> Any:
-            passed = [v[0] if name == "t" else v for name, v in zip(given, vectors, strict=True)]
-            return function(*passed)
+            parts = zip(given, vectors, strict=True)
+            return function(**{name: v[0] if name == "t" else v for name, v in parts})
 
         called.__name__ = getattr(function, "__name__", "dynamics")
         try:
@@ -358,6 +356,23 @@ class _Plan:
         for i, (a, b) in enumerate(self.products, start=size + 1):
             np.multiply(stack[a], stack[b], out=stack[i])
         return (self.table @ stack).T
+
+
+def arguments(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Which of t, x, u, w a function of dynamics takes; it is called with them by name.
+
+    What else it takes keeps its default. DataError of what has none, and if it takes none of them.
+    """
+    given = inspect.signature(function).parameters.values()
+    names = tuple(p.name for p in given if p.name in ARGUMENTS)
+    unknown = [p for p in given if p.name not in ARGUMENTS and p.default is p.empty]
+    if not names or unknown or any(p.kind is p.POSITIONAL_ONLY for p in given):
+        said = ", ".join(map(str, given))
+        raise DataError(
+            "dynamics should be a function of some of t, x, u, w, by these names, and of nothing "
+            f"else without a default value; it is of ({said})"
+        )
+    return names
 
 
 def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:

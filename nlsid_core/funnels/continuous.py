@@ -153,14 +153,6 @@ class ContinuousFunnel:
         volumes = np.array([self.volume(s) for s in self.t])
         return float((volumes[1:] + volumes[:-1]) @ np.diff(self.t) / 2)
 
-    def contains_ellipsoid(self, t: float, centre: ArrayLike, M: ArrayLike) -> bool:
-        """True if {|x - centre|²_M ≤ 1} ⊂ {V(t, ·) ≤ 1}, numerically: for plots, not for proofs."""
-        return ellipsoid_inside(centre, M, self.nominal(t), self.shape(t)) is not None
-
-    def inside_ellipsoid(self, t: float, centre: ArrayLike, M: ArrayLike) -> bool:
-        """True if {V(t, ·) ≤ 1} ⊂ {|x - centre|²_M ≤ 1}, numerically: for plots, not for proofs."""
-        return ellipsoid_inside(self.nominal(t), self.shape(t), centre, M) is not None
-
     def outline(self, t: float, axes: tuple[int, ...], points: int = 100) -> FloatArray:
         """Boundary of the projection onto 2 or 3 axes: (points, 2), or (points, points, 3)."""
         chosen = list(axes)

@@ -4,6 +4,7 @@ With a policy, around its plan too: the simulation from the plan's start under t
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +16,7 @@ from nlsid_core.arrays import FloatArray, Json, freeze
 from nlsid_core.errors import DataError, DocumentError, ShapeError
 from nlsid_core.funnels.factor import factor_of, rounding_of
 from nlsid_core.funnels.level import CommandLevel
+from nlsid_core.models.signal import Signal
 
 FORMAT = "nlsid/funnel"
 KIND = "tube"
@@ -95,6 +97,14 @@ class Tube:
         if self.inlet > 0.0:
             return size / math.sqrt(self.inlet) * (1.0 + self.rounding)
         return math.inf if size != 0.0 else 0.0
+
+    def energy_unit(self, y: Sequence[Signal]) -> str:
+        """The unit of E and the level, after a space; empty unless it is the one output's squared.
+
+        Several outputs are weighed by R, and E has no unit.
+        """
+        plain = len(y) == 1 and y[0].unit and self.R[0, 0] == 1.0
+        return f" ({y[0].unit})²" if plain else ""
 
     @property
     def assumption(self) -> str:

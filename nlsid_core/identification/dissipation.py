@@ -147,6 +147,11 @@ def _proved(
     except kernel.Rejected as refusal:
         raise DataError(f"the model has no increments for two inputs: {refusal}") from refusal
     p, q = len(read.H), read.driven
+    if not q:
+        raise DataError(
+            "the model has no inputs, so nothing drives two runs apart: its proof of stability "
+            "says how fast they approach each other"
+        )
     u = np.ones(q) if u_scales is None else np.asarray(u_scales, dtype=np.float64)
     y = np.ones(p) if y_scales is None else np.asarray(y_scales, dtype=np.float64)
     if u.shape != (q,) or y.shape != (p,) or not (min(u) > 0.0 and min(y) > 0.0):

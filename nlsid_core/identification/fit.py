@@ -11,6 +11,8 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.identification.methods import M, Method
 from nlsid_core.identification.validation import Validation, simulation_percent, validate
 
+AT_BOUND = 1.15  # of 1 - max_rate: a search keeps 1.1 (`rates.ROOM`), and a proof loses a little
+
 
 class Proof(Protocol):
     """An exact proof of incremental stability, as the checker decides it."""
@@ -138,8 +140,16 @@ class Fit(Generic[M]):
 
     @property
     def slowest(self) -> str:
-        """The slowest rate that was allowed, in words."""
-        return f"slowest rate allowed: {rate_text(self.max_rate, self.model.period)} a sample"
+        """The slowest rate that was allowed, in words, and whether the chosen model has it."""
+        said = f"slowest rate allowed: {rate_text(self.max_rate, self.model.period)} a sample"
+        proof = self.chosen.proof
+        if proof is None or not 0.0 < 1.0 - proof.rate <= AT_BOUND * (1.0 - self.max_rate):
+            return said
+        return (
+            f"{said}. This bound is active: the model is proved at "
+            f"{stated_rate(proof, self.model.period)}, and the trials may ask for a slower one. "
+            "Longer training trials allow it (the longest is the time constant), or max_rate does"
+        )
 
     def __str__(self) -> str:
         columns = list(self.errors)

@@ -40,6 +40,14 @@ def history(model: Model) -> int:
     return model.history if isinstance(model, MonotoneEquation | ImplicitModel) else len(model)
 
 
+def learns(model: Model) -> bool:
+    """Whether outputs after the first n change what the model predicts.
+
+    Not of a block cascade or a network: their noise is that of the measurement.
+    """
+    return not isinstance(model, BlockCascade | CellNetwork)
+
+
 def simulate_trial(model: Model, trial: Trajectory) -> FloatArray:
     """(N, n_y) outputs, from the first measured outputs with the recorded inputs.
 
@@ -66,14 +74,13 @@ def simulate_trials(model: Model, trials: Sequence[Trajectory]) -> list[FloatArr
 def predict(model: Model, trial: Trajectory, horizon: int) -> FloatArray:
     """(N - n - horizon + 1, n_y): ŷ(t) from measurements up to t - horizon, t = n + horizon - 1 ….
 
-    n is the model's history. The noise of a block cascade or a network is that of the measurement,
-    so outputs later than the first n tell it nothing: its predictions are its simulation.
+    n is the model's history. A model that does not learn (`learns`) predicts what it simulates.
     Raises DataError if the horizon is not positive or the trial is too short.
     """
     n, N = history(model), len(trial)
     if horizon < 1 or n + horizon > N:
         raise DataError(f"{trial.name}: a horizon of {horizon} needs 1 to {N - n} samples")
-    if isinstance(model, BlockCascade | CellNetwork):
+    if isinstance(model, BlockCascade | CellNetwork):  # those that do not learn
         return simulate_trial(model, trial)[n + horizon - 1 :]
     step, lags = _step(model, trial)
     starts = N - n - horizon + 1

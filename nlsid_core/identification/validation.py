@@ -20,6 +20,7 @@ from nlsid_core.errors import DataError
 from nlsid_core.identification.prediction import (
     Model,
     history,
+    learns,
     one_step_residual,
     predict,
     simulate_trial,
@@ -63,10 +64,12 @@ class Validation:
 
     simulation_percent: 100·‖y - ŷ‖/‖y - mean(y)‖ of the simulation, output_percent of each output
     alone; fit_percent: 100 minus it. output_rms: of y - ŷ of each output with its name and unit.
-    prediction_percent: of the k-step predictions, by horizon k. clipped_percent: of the samples
-    with an input beyond the model's range, where the model uses the nearest in the range instead.
+    prediction_percent: of the k-step predictions, by horizon k; empty of a model that predicts
+    what it simulates (`learns`). clipped_percent: of the samples with an input beyond the model's
+    range, where the model uses the nearest in the range instead.
     one_step is white where noise enters the equation, simulation where it enters the measurement:
-    under a model that explains everything one of them is. samples: how many were scored.
+    under a model that explains everything one of them is; they are the same where nothing is
+    predicted. samples: how many were scored.
     """
 
     simulation_percent: float
@@ -95,11 +98,22 @@ class Validation:
 
     def __str__(self) -> str:
         ahead = ", ".join(f"{k}: {p:.2f} %" for k, p in self.prediction_percent.items())
+        predicted = [
+            f"prediction error, steps ahead: {ahead}",
+            f"one-step residual is {self.one_step}",
+        ]
         lines = [
             f"simulation error {self.simulation_percent:.2f} % (fit {self.fit_percent:.2f} %) "
             f"over {self.samples} samples",
-            f"prediction error, steps ahead: {ahead}",
-            f"one-step residual is {self.one_step}",
+            *(
+                predicted
+                if ahead
+                else [
+                    "prediction error: -, as this class of models predicts "
+                    "what it simulates: it learns nothing from outputs after "
+                    "the start"
+                ]
+            ),
             f"simulation residual is {self.simulation}",
         ]
         rms = []
@@ -138,6 +152,7 @@ def validate(
     room = len(shortest) - first - 1
     lags = min(LAGS, room // 2) if lags is None else lags
     horizons = [k for k in HORIZONS if k <= room] if horizons is None else horizons
+    horizons = horizons if learns(model) else []
     longest = max(1, 2 * lags, *horizons)
     if room < longest or lags < 1:
         raise DataError(

@@ -198,14 +198,19 @@ class PlanComparison:
         low, high = min(planned, meant), max(planned, meant)
         room = COMMAND_TOLERANCE * (1.0 + abs(meant))
         if not used <= 1.0:
-            level = self._funnels[i].tubes[most].level
-            spent = self._spent[i][most]
-            return f"innovation energy {spent:.4g} above the level {level:.4g} at t = {t:g} s"
+            tube, spent = self._funnels[i].tubes[most], self._spent[i][most]
+            unit = tube.energy_unit([self.model.y])
+            return (
+                f"innovation energy {spent:.4g}{unit} above the level {tube.level:.4g}{unit} "
+                f"at t = {t:g} s"
+            )
         if not lowest <= u <= highest:
             told = apart(u, lowest, highest)
-            return f"{self.model.u.name} {told[0]} outside the fitted range [{told[1]}, {told[2]}]"
+            fitted = f"[{told[1]}, {told[2]}] {self.model.u.unit}".rstrip()
+            return f"{self.model.u.name} {told[0]} outside the fitted range {fitted}"
         if not low - room <= u <= high + room:
-            return f"{self.model.u.name} {u:.6g} is not the policy's {meant:.6g} at t = {t:g} s"
+            wanted = f"{meant:.6g} {self.model.u.unit}".rstrip()
+            return f"{self.model.u.name} {u:.6g} is not the policy's {wanted}, at t = {t:g} s"
         return ""
 
 

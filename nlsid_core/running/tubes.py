@@ -21,6 +21,8 @@ from nlsid_core.errors import DataError, SolverError
 from nlsid_core.funnels.factor import UNIT
 from nlsid_core.funnels.level import CommandLevel, LevelMeter
 from nlsid_core.funnels.tube import Tube, TubeFunnel
+from nlsid_core.kernel.signals import name_label
+from nlsid_core.kernel.tube import BESIDE
 from nlsid_core.models import StableModel
 from nlsid_core.running.detectors import CusumMeter
 from nlsid_core.running.forecast import OUTWARD, linear_form, reach
@@ -34,6 +36,7 @@ FOLLOW = 0.1  # part of a stamp's error by which the next one is expected later:
 ROUNDING = 1e-9  # relative, of |o| and of E beside a half-width and a level
 TINY = 1e-100  # g where no command opens a level: its square root times a width is a number
 STARTING = "waiting for the first"
+WATCHED = BESIDE.replace("this", "the tube's")  # in the words of `check`
 
 
 class TubeRun:
@@ -93,6 +96,7 @@ class TubeRun:
         self._follow = follow
         self._cusums = [funnel.cusum for funnel in funnels]
         self._names = [signal.name for signal in self._stepper.y]
+        self._units = [tube.energy_unit(self._stepper.y) for tube in tubes]
         boxed = [f for f in funnels if f.y_box is not None and f.u_box is not None]
         self._boxes = [
             (np.array(f.y_box).T, np.array(f.u_box).T, np.tile(np.array(f.y_box), (n // p, 1)).T)
@@ -326,9 +330,12 @@ class TubeRun:
                 used, worst = part, j
         if used <= 1.0:
             return used * used, ""
+        unit = self._stepper.y[worst].unit
+        said = f"{abs(away[worst]):.4g} {unit}".rstrip()
+        most = f"{abs(away[worst]) / used:.4g} {unit}".rstrip()
         return used * used, (
-            f"{self._names[worst]} {abs(away[worst]):.4g} from the simulation, above "
-            f"{abs(away[worst]) / used:.4g}, which is assumed"
+            f"{name_label(self._names[worst])} is {said} from the simulation, above {most}, which "
+            f"is assumed ({WATCHED})"
         )
 
     def _alarm(self, i: int, innovation: list[float]) -> str:
@@ -369,15 +376,16 @@ class TubeRun:
         status = Status.INSIDE
         if not spent[most] <= 1.0:
             status = Status.ASSUMPTION_VIOLATED
+            unit = self._units[most]
             reason = (
-                f"innovation energy {self._spent[most]:.4g} above the level "
-                f"{level[most]:.4g} at t = {t:g} s"
+                f"innovation energy {self._spent[most]:.4g}{unit} above the level "
+                f"{level[most]:.4g}{unit} at t = {t:g} s"
             )
         elif not peaks[sharpest] <= 1.0:
             status = Status.ASSUMPTION_VIOLATED
             reason = (
-                f"one sample's innovation energy is {peaks[sharpest]:.4g} times what is assumed, "
-                f"at t = {t:g} s"
+                f"one sample's innovation energy is {peaks[sharpest]:.4g} times what is assumed "
+                f"({WATCHED}), at t = {t:g} s"
             )
         elif exceeded:
             status, reason = Status.ASSUMPTION_VIOLATED, f"{exceeded}, at t = {t:g} s"

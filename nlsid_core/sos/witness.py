@@ -12,8 +12,9 @@ Source: docs/certificate.md.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from itertools import combinations
+from functools import lru_cache
 from math import ceil, lcm, log2
 
 import numpy as np
@@ -32,6 +33,52 @@ SMALLEST = 2.0**-200  # of a diagonal entry, relative to the largest: below it a
 Residual = Mapping[tuple[int, ...], ArrayLike]
 
 
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """How a witness of Gram matrices is scaled, and what their errors cost there.
+
+    diagonal: (k,) powers of two near the roots of their largest diagonal entries. columns: (k,)
+    exponents that are written, no less. small: (k,) diagonal / 2^columns, at most 1. places: (k, k)
+    each, where the kernel counts v_i v_j, a square's own place or that of one pair; weights: (k, k)
+    of the scale at i, j over the scale at that place.
+    """
+
+    diagonal: FloatArray
+    columns: IntArray
+    small: FloatArray
+    places: tuple[IntArray, IntArray]
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, monomials: IntArray, Q: FloatArray) -> "Scale":
+        """Of matrices (J+1, k, k)."""
+        exponents = _columns(Q)
+        columns = _raised(monomials, exponents)
+        product, square = _products(monomials.shape, monomials.tobytes())
+        i, j = np.triu_indices(len(monomials), 1)
+        order = np.lexsort((-columns[i] - columns[j], product[i, j]))  # stable: the first pair wins
+        found, first = np.unique(product[i, j][order], return_index=True)
+        home = np.zeros((len(square), 2), dtype=np.int64)
+        home[found] = np.column_stack([i, j])[order[first]]
+        home[square >= 0] = square[square >= 0, None]
+        places = home[product]
+        steps = columns[:, None] + columns - columns[places].sum(axis=2)
+        return cls(
+            np.exp2(exponents.astype(np.float64)),
+            columns,
+            np.exp2((exponents - columns).astype(np.float64)),
+            (places[..., 0], places[..., 1]),
+            np.exp2(steps.astype(np.float64)),
+        )
+
+    def lost(self, change: FloatArray) -> FloatArray:
+        """(J+1, k) what the diagonal of r loses by a change (J+1, k, k), scaled as written."""
+        at = np.zeros_like(change)
+        for total, part in zip(at, change * self.weights, strict=True):
+            np.add.at(total, self.places, part)
+        return np.asarray(np.abs(at).sum(axis=1) + np.abs(at).sum(axis=2)) / 2
+
+
 def witness(
     basis: ArrayLike, grams: ArrayLike | Sequence[ArrayLike], *, residual: Residual | None = None
 ) -> Json:
@@ -46,8 +93,8 @@ def witness(
     monomials, Q = _checked(basis, grams)
     if residual:
         Q = _absorbed(monomials, Q, residual)
-    diagonal = np.exp2(_columns(Q).astype(np.float64))
-    S = Q / diagonal[:, None] / diagonal
+    scale = Scale.of(monomials, Q)
+    S = Q / scale.diagonal[:, None] / scale.diagonal
     least = np.array([float(np.linalg.eigvalsh(part)[0]) for part in S])
     if not least.min() > 0.0:
         raise Infeasible(
@@ -55,22 +102,19 @@ def witness(
             "diagonal is 1"
         )
     room = ROOM * least
-    columns = _raised(monomials, _columns(Q))
-    small = diagonal * np.exp2(-columns.astype(np.float64))
     try:
         roots = np.array([
-            cholesky(part - delta * np.eye(len(part))) * small
+            cholesky(part - delta * np.eye(len(part))) * scale.small
             for part, delta in zip(S, room, strict=True)
         ])  # fmt: skip
     except LinAlgError as error:
         raise Infeasible("a Gram matrix is positive definite to rounding only") from error
-    allowed = ROUNDING * room[:, None] * small**2
+    allowed = ROUNDING * room[:, None] * scale.small**2
     enough = ceil(log2(len(monomials) ** 1.5 / allowed.min()))  # |E|₁ ≤ k^1.5 2^-unit
     enough = max(0, enough + SPARE_BITS)
-    places = _charged(monomials, columns)
-    kept = (u for u in range(enough) if (_lost(roots, u, places) <= allowed).all())
+    kept = (u for u in range(enough) if (scale.lost(_rounding(roots, u)) <= allowed).all())
     unit = next(kept, enough)
-    return _written(monomials, columns, unit, list(roots))
+    return _written(monomials, scale.columns, unit, list(roots))
 
 
 def multiplier(
@@ -177,28 +221,10 @@ def _absorbed(monomials: IntArray, Q: FloatArray, residual: Residual) -> FloatAr
     return Q
 
 
-def _lost(roots: FloatArray, unit: int, places: tuple[IntArray, IntArray]) -> FloatArray:
-    """(J+1, k) what each diagonal entry of r loses where factors are whole numbers over 2^unit."""
+def _rounding(roots: FloatArray, unit: int) -> FloatArray:
+    """(J+1, k, k): how the Gram matrices change where factors are whole numbers over 2^unit."""
     whole = np.ldexp(np.round(np.ldexp(roots, unit)), -unit)
-    change = np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole
-    at = np.zeros_like(change)
-    for total, part in zip(at, change, strict=True):
-        np.add.at(total, places, part)
-    return np.asarray(np.abs(at).sum(axis=1) + np.abs(at).sum(axis=2)) / 2
-
-
-def _charged(monomials: IntArray, columns: IntArray) -> tuple[IntArray, IntArray]:
-    """(k, k) each: where the kernel counts v_a v_b, at a square's own place or that of one pair."""
-    k, shifts = len(monomials), columns.tolist()
-    keys = [[tuple(key) for key in row] for row in (monomials[:, None] + monomials[None]).tolist()]
-    home: dict[tuple[int, ...], tuple[int, int]] = {}
-    for i, j in combinations(range(k), 2):
-        a, b = home.setdefault(keys[i][j], (i, j))
-        if shifts[i] + shifts[j] > shifts[a] + shifts[b]:
-            home[keys[i][j]] = (i, j)
-    home |= {keys[i][i]: (i, i) for i in range(k)}
-    places = np.array([[home[key] for key in row] for row in keys])
-    return places[..., 0], places[..., 1]
+    return np.asarray(np.swapaxes(roots, 1, 2) @ roots - np.swapaxes(whole, 1, 2) @ whole)
 
 
 def _columns(Q: FloatArray) -> IntArray:
@@ -210,20 +236,26 @@ def _columns(Q: FloatArray) -> IntArray:
 
 def _raised(monomials: IntArray, columns: IntArray) -> IntArray:
     """Columns with columns[i] >= (columns[a] + columns[b])/2 wherever v_i² = v_a v_b."""
-    places = {tuple(row): k for k, row in enumerate((2 * monomials).tolist())}
-    sums = (monomials[:, None] + monomials[None]).tolist()
-    triples = [
-        (places[tuple(key)], a, b)
-        for a, row in enumerate(sums)
-        for b, key in enumerate(row[:a])
-        if tuple(key) in places
-    ]
-    raised, before = columns.tolist(), None
-    while raised != before:
-        before = list(raised)
-        for i, a, b in triples:
-            raised[i] = max(raised[i], (raised[a] + raised[b]) // 2)
-    return np.asarray(raised, np.int64)
+    product, square = _products(monomials.shape, monomials.tobytes())
+    a, b = np.nonzero(np.tril(square[product] >= 0, -1))
+    while True:
+        raised = columns.copy()
+        np.maximum.at(raised, square[product[a, b]], (columns[a] + columns[b]) // 2)
+        if np.array_equal(raised, columns):
+            return raised
+        columns = raised
+
+
+@lru_cache(maxsize=8)
+def _products(shape: tuple[int, int], monomials: bytes) -> tuple[IntArray, IntArray]:
+    """(k, k) which product v_i v_j is, and for each product the i whose square it is, else -1."""
+    rows = np.frombuffer(monomials, dtype=np.int64).reshape(shape)
+    sums = (rows[:, None] + rows).reshape(-1, shape[1])
+    _, which = np.unique(sums, axis=0, return_inverse=True)
+    product = np.asarray(which.reshape(shape[0], shape[0]), dtype=np.int64)
+    square = np.full(int(product.max()) + 1, -1)
+    square[np.diagonal(product)] = np.arange(shape[0])
+    return product, square
 
 
 def _written(

@@ -32,6 +32,7 @@ def wait(work: BackgroundIdentification) -> Progress:
     return progress
 
 
+@pytest.mark.slow
 def test_it_writes_a_model_and_its_proof(tmp_path: Path) -> None:
     work = BackgroundIdentification(f1tenth(), CONFIG, tmp_path)
     assert wait(work) == Progress("done", 1.0, done=True)

@@ -81,6 +81,7 @@ def test_every_command_has_help() -> None:
         assert "--help" in run(name, "--help")
 
 
+@pytest.mark.slow
 def test_an_error_shows_a_path_with_brackets_whole(bag: Path) -> None:
     command = [sys.executable, "-m", "bags.commands.cli", "bag", "plot", str(bag), "--out", "x.png"]
     signal = f"{ODOM}:twist.twist.linear[name=elbow].x"

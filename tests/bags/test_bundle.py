@@ -7,30 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from bags.chain.config import load_config
-from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import bundle as bundles
 from bags.designs import documents
 from bags.designs.bundle import Bundle, Check, decide
-from bags.samples import f1tenth
 from nlsid_core import files
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, DocumentError
-from nlsid_core.progress import silent
 from nlsid_core.proofs import check
 
 
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
+@pytest.fixture
+def funnel(f1tenth_chain: Path) -> Path:
+    return f1tenth_chain / documents.FUNNEL
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def bundle(funnel: Path) -> Bundle:
     return Bundle.load(funnel)
 

@@ -198,6 +198,21 @@ def test_a_wide_tube_is_warned_of_with_its_cause(found: Catching) -> None:
     assert "is inf of its range" in constant.warnings()[0]
 
 
+def test_a_tube_beside_which_trials_hardly_move_is_warned_of(
+    found: Catching, train: Dataset
+) -> None:
+    moves = [np.ptp(train.select([name]).trajectories[0].y) for name, _ in found.shares]
+    width = found.widths[0]
+    assert width.moves == pytest.approx(np.median(moves))
+    assert found.still == []
+    motor = Width("speed", "rad/s", 20.5, 52.4, 3.7, moves=28.0)
+    [said] = replace(found, widths=(motor,)).still
+    assert "the half-width of speed is 20.5 rad/s, and within a calibration trial speed" in said
+    assert "moves by 28 rad/s (the median)" in said
+    assert replace(found, widths=(replace(motor, moves=42.0),)).still == []
+    assert replace(found, widths=(replace(motor, range=40.0),)).still == [], "that is said before"
+
+
 def test_the_table_colours_the_faults_that_another_detector_catches_more_often(
     found: Catching,
 ) -> None:
@@ -259,6 +274,7 @@ def test_a_tube_that_follows_the_commands_says_and_draws_how() -> None:
     assert len(errors.collections) == found.trials
 
 
+@pytest.mark.slow
 def test_a_sensors_fault_is_put_into_the_output_in_which_it_is_caught_least() -> None:
     """Of two outputs; what the monitor says of each alone is counted here by itself."""
     made = follower("two_outputs")

@@ -16,6 +16,7 @@ from bags.chain.shipped import config_file
 from bags.chain.steps import design_funnel_files, identify_bags, read_trials
 from bags.chain.training import load_training
 from bags.commands.cli import app
+from bags.commands.show import paced_lines, replay_lines
 from bags.designs import documents
 from bags.monitoring.replay import Replay, replay_bag
 from bags.recordings.bag import Bag
@@ -40,20 +41,9 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="module")
-def chain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def chain(f1tenth_chain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Everything `nlsid identify` and `nlsid funnel` write, through the command line."""
-    out = tmp_path_factory.mktemp("chain")
-    folder = str(f1tenth()[0].parent)
-    runner = CliRunner()
-    made = runner.invoke(app, ["identify", folder, "--config", str(CONFIG), "--out", str(out)])
-    assert made.exit_code == 0, made.output
-    assert "robust simulation error, final iterate" in made.output
-    model = str(out / documents.MODEL)
-    made = runner.invoke(
-        app, ["funnel", "--model", model, "--config", str(CONFIG), "--out", str(out)]
-    )
-    assert made.exit_code == 0, made.output
-    return out
+    return shutil.copytree(f1tenth_chain, tmp_path_factory.mktemp("chain") / "f1tenth")
 
 
 def trial(name: str) -> Path:
@@ -74,6 +64,7 @@ def test_errors_on_the_test_trials_are_as_promised(config: Config, tmp_path: Pat
     assert len(result.train) == 33
 
 
+@pytest.mark.slow
 def test_errors_without_the_calibration_trials_are_as_documented(
     config: Config, tmp_path: Path
 ) -> None:
@@ -132,6 +123,7 @@ def test_the_funnel_command_prints_bounds_rounded_outward(chain: Path, tmp_path:
     assert "probability at most 1/17" in said
 
 
+@pytest.mark.slow
 def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: Path) -> None:
     """In a copy of the chain's folder: the same numbers in the terminal and in the report."""
     out = tmp_path / "copy"
@@ -159,6 +151,7 @@ def test_the_funnel_command_says_what_the_funnel_catches(chain: Path, tmp_path: 
     assert (out / documents.CATCHING_PLOT).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("require", "status"), [("0.56", 0), ("0.55", 1)])
 def test_a_tube_wider_than_required_ends_with_status_1(
     chain: Path, tmp_path: Path, require: str, status: int
@@ -173,6 +166,7 @@ def test_a_tube_wider_than_required_ends_with_status_1(
     assert "warning" not in made.output
 
 
+@pytest.mark.slow
 def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     chain: Path, tmp_path: Path
 ) -> None:
@@ -187,6 +181,7 @@ def test_without_test_trials_it_is_not_known_what_a_funnel_catches(
     assert required.exit_code == 2, "not measured is neither yes nor no"
 
 
+@pytest.mark.slow
 def test_a_single_recording_is_cut_into_windows_and_says_what_that_is_worth(tmp_path: Path) -> None:
     path = edited(tmp_path, funnel__horizon=1.0, funnel__profile=[[0.0, 0.3], [1.0, 0.35]])
     content = json.loads(path.read_text()) | {"split": {"share": 0.25}}
@@ -264,6 +259,7 @@ def test_check_prints_rejected_with_the_reason_and_status_1(chain: Path, tmp_pat
     assert "model.json is not the model this proof is about" in done.output
 
 
+@pytest.mark.slow
 def test_without_a_profile_the_tube_is_around_the_models_simulation(
     chain: Path, tmp_path: Path
 ) -> None:
@@ -354,7 +350,57 @@ def test_a_bag_whose_samples_are_lost_on_the_way_is_unknown_not_inside(chain: Pa
     both = replace(whole, readings=(waiting, violated, inside, outside, outside))
     assert (both.first_bad, both.first_outside) == (violated, outside)
     parts = replace(whole, readings=(waiting, inside, past, past, nan))
-    assert parts.unjudged == (past, nan)
+    assert [stretch.reasons for stretch in parts.unjudged] == [(past.reason, nan.reason)]
+
+
+def test_the_stretches_that_were_not_judged_begin_and_end(chain: Path) -> None:
+    whole = replay(chain, trial("05"))
+    waiting, inside = whole.readings[0], whole.readings[-1]
+    nan = inside._replace(status=Status.UNKNOWN, reason="no speed at t = 2 s")
+    said = (waiting, *[inside] * 4, nan, *[waiting] * 3, *[inside] * 5, nan, *[inside] * 4)
+    stamps = [*range(14), *range(20, 25)]  # six samples never came
+    readings = tuple(r._replace(t=float(t)) for r, t in zip(said, stamps, strict=True))
+    found = replace(whole, readings=readings, period=1.0)
+    first, second = found.unjudged
+    assert (first.start, first.end, first.samples) == (5.0, 8.0, 4)
+    assert first.why == "no speed at t = 2 s; then 3 to start a new run"
+    assert (second.start, second.end, second.samples) == (14.0, 20.0, 7)
+    assert second.why == "6 samples are missing; then no speed at t = 2 s"
+    left = found.span - found.judged_span
+    assert left == first.samples + second.samples == 11
+
+
+def test_bags_of_another_period_are_said_once_with_both_periods(chain: Path) -> None:
+    whole = replay(chain, trial("05"))
+    off = whole.readings[-1]._replace(status=Status.UNKNOWN, reason="off the grid")
+    slow = [
+        replace(
+            whole,
+            name=f"slow_{k}",
+            readings=tuple(off._replace(t=1.2 * whole.period * i) for i in range(20)),
+        )
+        for k in range(5)
+    ]
+    assert slow[0].paced == pytest.approx(1.2 * whole.period)
+    assert slow[0].reason == "its samples come every 0.03 s, the model's every 0.025 s"
+    assert not any(replay_lines(slow[0]))
+    [said] = paced_lines([whole, *slow])
+    assert "5 bags have samples of another period than the model's 0.025 s: " in said
+    assert "slow_0 0.03 s, slow_1 0.03 s, slow_2 0.03 s and 2 more;" in said
+    assert (whole.paced, list(paced_lines([whole]))) == (0.0, [])
+
+
+def test_a_recording_that_hardly_outlasts_the_start_says_how_little_was_judged(
+    chain: Path,
+) -> None:
+    whole = replay(chain, trial("05"))
+    start = whole.starting
+    short = replace(whole, readings=whole.readings[: start + 1])
+    assert (short.starting, len(short.judged), short.verdict) == (start, 1, "inside")
+    [*_, said] = replay_lines(short)
+    few = f"only 1 of {start + 1} samples were judged: the first {start} start the run"
+    assert said == f"{short.name}: {few}"
+    assert not any("start the run" in line for line in replay_lines(whole))
 
 
 def test_while_a_start_in_motion_fades_nothing_is_judged_and_the_verdict_says_so(

@@ -9,6 +9,7 @@ from nlsid_core.data.trajectory import Dataset
 from tests.tracked import designed, run
 
 
+@pytest.mark.slow
 def test_the_widest_start_is_told_in_parts_of_the_inlet() -> None:
     made = designed()
     edge = np.linalg.solve(made.funnel.S[0], [float(made.funnel.inlet[0]), 0.0])

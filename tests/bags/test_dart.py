@@ -86,6 +86,7 @@ def test_without_the_tables_nothing_is_converted(tmp_path: Path) -> None:
         convert_dart.read(bad)
 
 
+@pytest.mark.slow
 def test_unseen_drives_stay_inside_and_other_floors_are_named(tmp_path: Path) -> None:
     """The whole way with a product of two topics' signals, one of them lagged, as an input."""
     config = load_config(config_file("dart.yaml"))

@@ -49,6 +49,7 @@ def test_a_signal_that_is_not_washed_out_tells_no_displacement() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_shipped_cars_way_is_proved_and_held_against_its_tube(tmp_path: Path) -> None:
     config = tmp_path / "position.yaml"
     config.write_text(CONFIG)

@@ -32,6 +32,7 @@ def test_init_proposes_feedback_where_linear_models_say_little(tmp_path: Path) -
     assert feedback < 0.3 * linear
 
 
+@pytest.mark.slow
 def test_feedback_goes_from_bags_to_a_monitor(tmp_path: Path) -> None:
     for k, trial in enumerate(trials([0.15] * RUNS, samples=SAMPLES, seed=4)):
         write_bag(tmp_path / "bags", f"run_{k}", trial.y, trial.u)

@@ -33,11 +33,8 @@ def nlsid(*arguments: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def design(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("report") / "car <1>"
-    nlsid("identify", *f1tenth(), "--config", CONFIG, "--out", folder)
-    nlsid("funnel", "--model", folder / documents.MODEL, "--config", CONFIG, "--out", folder)
-    return folder
+def design(f1tenth_chain: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return shutil.copytree(f1tenth_chain, tmp_path_factory.mktemp("report") / "car <1>")
 
 
 class Page(HTMLParser):
@@ -176,6 +173,7 @@ def test_a_folder_without_a_design_is_refused(tmp_path: Path) -> None:
         folder_page(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="needs Chromium or Chrome")
 def test_the_page_is_printed_as_pdf(design: Path, tmp_path: Path) -> None:
     page = tmp_path / "design.html"

@@ -55,6 +55,7 @@ def test_volumes_widths_and_margins_are_the_funnels(satellite: FunnelDesign) -> 
     assert heights == pytest.approx(satellite.found.proved.margins)
 
 
+@pytest.mark.slow
 def test_one_state_is_drawn_over_time(tmp_path: Path) -> None:
     design = one_dimensional.designed()
     figure = funnel_picture(design)

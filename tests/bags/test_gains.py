@@ -2,17 +2,22 @@
 
 import json
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bags.chain.gains import Gain
 from bags.commands.cli import app
-from bags.commands.show import named_number
+from bags.commands.show import gain_lines, named_number
 from nlsid_core import files
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible
-from nlsid_core.models import DifferenceEquation, Signal
+from nlsid_core.identification import prove_gain
+from nlsid_core.kernel import Verdict
+from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal
+from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check
 from tests.core.kernel.dissipation_claims import feedthrough, integrator, moving
 from tests.core.kernel.stability_claims import U, Y, linear
@@ -80,7 +85,8 @@ def test_what_has_no_gain_is_not_proved_but_with_a_discount(tmp_path: Path) -> N
 def test_a_scale_takes_the_unit_away(tmp_path: Path) -> None:
     model = written(tmp_path, linear())
     result = RUN.invoke(app, ["gain", str(model), "--scale", "speed=0.5"])
-    assert result.output.startswith("gain at most 2.252: proved")
+    said = "gain at most 2.252: proved, of the model, speed in units of 0.5 m/s\n"
+    assert result.output.startswith(said)
     proof = json.loads((tmp_path / "model.gain.proof.json").read_text())
     assert proof["claim"]["scales"] == {"u": [1.0], "y": [0.5]}
 
@@ -107,6 +113,27 @@ def test_a_model_that_needs_a_box_says_so_where_no_trials_lie_beside_it(tmp_path
     result = RUN.invoke(app, ["gain", str(model)])
     assert isinstance(result.exception, DataError)
     assert "needs a box of its outputs" in str(result.exception)
+
+
+def test_the_box_that_runs_have_to_stay_in_is_said_where_the_gain_is(tmp_path: Path) -> None:
+    model = moving()
+    [signal] = model.y
+    proof = prove_gain(model, box={"y": [[-1.0, 1.5]]})
+    assert proof is not None
+    verdict = Verdict("dissipation", "made up", Fraction(1))
+    said = gain_lines(Gain(model, proof, verdict, None, tmp_path))[0]
+    box = f"{signal.name} in [-1, 1.5] {signal.unit}".rstrip()
+    assert said.endswith(f"proved, of the model, for runs that stay in a box: {box}")
+
+
+def test_a_gain_of_a_model_without_inputs_is_refused_with_words() -> None:
+    free = ImplicitModel(
+        h=Polynomials(np.array([[1, 0], [3, 0], [0, 1]]), np.array([[1.0], [0.1], [-0.5]])),
+        shift=Polynomials(np.zeros((0, 1), dtype=np.int64), np.zeros((0, 0))),
+        monotonicity=0.9, period=0.1, states=("x",), inputs=(), y=(Y,),
+    )  # fmt: skip
+    with pytest.raises(DataError, match="the model has no inputs, so nothing drives two runs"):
+        prove_gain(free)
 
 
 def heard(gain: float) -> DifferenceEquation:
@@ -144,6 +171,12 @@ def test_a_loop_that_is_not_small_or_does_not_fit_is_refused(tmp_path: Path) -> 
     fits = RUN.invoke(app, ["compose", paths["car"], paths["same"], *out])
     assert isinstance(fits.exception, CertificateRejected)
     assert "the units differ" in str(fits.exception)
+    passive = written(tmp_path, feedthrough(), "passive")
+    assert RUN.invoke(app, ["gain", str(passive), "--passivity"]).exit_code == 0
+    proof = str(tmp_path / "passive.passivity.proof.json")
+    mixed = RUN.invoke(app, ["compose", paths["car"], proof, *out])
+    assert isinstance(mixed.exception, CertificateRejected)
+    assert "proves passivity, not a gain" in str(mixed.exception)
     alone = RUN.invoke(app, ["compose", paths["car"], *out])
     assert "a loop is of two proved gains" in str(alone.exception)
     assert not (tmp_path / "loop").exists()

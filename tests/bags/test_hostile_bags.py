@@ -89,6 +89,7 @@ def test_a_type_made_of_itself_is_refused(tmp_path: Path) -> None:
         run_all(file, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_ten_thousand_topics_are_listed_and_read(tmp_path: Path) -> None:
     file = tmp_path / "many.mcap"
     started = time.monotonic()

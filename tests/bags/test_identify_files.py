@@ -37,6 +37,7 @@ from tests.identified_bags import (
     write_coupled_bags,
     write_saturating_bags,
 )
+from tests.marks import slow_among
 
 HOWTO = Path(__file__).resolve().parents[2] / "docs" / "howto-offline.md"
 CASCADE = {
@@ -62,6 +63,7 @@ COEFFICIENTS = {
     "implicit": "coefficients", "linear_states": "coefficients", "cells": "next",
     "feedback": "next",
 }  # fmt: skip
+LONG = {"cells", "feedback", "block_cascade", "state_affine", "monotone"}
 STRONGER = {"rate": 0.2, "delta": 50.0}  # factors no proof here has room for
 REASONS = {"rate": "the decrease of V", "delta": "inequality stable: not positive"}
 
@@ -98,7 +100,7 @@ def one_digit_changed(text: str, after: str) -> str:
     return text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :]
 
 
-@pytest.fixture(scope="module", params=CLASSES)
+@pytest.fixture(scope="module", params=slow_among(CLASSES, LONG))
 def made(
     request: pytest.FixtureRequest, folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[str, Path, str]:
@@ -150,6 +152,7 @@ def test_a_stronger_claim_needs_another_proof(made: tuple[str, Path, str], tmp_p
     assert REASONS[claimed(name)] in refused.output
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_the_best_class_for_a_saturating_robot_is_the_one_it_is(
     folder: Path, tmp_path: Path
@@ -182,6 +185,7 @@ def test_what_cannot_be_compared_is_named_and_the_rest_is(folder: Path, tmp_path
         compare_bags([alone[0], *alone[-2:]], impossible, progress=silent)
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_select_takes_the_order_with_the_least_validation_error(
     folder: Path, tmp_path: Path
@@ -252,6 +256,7 @@ def test_a_selection_needs_validation_bags(folder: Path, tmp_path: Path) -> None
 # -- several inputs and outputs, gaps ----------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_several_inputs_and_outputs_are_identified_and_scored_one_by_one(
     coupled: Path, tmp_path: Path
@@ -357,6 +362,7 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
 # -- models without a proof ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_an_unproved_model_is_refused_unless_asked_for_and_leaves_no_old_proof(
     coupled: Path, tmp_path: Path
@@ -387,6 +393,7 @@ def examples() -> list[dict[str, Any]]:
 
 @pytest.mark.slow  # the classes are identified above; here the page's own words for them are
 @pytest.mark.parametrize("example", examples(), ids=lambda e: "-".join(e) + str(len(str(e))))
+@pytest.mark.pictures
 def test_every_example_of_the_how_to_runs(
     example: dict[str, Any], folder: Path, tmp_path: Path
 ) -> None:

@@ -19,13 +19,16 @@ from typer.testing import CliRunner
 from bags.chain.config import load_config
 from bags.chain.training import decoded
 from bags.commands.cli import app
+from bags.commands.init import said_briefly
 from bags.designs import documents
 from bags.recordings.bag import Bag
 from bags.recordings.message_types import decode, standard_types
 from bags.recordings.writer import BagWriter
 from bags.samples import f1tenth, schunk
 from bags.setup.candidates import look
+from bags.setup.proposal import Proposal
 from bags.setup.proposing import choose
+from bags.setup.written import yaml_text
 from bags.tools.fitness import check_fitness
 from nlsid_core.errors import BagError, DataError
 from tests.bag_messages import (
@@ -73,12 +76,11 @@ def whole_way(bags: Path, config: Path, out: Path) -> str:
     return done.output
 
 
+@pytest.mark.slow
+@pytest.mark.pictures
 @pytest.mark.parametrize(
     ("options", "response", "excitation"),
-    [
-        pytest.param((), YAW, "/steering_command:position[name=steering]", marks=pytest.mark.slow),
-        pytest.param(("-u", CMD), SPEED, CMD, marks=pytest.mark.slow),
-    ],
+    [((), YAW, "/steering_command:position[name=steering]"), (("-u", CMD), SPEED, CMD)],
 )
 def test_the_written_file_goes_the_whole_way_on_the_f1tenth_bags(
     tmp_path: Path, options: tuple[str, ...], response: str, excitation: str
@@ -105,6 +107,7 @@ def test_every_key_of_the_written_file_has_a_comment(tmp_path: Path) -> None:
     assert max(map(len, lines)) < 160
 
 
+@pytest.mark.slow
 def test_unstamped_commands_are_paired_by_log_times_and_said(tmp_path: Path) -> None:
     """The F1TENTH speed trials with their commands as plain Twist, as nav2 publishes them."""
     bags = [bag for bag in f1tenth() if int(bag.name[-2:]) in (1, 2, 3, 4, 5, 12, 13, 14, 23, 24)]
@@ -163,6 +166,7 @@ def boat(folder: Path, trials: int = 4) -> tuple[Path, Path]:
     return folder / "trials", package
 
 
+@pytest.mark.slow
 def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> None:
     """Neither type nor name says which number drives; the configuration lies elsewhere."""
     bags, package = boat(tmp_path)
@@ -176,6 +180,7 @@ def test_types_that_only_msg_files_define_go_the_whole_way(tmp_path: Path) -> No
     assert "run_3" in whole_way(bags, config, tmp_path / "out"), "the test trial is judged"
 
 
+@pytest.mark.slow
 def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path) -> None:
     types = get_typestore(Stores.ROS1_NOETIC)
     kinds = types.types
@@ -212,6 +217,7 @@ def test_a_folder_of_ros_1_bags_with_numbers_is_one_trial_a_file(tmp_path: Path)
     ) == 2, "the test trial alone is monitored"  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pace", "is_said"), [(0.5, True), (1.0, False)])
 def test_simulated_time_at_another_pace_than_the_log_is_said(
     tmp_path: Path, pace: float, is_said: bool
@@ -296,6 +302,7 @@ def test_a_measured_effort_drives_where_nothing_commands() -> None:
     assert excitations == ["/joint_states:effort[name=joint_3]"]
 
 
+@pytest.mark.slow
 def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     nlsid("init", schunk()[0].parent, "--yes", "--out", config)
@@ -306,6 +313,7 @@ def test_a_few_arm_bags_are_sampled_more_slowly_and_go_the_whole_way(tmp_path: P
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_path: Path) -> None:
     config = tmp_path / "robot.yaml"
     steering = "/steering_command:position[name=steering]"
@@ -321,6 +329,7 @@ def test_two_commands_and_two_responses_on_three_topics_go_the_whole_way(tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     """Speed and yaw rate of the F1TENTH car by speed command alone: two responses, one tube."""
     config, folder = tmp_path / "robot.yaml", f1tenth()[0].parent
@@ -403,10 +412,11 @@ def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     assert float(expected[2]) == pytest.approx(spread, rel=5e-3), "run_1 was held back"
 
 
-def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: Path) -> None:
+def two_axes(folder: Path) -> None:
+    """Two numbers that each follow a command of their own, and one that stands still."""
     rng = np.random.default_rng(7)
     kind, number = "std_msgs/msg/Float64", standard_types().types["std_msgs/msg/Float64"]
-    with BagWriter(tmp_path / "bag") as writer:
+    with BagWriter(folder) as writer:
         y, u = np.zeros(2), np.zeros(2)
         for k in range(400):
             u = rng.uniform(-1.0, 1.0, 2) if k % 20 == 0 else u
@@ -416,11 +426,44 @@ def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: 
                 data = bytes(standard_types().serialize_cdr(number(value), kind))
                 stamp = START_NS + k * 100_000_000
                 writer.write(topic, kind, data, log_time_ns=stamp, publish_time_ns=stamp)
+
+
+def test_each_response_that_is_named_gets_the_command_that_it_follows(tmp_path: Path) -> None:
+    two_axes(tmp_path / "bag")
     found = look([tmp_path / "bag"])
     named = ["/speed_b:data", "/speed_a:data"]
     assert choose(found, named) == (named, ["/cmd_b:data", "/cmd_a:data"])
     with pytest.raises(BagError, match="/speed_c:data follows no command"):
         choose(found, ["/speed_c:data"])
+
+
+def test_responses_like_the_proposed_one_are_said_and_how_they_are_added(tmp_path: Path) -> None:
+    bag, config = tmp_path / "bag", tmp_path / "robot.yaml"
+    two_axes(bag)
+    said = nlsid("init", bag, "--yes", "--out", config)
+    [chosen] = load_config(config).signals.response
+    other = "b" if chosen.path.startswith("/speed_a") else "a"
+    assert f"there are others like it: /speed_{other}:data follows /cmd_{other}:data (+" in said
+    options = "-y '/speed_a:data' -y '/speed_b:data' -u '/cmd_a:data' -u '/cmd_b:data'"
+    assert f"run init with {options}." in said
+
+
+def test_many_bags_are_said_as_their_folder_or_a_pattern(tmp_path: Path) -> None:
+    bags = [tmp_path / f"run_{k}" for k in range(4)]
+    for bag in bags:
+        two_axes(bag)
+    assert said_briefly(bags) == str(tmp_path)
+    assert said_briefly([tmp_path]) == str(tmp_path)
+    assert said_briefly(bags[:2]) == f"{bags[0]} {bags[1]}"
+    two_axes(tmp_path / "other")
+    assert said_briefly(bags) == f"{tmp_path}/run_*"
+    assert said_briefly([*bags[1:], tmp_path / "other"]) == "BAGS"
+
+
+def test_units_keep_their_letters_at_the_head_of_the_file() -> None:
+    proposal = Proposal({}, error=3.0, varies=", in which T varies by 10.5 degC, rms")
+    said = "# Expect 3 % error in simulation (of trials held back, in which T varies by 10.5 degC"
+    assert said in yaml_text(proposal)
 
 
 def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -> None:
@@ -439,6 +482,7 @@ def test_a_robot_that_never_moves_is_named_and_not_its_command(tmp_path: Path) -
         choose(look([tmp_path / "bag"]))
 
 
+@pytest.mark.slow
 def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None:
     """Degrees that begin again at 360, without a unit in the type."""
     rng = np.random.default_rng(3)
@@ -463,6 +507,7 @@ def test_a_compass_is_unwrapped_and_goes_with_its_course(tmp_path: Path) -> None
     assert "if a trial begins near half a turn" in said
 
 
+@pytest.mark.slow
 def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
     """A publisher that does not fill them in: identification would refuse them."""
     rng = np.random.default_rng(4)
@@ -477,6 +522,7 @@ def test_header_stamps_that_are_all_zero_are_not_taken(tmp_path: Path) -> None:
     assert "/odom (nav_msgs/msg/Odometry) has header stamps that are all 0" in said
 
 
+@pytest.mark.slow
 def test_the_likeliest_signals_are_several_commands_where_one_alone_says_little(
     tmp_path: Path,
 ) -> None:
@@ -515,6 +561,7 @@ def test_bags_in_which_nothing_moves_are_refused(tmp_path: Path) -> None:
         look([still])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
 def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
     """A real pseudo-terminal: the second command, then what follows it best."""
@@ -544,6 +591,7 @@ def test_on_a_terminal_the_signals_are_asked_for(tmp_path: Path) -> None:
         ("cougars_auv/SO_lastbag_mcap", 24.0),
     ],
 )
+@pytest.mark.pictures
 def test_other_robots_go_the_whole_way_unedited(tmp_path: Path, robot: str, seconds: float) -> None:
     """Each is one recording, which is cut into parts first, as `init` says it should be."""
     bag, parts = SHARED / robot, tmp_path / "parts"
@@ -603,6 +651,7 @@ def heater(folder: Path, *, trials: int, kelvin: int = -1, motions: int = 0) -> 
 SLOW = ("-u", "/power:data", "-y", "/temperature:data")
 
 
+@pytest.mark.slow
 def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Path) -> None:
     bags, config = heater(tmp_path / "bags", trials=5), tmp_path / "robot.yaml"
     said = nlsid("init", bags, "--out", config, *SLOW)
@@ -615,6 +664,7 @@ def test_a_slow_robot_goes_the_whole_way_by_the_names_of_its_topics(tmp_path: Pa
     assert "run_04" in whole_way(bags, config, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
     bags = heater(tmp_path / "bags", trials=5, kelvin=2)
     said = nlsid("init", bags, "--out", tmp_path / "robot.yaml", *SLOW)
@@ -622,6 +672,7 @@ def test_a_trial_in_another_unit_is_named(tmp_path: Path) -> None:
     assert "mind: run_02: temperature is 29" in said
 
 
+@pytest.mark.slow
 def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None:
     """Two motions in turn, ten bags: every fifth by name would test one of them twice as often."""
     bags, config = heater(tmp_path / "bags", trials=10, motions=2), tmp_path / "robot.yaml"

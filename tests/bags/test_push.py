@@ -60,6 +60,7 @@ def told(folder: Path, *options: str) -> tuple[int, str]:
     return ended.exit_code, ended.output + str(ended.exception or "")
 
 
+@pytest.mark.slow
 def test_what_bags_show_is_stored_with_their_digests_and_the_funnel_is_proved_for_it(
     folder: Path,
 ) -> None:

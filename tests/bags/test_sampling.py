@@ -144,6 +144,7 @@ def test_samples_are_what_the_rule_says_in_any_order_of_arrival(seed: int, rule:
         assert bool(sample.filled) is any(bridged)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_operations_give_the_same_bits_one_by_one_as_all_at_once(seed: int) -> None:
@@ -389,6 +390,7 @@ def turning_robot(path: Path, seed: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_robot_with_unstamped_commands_and_a_measured_heading_is_monitored(
     tmp_path: Path,
 ) -> None:

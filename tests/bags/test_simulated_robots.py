@@ -75,6 +75,7 @@ def test_an_unknown_simulated_robot_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_whole_chain_runs_from_one_configuration(tmp_path: Path) -> None:
     config = tmp_path / "pendulum.yaml"
     text = (ROOT / "config" / "pendulum.yaml").read_text()

@@ -1,6 +1,7 @@
 """What the commands print fits 80 columns, with every number whole."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,16 @@ def test_what_a_monitor_says_of_the_worst_bag_is_not_cut() -> None:
     assert max(map(len, text.splitlines())) <= 80
 
 
+def test_a_name_that_fits_beside_the_numbers_stays_whole() -> None:
+    inside = Reading(9.85, Status.INSIDE, 0.861, 0.12, worst_axis="position")
+    bad = Reading(34.8, Status.ASSUMPTION_VIOLATED, -2.588, 200.0, worst_axis="position")
+    named = [replace(replay(r), name=n) for r, n in ((inside, "duffing_test_0"), (bad, "x" * 30))]
+    text = printed(show.replay_table(named))
+    assert "duffing_test_0" in text.split()
+    assert text.count("x") - text.count("axis") == 30
+    assert max(map(len, text.splitlines())) <= 80
+
+
 @pytest.mark.parametrize("last", [0.01, float("nan")])
 def test_what_is_used_is_the_most_that_a_sample_used(last: float) -> None:
     fading = (
@@ -53,6 +64,7 @@ def test_what_is_used_is_the_most_that_a_sample_used(last: float) -> None:
     assert np.isnan(replay().assumption)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "method"), [(MonotoneClass(1, delays=(1,)), CertifiedSem()), (LinearClass(2), Rse())]
 )

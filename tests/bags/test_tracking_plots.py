@@ -204,6 +204,7 @@ def test_a_picture_is_a_png_file(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_every_step_draws_beside_its_files_and_says_so(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="simulated robots need the extra `sim`")
     text = (ROOT / "config" / "pendulum.yaml").read_text()

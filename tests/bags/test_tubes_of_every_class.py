@@ -34,6 +34,7 @@ from tests.identified_bags import (
     write_coupled_bags,
     write_saturating_bags,
 )
+from tests.marks import slow_among
 
 RUNS = 6
 
@@ -72,7 +73,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=pytest.mark.slow if n == "cells" else ()) for n in (*ONE, *TWO)],
+    slow_among((*ONE, *TWO), {"cells", "state_affine", "block_cascade", "linear_states"}),
 )
 def test_a_class_ends_in_a_tube_that_judges_a_bag_to_its_end(
     name: str, one: Path, two: Path, tmp_path: Path
@@ -103,7 +104,8 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     held = ["monitor", "--replay", "--funnel", str(linear_funnel), str(bag)]
     done = CliRunner().invoke(app, held)
     assert done.exit_code == 2, done.output
-    assert "not judged from 1.000 s on: 3 samples are missing" in done.output
+    lost = "3 samples from 1.000 to 1.020 s: 3 samples are missing"
+    assert f"gap: not judged: {lost}\n" in done.output
     told = CliRunner().invoke(app, [*held, "--json"])
     [entry] = json.loads(told.stdout)
     assert told.exit_code == 2
@@ -112,9 +114,9 @@ def test_a_bag_with_a_gap_is_judged_after_it_and_ends_with_status_2(
     kept = np.setdiff1d(np.arange(300), [50, 100, 150, 200, 250])
     gaps = Trajectory(t=PERIOD * kept, y=y[kept], u=np.zeros((len(kept), 1)), name="gaps")
     done = CliRunner().invoke(app, [*held[:-1], str(write_joint_bag(tmp_path, gaps))])
-    assert done.output.count("not judged from") == UNJUDGED_SAID == 3
-    last = f"the last from {PERIOD * 250:.3f} s on"
-    assert f"gaps: not judged later either: 2 more, {last}" in done.output
+    assert done.output.count("1 sample is missing") == UNJUDGED_SAID == 3
+    last = f"the last 1 sample at {PERIOD * 250:.3f} s"
+    assert f"gaps: not judged: 2 more samples in 2 places, {last}" in done.output
     replayed = replay_bag(documents.load_proved(linear_funnel), bag, centre=Centre.COMMAND)
     assert replayed.verdict == Status.UNKNOWN.value
     assert [k for k, r in enumerate(replayed.readings) if r.reason == LOST] == [100, 101, 102]

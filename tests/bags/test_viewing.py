@@ -15,10 +15,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from bags.chain.config import load_config
 from bags.chain.faults import FAULTS, write_faulty_copy
 from bags.chain.shipped import config_file
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.designs import documents
 from bags.monitoring.replay import replay_messages
 from bags.samples import f1tenth
@@ -30,7 +28,6 @@ from bags.viewing.replay import Recording
 from bags.viewing.scene import ERROR, OK, STALE, WARN, Scene
 from bags.viewing.serving import serve
 from nlsid_core.errors import DataError
-from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Status
 from tests.browser import CHROMIUM, MISSING, Page, browser
@@ -41,13 +38,9 @@ GOOD = {"margin": 0.5, "assumption": 0.1, "nominal": 1.0, "measured": 1.1, "half
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=MISSING)
 
 
-@pytest.fixture(scope="module")
-def funnel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("chain")
-    config = load_config(config_file("f1tenth.yaml"))
-    identify_bags(f1tenth(), config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
+@pytest.fixture
+def funnel(f1tenth_chain: Path) -> Path:
+    return f1tenth_chain / documents.FUNNEL
 
 
 @pytest.fixture
@@ -302,6 +295,7 @@ def test_a_browser_shows_the_words_and_takes_inside_back(page: Page, watched: Sc
     assert "what is shown is old" in page.text("#why")
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_shows_a_recording_that_is_over_as_it_ended(page: Page, watched: Scene) -> None:
     watched.end("verdict: inside. 2.9 of 2.9 s judged")
@@ -313,6 +307,7 @@ def test_a_browser_shows_a_recording_that_is_over_as_it_ended(page: Page, watche
         assert page.value("document.body.className") == ""
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_says_no_connection_when_the_stream_stands_still(
     page: Page, watched: Scene, monkeypatch: pytest.MonkeyPatch
@@ -328,6 +323,7 @@ def test_a_browser_says_no_connection_when_the_stream_stands_still(
         page.wait(lambda: page.text("#word").lower() == "inside")
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_shows_hostile_names_as_text(page: Page) -> None:
     hostile = "<img src=x onerror=\"document.title='run'\"><script>document.title='run'</script>"

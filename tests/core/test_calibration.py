@@ -108,6 +108,7 @@ def test_the_calibration_trials_do_not_choose_the_observer(
         assert louder.measured > 100 * tube.measured
 
 
+@pytest.mark.slow
 def test_a_probability_is_said_of_trials_that_the_model_was_not_fitted_to(
     fit: Fit[DifferenceEquation], train: Dataset
 ) -> None:
@@ -135,6 +136,7 @@ CONFIDENCE = 0.999  # of the interval around the frequency
 RATIOS = (1e-3, 1e-1, 1.0, 10.0, 1e3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaling", [1, 4, 9])
 def test_exchangeable_trials_exceed_the_largest_as_often_as_stated(
     fit: Fit[DifferenceEquation], scaling: int

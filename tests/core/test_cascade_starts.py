@@ -47,6 +47,7 @@ def test_sensitivities_are_the_derivatives_of_the_output(
         np.testing.assert_allclose(J[k], slope, atol=1e-7 * (1.0 + np.abs(slope).max()))
 
 
+@pytest.mark.slow
 def test_trials_that_begin_in_motion_are_identified_to_the_noise() -> None:
     train = Dataset(tuple(in_motion(150, seed) for seed in range(8)))
     validation = Dataset(tuple(in_motion(150, seed) for seed in (20, 21)))

@@ -42,6 +42,7 @@ def rms(fit: Fit[CellNetwork], data: Dataset) -> float:
     return float(np.sqrt(np.mean((simulate_trial(fit.model, trial) - trial.y)[skipped:] ** 2)))
 
 
+@pytest.mark.slow
 def test_two_tanks_that_flow_over_are_found_to_the_noise_and_proved(fit: Fit[CellNetwork]) -> None:
     """A new trial with other first levels, the upper one never measured: 1.5 times the noise."""
     assert fit.proof.rate < fit.max_rate < 1.0
@@ -50,6 +51,7 @@ def test_two_tanks_that_flow_over_are_found_to_the_noise_and_proved(fit: Fit[Cel
     assert rms(fit, tanks(2, h=(6.0, 3.0))) < 1.5 * NOISE
 
 
+@pytest.mark.slow
 def test_without_tops_the_overflow_is_left_over(fit: Fit[CellNetwork]) -> None:
     straight = identify(tanks(1), replace(SMALL, limit="none"))
     assert len(straight.model.maps) == 3
@@ -99,6 +101,7 @@ def test_the_sensitivities_are_those_of_finite_differences(limit: str) -> None:
         assert J[:, k] == pytest.approx((high - low) / (2 * h), abs=2e-5)
 
 
+@pytest.mark.slow
 def test_the_network_of_a_fit_simulates_what_was_fitted(fit: Fit[CellNetwork]) -> None:
     """From the state that the first samples show, and in one step of several states at once."""
     trial, model = tanks(1).trajectories[0], fit.model

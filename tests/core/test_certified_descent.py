@@ -59,6 +59,7 @@ def test_where_the_set_does_not_matter_the_minimum_is_the_free_one() -> None:
     assert fit.proof.rate < 1.0
 
 
+@pytest.mark.slow
 def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> None:
     data = resonant(1500, 0)
     model_class = MonotoneClass(2, (0,))
@@ -73,6 +74,7 @@ def test_where_the_set_matters_the_model_stays_in_it_and_beats_the_bound() -> No
     assert "incremental stability" in decided.statement
 
 
+@pytest.mark.slow
 def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
     fast = identify(noisy(800, 1), CLASS, method=CertifiedSem(), comparators=(), max_rate=0.4)
     assert fast.proof.rate <= 0.4
@@ -84,13 +86,18 @@ def test_a_rate_that_is_asked_for_is_kept_in_the_descent() -> None:
 @pytest.mark.parametrize(
     "model_class",
     [
-        ImplicitClass(2, (0,)),
-        ImplicitClass(2, (0,), "2.10"),
-        ImplicitClass(1, (0,), "2.12"),
         ImplicitClass(1, (0,), "2.13"),
-        ImplicitClass(1, (0,), "2.13", 5, 3),
         ImplicitClass(1, (0,), "2.19", 1),
-        ImplicitClass(1, (0,), "2.11", 3, 2, box=((-4.0, 4.0), (-2.1, 2.1))),
+        *(
+            pytest.param(longer, marks=pytest.mark.slow)
+            for longer in (
+                ImplicitClass(2, (0,)),
+                ImplicitClass(2, (0,), "2.10"),
+                ImplicitClass(1, (0,), "2.12"),
+                ImplicitClass(1, (0,), "2.13", 5, 3),
+                ImplicitClass(1, (0,), "2.11", 3, 2, box=((-4.0, 4.0), (-2.1, 2.1))),
+            )
+        ),
     ],
     ids=str,
 )
@@ -107,6 +114,7 @@ def test_every_set_of_implicit_models_has_a_proved_minimum_below_its_bounds(
     proofs.decide(document, {"m.json": fit.model.document()})
 
 
+@pytest.mark.slow
 def test_linear_models_of_several_measured_states_are_found_and_proved() -> None:
     data, test = coupled(400, 0), coupled(400, 1)
     fit = identify(
@@ -160,6 +168,7 @@ def test_a_linear_model_begins_as_itself_in_the_other_classes() -> None:
     np.testing.assert_allclose(found.r, error, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_of_a_random_walk_there_is_a_stable_model_too() -> None:
     u = np.random.default_rng(1).uniform(-1.0, 1.0, 300)
     y = np.cumsum(np.random.default_rng(0).standard_normal(300))

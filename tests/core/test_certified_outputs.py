@@ -19,6 +19,7 @@ from tests.state_affine_rows import problem
 
 # (outputs, degree of G_0, degree of G_1 …), and inputs in [-range, range] beside data in [-1, 1]
 CASES = [(2, 0, 0, 1.0), (2, 1, 0, 6.0), (2, 1, 1, 2.0), (1, 1, 1, 3.0)]
+MARKED = [CASES[0], *(pytest.param(case, marks=pytest.mark.slow) for case in CASES[1:])]
 
 
 def rows(outputs: int, leading: int, lagged: int, most: float) -> StateAffineRows:
@@ -47,7 +48,7 @@ def checked(model: StateAffineModel, folder: Path) -> str:
     return check(folder / "model.proof.json").statement
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", MARKED)
 def test_iterates_never_go_up_and_the_last_one_is_proved(
     case: tuple[int, int, int, float], tmp_path: Path
 ) -> None:
@@ -60,6 +61,7 @@ def test_iterates_never_go_up_and_the_last_one_is_proved(
     assert "every input" in checked(stacked.model(point.theta, point.p), tmp_path)
 
 
+@pytest.mark.slow
 def test_few_steps_a_bound_stay_inside_the_set_and_end_as_low(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -83,7 +85,7 @@ def test_the_set_gives_a_proof_where_the_free_iterates_have_none() -> None:
     assert prove_stability(model) is None
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", MARKED)
 def test_the_last_step_keeps_the_proof_and_lowers_the_error(
     case: tuple[int, int, int, float], tmp_path: Path
 ) -> None:

@@ -140,6 +140,7 @@ def test_a_small_swing_of_the_pendulum_has_its_textbook_period() -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_free_satellite_keeps_its_angular_momentum_and_energy() -> None:
     satellite = Satellite(0.01)
     satellite.step(np.array([20.0, 30.0, -10.0]), np.zeros(3))

@@ -69,6 +69,7 @@ def test_errors_of_measurement_push_through_the_feedback() -> None:
     assert found.farthest[0] == pytest.approx(0.05 * (1 - decay) / 0.1, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_held_input_is_held() -> None:
     """x(k + 1) = (1 - hK)x(k) with a hold of h: here it overshoots, and grows."""
     hold = 0.5

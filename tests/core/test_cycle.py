@@ -29,6 +29,7 @@ def decaying(hold: float | None = None, rate: float = -1.0) -> FunnelDesign:
     return design(ContinuousTracking(field, still, goal=[0.5], hold=hold))
 
 
+@pytest.mark.slow
 def test_every_start_of_the_ring_comes_to_the_published_limit_cycle() -> None:
     found = limit_cycle.designed()
     funnel = found.funnel
@@ -77,6 +78,7 @@ def steps(speed: float) -> Iterator[tuple[float, float]]:
         yield float(before), speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_wheel_that_starts_in_its_funnel_walks_on_for_ever(side: int) -> None:
     found = rimless_wheel.designed()

@@ -110,6 +110,7 @@ def test_what_is_a_little_more_than_was_proved_is_refused(files: Files) -> None:
     refused(unclaimed, "'margin' is missing")
 
 
+@pytest.mark.slow
 def test_inputs_that_saturate_or_are_held_and_many_pushes_may_decay_too() -> None:
     """ẋ = x - x³/3 + clip(u), and a point that three winds push."""
     t = np.linspace(0, 0.5, 5)
@@ -131,6 +132,7 @@ def test_inputs_that_saturate_or_are_held_and_many_pushes_may_decay_too() -> Non
     assert excess(found, found.claim["decay"]) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_function_that_is_expanded_may_decay_too() -> None:
     """A pendulum that falls, with its sine."""
 

@@ -11,7 +11,7 @@ from nlsid_core import files
 from nlsid_core.documents import load
 from nlsid_core.dynamics import Nominal, VectorField, constant_on, cubic_through, linear_through
 from nlsid_core.errors import DataError, DocumentError, ShapeError
-from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.funnels.sampled import DisturbanceAssumption, SampledFunnel
 from nlsid_core.funnels.tube import Tube, TubeFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
@@ -128,8 +128,8 @@ def test_an_ellipsoid_is_inside_exactly_up_to_the_boundary() -> None:
     t = funnel.t0 + 0.5
     shape, centre = funnel.shape(t), funnel.nominal(t)
     for scale, inside in ((1.001, True), (0.999, False)):
-        assert funnel.contains_ellipsoid(t, centre, scale * shape) is inside
-        assert funnel.inside_ellipsoid(t, centre, shape / scale) is inside
+        inner, outer = ((centre, scale * shape), (centre, shape))
+        assert (ellipsoid_inside(*inner, *outer) is not None) is inside
 
 
 @pytest.mark.parametrize("gain", ["constant", "linear", "cubic"])

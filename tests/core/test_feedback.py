@@ -39,6 +39,7 @@ def fit() -> Fit[CellNetwork]:
     return identify(trials(AMPLITUDES), SMALL, comparators=(Sem(),))
 
 
+@pytest.mark.slow
 def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None:
     """The loop to its noise, unproved; unrolled and proved, 5 % where linear models have 20 %."""
     fresh, louder = trials([0.12, 0.22], seed=1), trials([0.28], seed=2)
@@ -55,6 +56,7 @@ def test_a_duffing_oscillator_is_found_and_proved(fit: Fit[CellNetwork]) -> None
     assert CellNetwork.from_document(fit.model.document()).document() == fit.model.document()
 
 
+@pytest.mark.slow
 def test_the_history_says_what_every_map_gained(fit: Fit[CellNetwork]) -> None:
     first, second, _ = fit.history.steps
     assert (first.what, second.what) == ("1 map", "2 maps")
@@ -62,6 +64,7 @@ def test_the_history_says_what_every_map_gained(fit: Fit[CellNetwork]) -> None:
     assert fit.history.value.startswith("held-back error")
 
 
+@pytest.mark.slow
 def test_a_slower_proof_than_the_kernel_can_decide_is_refused(fit: Fit[CellNetwork]) -> None:
     document = fit.proof.document(fit.model, "m.json")
     document["claim"]["rate"] = 0.5
@@ -145,6 +148,7 @@ def test_the_network_simulates_what_was_fitted() -> None:
         assert model.states(u[n:], start)[0] == pytest.approx(recorded[n:], abs=0.02 * y.std())
 
 
+@pytest.mark.slow
 def test_several_layers_are_proved_by_their_weights(fit: Fit[CellNetwork]) -> None:
     """P couples no stage with another, so that no program has to be solved."""
     n, proof = SMALL.lags, prove_stability(fit.model)

@@ -19,10 +19,11 @@ from nlsid_core.running.forecast import Forecast, linear_form, reach
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from nlsid_core.running.stepping import Stepper
-from tests.core.kernel.tube_claims import HIGH, LOW, MODELS, design
+from tests.core.kernel.tube_claims import HIGH, LONG, LOW, MODELS, design
+from tests.marks import slow_among
 
 AHEAD = 12
-EVERY = pytest.mark.parametrize("name", MODELS)
+EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 
 
 def alone(name: str, i: int = 0, *, peak: bool = True) -> tuple[Any, TubeFunnel]:
@@ -214,15 +215,15 @@ def exact_reach(tube: Any, linear: Any) -> list[list[Fraction]]:
     return found
 
 
-def test_forecasting_leaves_the_run_where_it_is() -> None:
-    for name in ("cascade", "two_following", "implicit_ray"):
-        model, funnel = alone(name)
-        y, u = attack(model, funnel, "random", 60, seed=3)
-        looking, plain = Monitor(model, None, funnel), Monitor(model, None, funnel)
-        for k in range(len(y)):
-            expected = plain.update(k * model.period, y[k], u[k])
-            assert str(looking.update(k * model.period, y[k], u[k])) == str(expected)
-            looking.forecast(u[k : k + 5])
+@pytest.mark.parametrize("name", slow_among(("cascade", "two_following", "implicit_ray"), LONG))
+def test_forecasting_leaves_the_run_where_it_is(name: str) -> None:
+    model, funnel = alone(name)
+    y, u = attack(model, funnel, "random", 60, seed=3)
+    looking, plain = Monitor(model, None, funnel), Monitor(model, None, funnel)
+    for k in range(len(y)):
+        expected = plain.update(k * model.period, y[k], u[k])
+        assert str(looking.update(k * model.period, y[k], u[k])) == str(expected)
+        looking.forecast(u[k : k + 5])
 
 
 def test_where_nothing_is_known_nothing_is_forecast_and_it_says_why() -> None:

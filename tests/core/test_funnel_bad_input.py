@@ -19,6 +19,7 @@ from nlsid_core.arrays import Json
 from nlsid_core.design import Goal, design_funnel, integrate_nominal, tvlqr
 from nlsid_core.dynamics import Nominal, PiecewisePolynomial, VectorField
 from nlsid_core.errors import DataError, Infeasible, NlsidError, NotPolynomial, OptionError
+from tests.marks import slow_among
 
 KNOTS = 9
 
@@ -151,7 +152,11 @@ CASES: list[tuple[Callable[[Json], Json], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "message"), CASES, ids=lambda c: getattr(c, "__name__", ""))
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    slow_among(CASES, {"pushed_out"}),
+    ids=lambda c: getattr(c, "__name__", ""),
+)
 def test_a_problem_that_cannot_be_right_is_told_alike_by_python_and_command_line(
     spoil: Callable[[Json], Json],
     message: str,
@@ -181,6 +186,7 @@ def test_the_same_problem_unspoiled_is_designed(tmp_path: Path) -> None:
     assert np.min(read.design().found.proved.margins) > 0
 
 
+@pytest.mark.slow
 def test_what_may_be_left_out_is_and_a_hold_is_read_and_proved(tmp_path: Path) -> None:
     problem = {key: fair()[key] for key in ("format", "version", "vector_field", "nominal", "goal")}
     files.write_document(tmp_path / "problem.json", problem | {"hold": 0.01, "error": [0.001, 0.0]})

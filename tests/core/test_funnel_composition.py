@@ -15,6 +15,7 @@ from nlsid_core.design import Goal, compose_funnels, design_funnel, integrate_no
 from nlsid_core.dynamics import Nominal, VectorField
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.proofs import check
+from tests.marks import slow_among
 
 Files = dict[str, Any]
 
@@ -173,7 +174,11 @@ def rebound(files: Files, folder: Path) -> Path:
     return folder / "composition.proof.json"
 
 
-@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
+@pytest.mark.parametrize(
+    ("forge", "reason"),
+    slow_among(FORGERIES, {"stages_without_end"}),
+    ids=lambda f: getattr(f, "__name__", ""),
+)
 def test_a_forged_composition_is_refused_for_what_it_is(
     files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
 ) -> None:

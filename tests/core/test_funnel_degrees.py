@@ -16,6 +16,7 @@ from nlsid_core.polynomial import constant, variables
 from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.proofs import check
 from nlsid_core.sos import Program, SphereProgram, SumOfSquares, solve, sphere_proof
+from tests.marks import slow_among
 
 
 def quintic(n: int) -> VectorField:
@@ -34,7 +35,7 @@ def moving(field: VectorField, knots: int = 9) -> Nominal:
     return integrate_nominal(field, lambda s: [0.2 * s], t=t, start=np.zeros(field.n))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_among([1, 2, 3], {2, 3}))
 def test_dynamics_of_degree_five_are_proved_and_no_start_leaves(n: int, tmp_path: Path) -> None:
     field = quintic(n)
     assert field.degree == 5

@@ -15,6 +15,7 @@ from nlsid_core.design.continuous.pieces import prove_pieces
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from nlsid_core.proofs import check
 from tests.funnel_files import Files, write
+from tests.marks import slow_among
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +131,16 @@ FORGERIES: list[tuple[Callable[[Files], None], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("forge", "reason"), FORGERIES, ids=lambda f: getattr(f, "__name__", ""))
+# A refusal after the polynomials of all pieces: as long as a proof. One of them is always tried.
+LONG = {
+    "gain_lower", "multiplier_sign", "factor_entry", "margin_doubled", "goal_shrunk",
+    "shapes_swapped", "nominal_shifted", "other_inertia", "column_shifted",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("forge", "reason"), slow_among(FORGERIES, LONG), ids=lambda f: getattr(f, "__name__", "")
+)
 def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
     files: Files, tmp_path: Path, forge: Callable[[Files], None], reason: str
 ) -> None:
@@ -140,7 +150,10 @@ def test_a_forgery_with_fresh_digests_is_refused_for_what_it_is(
         check(write(forged, tmp_path, rebind=True))
 
 
-@pytest.mark.parametrize("forge", [rho_at_one_knot, gain_lower, nominal_shifted, other_inertia])
+@pytest.mark.parametrize(
+    "forge",
+    slow_among([rho_at_one_knot, gain_lower, nominal_shifted, other_inertia], {"nominal_shifted"}),
+)
 def test_a_forged_file_is_refused_by_its_digest(
     files: Files, tmp_path: Path, forge: Callable[[Files], None]
 ) -> None:

@@ -136,6 +136,7 @@ def test_an_unknown_option_is_named_with_the_known_ones(option: str) -> None:
         ContinuousTracking(*hanging(), goal=GOAL, **chosen)
 
 
+@pytest.mark.slow
 def test_every_iterate_of_the_alternation_is_larger_than_the_last() -> None:
     setting = prepare(*hanging(), goal=GOAL, **DEFAULTS)
     start = exponential_start(setting.steps, setting.policy, setting.P)
@@ -153,6 +154,7 @@ def setting() -> Setting:
     return prepare(*hanging(), goal=GOAL, **DEFAULTS)
 
 
+@pytest.mark.slow
 def test_both_objectives_grow_the_funnel_and_are_proved() -> None:
     rho = design_funnel(*hanging(), goal=GOAL)
     found = {
@@ -205,6 +207,7 @@ def test_the_trust_region_holds_and_without_it_the_linearised_volume_runs_furthe
     assert largest[0.2] > 0.1
 
 
+@pytest.mark.slow
 def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     """Three pushes, each bounded with κ."""
     field = VectorField.from_function(
@@ -219,6 +222,7 @@ def test_p_of_a_pushed_field_grows_and_no_push_leads_out() -> None:
     stays_inside(design, pushed=0.01)
 
 
+@pytest.mark.slow
 def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
     rho, design = (
         design_funnel(*hanging(5), goal=GOAL, limits=[[-0.4, 0.4]], shape=s) for s in ("rho", "P")
@@ -227,6 +231,7 @@ def test_p_of_a_limited_torque_grows_and_no_start_leaves() -> None:
     assert stays_inside(design) > 100
 
 
+@pytest.mark.slow
 def test_p_stays_where_a_taylor_polynomial_is_valid() -> None:
     def boat(x: Any, u: Any) -> Any:  # across its course, heading
         return np.array([np.sin(x[1]), u[0]])

@@ -1,5 +1,6 @@
 """Funnels whose input is held between samples and whose state is measured wrong."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from nlsid_core.running.reading import Status
 from tests.falling_pendulum import tracking
 from tests.forged_held import HELD_FORGERIES, forged_held
 from tests.funnel_files import PROOF, Files, bind, saved
+from tests.marks import slow_among
 
 HOLD = 0.01  # s
 ERROR = [0.002, 0.01]
@@ -42,12 +44,26 @@ def largest(found: FunnelDesign, *, hold: float) -> float:
     return run.max_v
 
 
+def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> None:
+    free = design(tracking(gain="linear"))  # as a held policy's is
+    widths, unheld = (found.funnel.widths(found.funnel.t0) for found in (held, free))
+    said = str(held)
+    named = "the hold of 0.01 s and the errors of the measured state"
+    part = re.search(rf"{named} leave ([\d.]+) of", said)
+    assert part, said
+    proved = widths[0] / unheld[0]  # what was found without is a little more than is proved
+    assert 0.97 * proved < float(part[1]) <= proved
+    assert f"at 0 s: x0 {widths[0]:.3g}, x1 {widths[1]:.3g}; without, x0 " in said
+    assert "leave" not in str(free)
+
+
 def test_runs_that_are_held_and_measured_wrong_stay_inside(held: FunnelDesign) -> None:
     assert largest(held, hold=HOLD) < 1
     assert largest(held, hold=HOLD / 3) < 1
     assert largest(held, hold=20 * HOLD) > 1, "the simulation does hold"
 
 
+@pytest.mark.slow
 def test_the_claim_says_how_often_and_how_wrong(held: FunnelDesign) -> None:
     said = held.verdict.assumptions[0]
     assert "applied every 0.01 s or more often" in said
@@ -78,6 +94,7 @@ def test_an_input_is_not_held_from_stage_to_stage(files: Files) -> None:
         proofs.decide(document, files)
 
 
+@pytest.mark.slow
 def test_holding_costs_room(held: FunnelDesign) -> None:
     free = design(tracking())
     assert 0.2 < held.funnel.volume(0.0) / free.funnel.volume(0.0) < 1
@@ -90,11 +107,15 @@ def refused(files: Files, reason: str) -> None:
         proofs.decide(files[PROOF], files)
 
 
-@pytest.mark.parametrize("what", HELD_FORGERIES)
+LONG = {"an input that turns more slowly", "rates of one sign", "a rate piece less"}
+
+
+@pytest.mark.parametrize("what", slow_among(HELD_FORGERIES, LONG))
 def test_what_is_a_little_more_than_was_proved_is_refused(files: Files, what: str) -> None:
     refused(forged_held(files, what), HELD_FORGERIES[what][1])
 
 
+@pytest.mark.slow
 def test_an_input_that_is_clipped_may_be_held_too() -> None:
     """ẋ = x - x³/3 + clip(u), which asks for more than it gets at its funnel's edge."""
     field = VectorField.from_function(lambda x, u: x - x**3 / 3 + u, 1, 1)
@@ -125,6 +146,7 @@ def test_without_an_input_there_is_nothing_to_hold() -> None:
         design(ContinuousTracking(field, nominal, goal=[[1.0]], hold=0.01))
 
 
+@pytest.mark.slow
 def test_a_hold_that_no_funnel_survives_is_refused_with_what_it_does() -> None:
     with pytest.raises(Infeasible, match=r"may be 1 s old.*of which .* is the plan's own change"):
         design(tracking(hold=1.0))
@@ -152,6 +174,7 @@ def test_what_cannot_be_held_is_refused(options: Any, reason: str) -> None:
         design(tracking(**options))
 
 
+@pytest.mark.slow
 def test_a_hold_of_inputs_that_are_not_affine_is_proved_of_a_function() -> None:
     def squared(x: Any, u: Any) -> Any:
         return [u[0] + u[0] ** 2 - 0.1 * x[0]]

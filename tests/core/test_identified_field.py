@@ -100,6 +100,7 @@ def test_a_step_of_the_model_is_the_trapezoidal_rule_of_the_field(
     np.testing.assert_allclose(after, x + PERIOD * rate, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_every_linear_model_of_measured_states_has_a_field() -> None:
     data = Dataset((recorded(network, 2, 1),))
     fit = identify(data, LinearStateClass(), method=CertifiedSem(5), comparators=())
@@ -108,6 +109,7 @@ def test_every_linear_model_of_measured_states_has_a_field() -> None:
     np.testing.assert_allclose(B, [[1.0], [0.0]], atol=0.06)
 
 
+@pytest.mark.slow
 def test_the_page_goes_from_a_recording_to_a_proved_funnel(tmp_path: Path) -> None:
     (block,) = [
         part

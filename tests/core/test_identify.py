@@ -101,6 +101,7 @@ def unstable_recordings() -> Dataset:
     return Dataset(tuple(trials))
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_an_unstable_truth_gets_the_best_stable_model_and_a_residual_that_is_not_white() -> None:
     data = unstable_recordings()
@@ -150,6 +151,7 @@ def test_the_class_that_is_selected_is_fitted_to_training_and_validation_trials(
     assert len(tried.model.bags) == len(train), "what was judged on validation had not seen it"
 
 
+@pytest.mark.slow
 def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
     config: Path, tmp_path: Path
 ) -> None:
@@ -168,6 +170,7 @@ def test_the_command_line_identifies_a_state_affine_model_and_proves_it(
 
 
 @pytest.mark.slow
+@pytest.mark.pictures
 def test_the_command_line_compares_methods_on_the_same_bags(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

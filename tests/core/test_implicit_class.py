@@ -163,6 +163,7 @@ def test_units_and_offsets_of_the_signals_change_nothing(name: StableSet) -> Non
     assert small == pytest.approx(plain, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_several_states_of_different_units_are_identified_together() -> None:
     data, test = Dataset((coupled(400, 0), coupled(300, 1))), Dataset((coupled(200, 5),))
     cubic, linear = (

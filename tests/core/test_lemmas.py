@@ -12,23 +12,23 @@ from nlsid_core.design import FunnelDesign, design_funnel, integrate_nominal
 from nlsid_core.design.continuous.closed_loop import closed_loop_polynomial
 from nlsid_core.design.continuous.graded import monomials_of
 from nlsid_core.dynamics import Nominal, VectorField
-from nlsid_core.errors import DataError, Infeasible
+from nlsid_core.errors import Infeasible
 from nlsid_core.polynomial import variables
 from nlsid_core.sos import Program, SumOfSquares, solve
-from nlsid_core.sos.lemmas import lemma_decay, lemma_invariance
+from nlsid_core.sos.search import lower_bound
 
 
 def test_example_5_1_1_is_refused() -> None:
-    """V̇ ≤ 0 on V = 1, and yet solutions leave: the lemma is strict."""
+    """ẋ = 1: V̇ ≤ 0 on V = 1, and yet solutions leave: Lemma 5.2 asks for V̇ < 0 there."""
     (x,) = variables("x")
-    with pytest.raises(Infeasible, match="V̇ < 0 on V = 1 is not proved"):
-        lemma_invariance(1 + (x**2 - 1) ** 3, [0 * x + 1], ["x"], degree=8)
+    V = 1 + (x**2 - 1) ** 3
+    assert lower_bound(-V.derivative("x"), equalities=[V - 1], degree=8).value <= 0
 
 
 @pytest.mark.parametrize(("sigma", "proved"), [(0.36, True), (0.26, True), (0.24, False)])
 def test_example_5_1_2_decays_down_to_a_quarter_and_not_below(sigma: float, proved: bool) -> None:
     if proved:
-        assert two_lemmas.decay(sigma).margin > 0
+        assert two_lemmas.decay(sigma) > 0
     else:
         with pytest.raises(Infeasible):
             two_lemmas.decay(sigma)
@@ -61,19 +61,11 @@ def test_solutions_of_example_5_1_2_obey_both_guarantees() -> None:
     assert V.max(axis=0)[0] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_the_two_figures_are_drawn_from_what_was_proved(tmp_path: Any) -> None:
     two_lemmas.draw(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_rate_or_sigma_that_means_nothing_is_refused() -> None:
-    (x,) = variables("x")
-    for rate, sigma in ((0.0, 0.5), (1.0, 1.0), (1.0, -0.1)):
-        with pytest.raises(DataError, match="should be positive and sigma"):
-            lemma_decay(x**2, [-x], ["x"], rate=rate, sigma=sigma)
-    with pytest.raises(DataError, match="1 rates for the states x, y"):
-        lemma_invariance(x**2, [-x], ["x", "y"])
 
 
 # -- the literal formulation, thesis (6.4) -----------------------------------------------------
@@ -140,6 +132,7 @@ def literal_margin(design: FunnelDesign, piece: int, degree: int) -> tuple[float
     return best / scale, lowest / scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "piece"),
     [("one_dimensional", 0), ("one_dimensional", 17), ("one_dimensional", 38),

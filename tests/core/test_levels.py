@@ -95,6 +95,7 @@ def test_products_of_a_few_inputs_are_tried_and_of_many_are_not() -> None:
     assert not any(term.inputs == (1,) for term in candidates([still]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [1.0, 0.0])
 def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says(moved: float) -> None:
     """A level designed on 8 trials, scaled on 9 others: the next one exceeds it in a tenth.

@@ -38,6 +38,7 @@ def recorded(seed: int, noise: float = 0.0) -> Trajectory:
     return Trajectory(t=PERIOD * np.arange(len(u)), y=x, u=u, name=f"run {seed}")
 
 
+@pytest.mark.slow
 def test_a_friction_that_equations_leave_out_is_measured_and_the_funnel_holds_with_it() -> None:
     push = measured_push(rate, Dataset(tuple(recorded(i) for i in range(4))), safety_factor=1.2)
     assert push.largest.shape == (4, 2)

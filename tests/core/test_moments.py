@@ -190,6 +190,7 @@ def test_a_bound_for_another_class_is_refused() -> None:
         moment_bound(truth(), plain_moments([trial], MonotoneClass(2, (0,), 1), OFFSETS))
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_more_data() -> None:
     def mean_error(samples: int) -> float:
         fits = [

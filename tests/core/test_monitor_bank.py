@@ -23,7 +23,7 @@ def designs(design: OutputTubeDesign, train: Dataset) -> list[OutputTubeDesign]:
             safety_factor=1.0 + 0.1 * i,
             inlet=0.01 * i,
         )
-        for i in range(10)
+        for i in range(4)
     ]
 
 

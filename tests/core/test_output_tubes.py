@@ -1,5 +1,6 @@
 """Running against tubes around a model's simulation: for ever, over gaps, several at once."""
 
+import re
 import sys
 import time
 import tracemalloc
@@ -21,10 +22,12 @@ from nlsid_core.models import BlockCascade
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Reading, Status
 from nlsid_core.running.stepping import Stepper
+from nlsid_core.running.tubes import WATCHED
 from tests import implicit_models
-from tests.core.kernel.tube_claims import MODELS, dataset, design, recorded
+from tests.core.kernel.tube_claims import LONG, MODELS, dataset, design, recorded
+from tests.marks import slow_among
 
-EVERY = pytest.mark.parametrize("name", MODELS)
+EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 
 
 def run(monitor: Monitor, trial: Trajectory) -> list[Reading]:
@@ -110,7 +113,32 @@ def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(
         reading = run(Monitor(made.model, None, wide), replace(trial, y=y))[k]
         assert reading.status is status
         assert ("one sample's innovation energy" in reading.reason) == (part > 1.0)
+        assert (f"assumed ({WATCHED})," in reading.reason) == (part > 1.0)
         assert reading.assumption >= part**2 * (1.0 - 1e-6)
+
+
+def test_a_reason_has_units_and_says_what_the_tube_does_not_rest_on() -> None:
+    made, trial = design("linear"), trial_of("linear")
+    [signal] = monitor_of("linear")._tubes._stepper.y
+    tube, response = made.funnel.tubes[0], made.funnel.response
+    assert tube.peak is not None
+    assert response is not None
+    y = trial.y.copy()
+    y[60:] += 3.0 * response.half_widths
+    unit = signal.unit
+    bad = [r for r in run(monitor_of("linear"), replace(trial, y=y)) if r.reason and r.t > 0.0]
+    energies = [r.reason for r in bad if "above the level" in r.reason]
+    number = r"[-+.\de]+"
+    squared = re.escape(f" ({unit})²")
+    assert re.search(
+        f"energy {number}{squared} above the level {number}{squared} at t", energies[0]
+    )
+    wide = replace(tube, level=1e6 * tube.level, peak=replace(tube.peak, level=1e6))
+    alone = Monitor(made.model, None, replace(made.funnel, tubes=(wide,), cusum=None))
+    reasons = [r.reason for r in run(alone, replace(trial, y=y))]
+    beside = next(reason for reason in reasons if "from the simulation" in reason)
+    said = f"is {number} {re.escape(unit)} from the simulation, above {number} {re.escape(unit)}"
+    assert re.search(rf"{said}, which is assumed \({WATCHED}\), at t", beside)
 
 
 @EVERY
@@ -128,6 +156,7 @@ def test_a_run_that_starts_at_a_wrong_measurement_is_inside_or_breaks_the_assump
         assert {r.status for r in readings[-10:]} == {Status.INSIDE}, "a wrong start fades"
 
 
+@pytest.mark.slow
 def test_nothing_ends_a_run_and_memory_does_not_grow() -> None:
     monitor, trial = monitor_of("linear"), trial_of("linear", 1000)
     run(monitor, trial)
@@ -304,6 +333,7 @@ def test_a_funnel_reads_back_as_it_was_written() -> None:
 # -- design ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() -> None:
     model = MODELS["linear"]()
     made = design_output_tube(model, dataset(model, 0, 6))
@@ -316,6 +346,7 @@ def test_the_level_is_measured_on_other_trials_than_the_tube_is_designed_on() ->
     assert "windows of one recording are hardly exchangeable" in str(single.verdict)
 
 
+@pytest.mark.slow
 def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says() -> None:
     """Of 40 next trials, each beside 9 of its own: a tenth, within three standard deviations."""
     model, exceeded = MODELS["linear"](), 0

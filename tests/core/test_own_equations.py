@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.first_try import Truth, dubins, lines_of, rocket, van_der_pol
+from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import (
@@ -20,7 +20,7 @@ from nlsid_core.design import (
     plan_motion,
 )
 from nlsid_core.design.continuous.diagnosis import TERMS, Diagnosis
-from nlsid_core.dynamics import Nominal, Rates
+from nlsid_core.dynamics import Nominal, PiecewisePolynomial, Rates
 from nlsid_core.errors import DataError, Infeasible, NlsidError
 from nlsid_core.proofs import check
 
@@ -38,6 +38,7 @@ def upright(knots: int = 9, seconds: float = 1.0) -> Nominal:
     return integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) -> None:
     code = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)[0]
     told = [float(number) for number in re.findall(r"# \[(.*?)\]", code)[0].split()]
@@ -67,6 +68,18 @@ def test_a_rocket_lands_at_the_first_try_and_no_start_leaves() -> None:
     assert np.ptp(np.log2(found.found.proved.pieces.kappa), axis=0).max() > 1  # it follows ρ
 
 
+@pytest.mark.slow
+def test_a_stiff_arm_gets_the_knots_that_its_springs_need() -> None:
+    rate, problem = flexible_arm()
+    found = design(problem)
+    assert len(found.funnel.t) > len(problem.nominal.t)
+    truth = Truth(rate, found, 0)
+    rng = np.random.default_rng(0)
+    run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
+    assert run.violations == 0
+    assert run.max_v > 0.9
+
+
 def test_an_oscillator_without_an_input_is_proved() -> None:
     found = design(van_der_pol()[1])
     assert (found.funnel.widths(0.0) > [0.9, 1.1]).all()
@@ -75,6 +88,7 @@ def test_an_oscillator_without_an_input_is_proved() -> None:
 # -- the motion ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_planned_motion_obeys_the_equations_and_its_limits() -> None:
     end = [np.pi / 2, 0.0]
     limits = [[-14.0, 14.0]]
@@ -98,6 +112,7 @@ def test_a_motion_is_planned_for_the_centre_of_what_is_uncertain() -> None:
             plan_motion(pushed, **ends, m=1, uncertain=box)
 
 
+@pytest.mark.slow
 def test_an_uncertain_that_cannot_move_adds_nothing() -> None:
     def rate(x: Any, u: Any, w: Any) -> list[Any]:
         return [x[1], u[0] - np.sin(x[0]) + w[0]]
@@ -119,6 +134,7 @@ def test_inputs_share_what_they_do_by_the_square_of_their_scale() -> None:
         plan_motion(pendulum, start=[0, 0], end=[1, 0], seconds=1, m=2, scale=[1.0, 0.0])
 
 
+@pytest.mark.slow
 def test_what_is_no_motion_is_not_returned() -> None:
     with pytest.raises(Infeasible, match="more seconds"):
         plan_motion(pendulum, start=[0, 0], end=[3, 0], seconds=1, m=1, limits=[[-1, 1]])
@@ -131,6 +147,7 @@ def test_what_is_no_motion_is_not_returned() -> None:
 # -- goals, limits, weights ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
     widths = np.array([0.2, 0.5])
     P = np.diag(widths**-2)
@@ -160,6 +177,7 @@ def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
         design_funnel(pendulum, upright(), **options)
 
 
+@pytest.mark.slow
 def test_limits_are_pairs_too() -> None:
     found = design_funnel(pendulum, upright(), goal=[0.2, 0.5], limits=[[-6, 6]])
     assert found.policy.limits.tolist() == [[0, -6, 6]]
@@ -179,6 +197,7 @@ def blown(x: Any, u: Any, w: Any) -> Any:
     return [x[1], 9.81 * np.sin(x[0]) + u[0] + w[0]]
 
 
+@pytest.mark.slow
 def test_a_disturbance_that_is_too_strong_is_named() -> None:
     text = refusal(blown, upright(), goal=[0.02, 0.05], uncertain=[[-9.0, 9.0]])
     assert "The diagonal of Q is (2e+04, 3.2e+03) and of R is (50)." in text
@@ -194,6 +213,58 @@ def test_a_refusal_tells_of_the_place_that_was_not_passed_however_often_it_was_t
     found = re.search(r"lets V fall by (\S+) 1/s, and the disturbance w takes (\S+) 1/s", text)
     assert found
     assert float(found[1]) < float(found[2]), "else nothing was in the way"
+
+
+@pytest.mark.slow
+def test_a_goal_wider_than_the_equations_are_defined_gets_a_narrower_funnel() -> None:
+    level = integrate_nominal(tank, lambda _: [1.0], t=np.linspace(0, 1, 5), start=[1.0])
+    found = design(ContinuousTracking(tank, level, goal=[1.5]))
+    assert 0.5 < found.funnel.widths(1.0)[0] < 1.0, "below an empty tank there is no root"
+    assert found.verdict.margin > 0
+
+
+def tank(x: Any, u: Any) -> Any:
+    """A level, and what flows in."""
+    return [u[0] - np.sqrt(x[0])]
+
+
+def test_what_cannot_be_expanded_is_told_with_its_line_time_and_state() -> None:
+    def filled(x: Any, u: Any) -> Any:
+        return [u[0], np.log(x[0]) - x[1]]
+
+    t = np.linspace(0, 1, 3)
+    inflow, wet = np.full((2, 2, 1), 1.0), np.stack([[[0.0], [0.5]], [[0.5], [1.0]]])
+    x = np.concatenate([wet, 0 * wet], axis=2)
+    motion = Nominal(PiecewisePolynomial(t, x), PiecewisePolynomial(t, inflow))
+    text = refusal(filled, motion, goal=[0.1, 0.1])
+    assert re.search(r"cannot be expanded between 0 and 0\.0\d+ s: the logarithm of a value", text)
+    assert "in `return [u[0], np.log(x[0]) - x[1]]`, because of x0 in [-" in text
+
+
+def test_a_jump_of_rounding_is_none() -> None:
+    t = np.linspace(0, 1, 3)
+    x = PiecewisePolynomial(t, np.zeros((2, 2, 1)))
+    for jump, kept in ((1e-17, False), (1e-9, True)):
+        u = np.full((2, 2, 1), 0.1)
+        u[1, 0] += jump + np.spacing(0.1)
+        assert Nominal(x, PiecewisePolynomial(t, u)).u.is_continuous() is not kept
+    with pytest.raises(DataError, match=r"x0 jumps by 1e-09 at 0\.5 s"):
+        Nominal(PiecewisePolynomial(t, u - 0.1), x)
+
+
+def lagging(x: Any, u: Any, w: Any) -> Any:
+    """A position whose speed lags its command, and is pushed."""
+    return [x[1] + 0.2 * w[0], (np.sin(u[0]) - x[1]) / 0.15]
+
+
+@pytest.mark.slow
+def test_feedback_that_acts_faster_is_tried_before_a_refusal() -> None:
+    t = np.linspace(0, 3, 45)
+    still = integrate_nominal(
+        lambda x, u: lagging(x, u, [0.0]), lambda _: [0.0], t=t, start=[0.0, 0.0]
+    )
+    found = design(ContinuousTracking(lagging, still, goal=[0.1, 1.0], uncertain=[[-1.0, 1.0]]))
+    assert found.found.tried.startswith("found with 0.25 R: with R as it is by default")
 
 
 def test_a_term_that_leaves_v_falling_is_not_blamed() -> None:

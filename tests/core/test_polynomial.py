@@ -41,7 +41,7 @@ def same(p: Polynomial, expression: Any) -> bool:
     return bool(sympy.expand(to_sympy(p) - expression) == 0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(polynomials(), polynomials(), st.integers(0, 3))
 def test_arithmetic_agrees_with_sympy(p: Polynomial, q: Polynomial, power: int) -> None:
     a, b = to_sympy(p), to_sympy(q)
@@ -53,6 +53,7 @@ def test_arithmetic_agrees_with_sympy(p: Polynomial, q: Polynomial, power: int) 
     assert same(-p / 3, -a / 3)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(polynomials(), polynomials())
 def test_composition_agrees_with_sympy(p: Polynomial, q: Polynomial) -> None:

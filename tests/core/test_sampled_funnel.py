@@ -14,6 +14,7 @@ from nlsid_core.design.sampled.motion import plan_motion
 from nlsid_core.errors import CertificateMismatch, CertificateRejected, DataError, Infeasible
 from nlsid_core.proofs import check
 from tests.forged_tracking import FORGERIES, forged
+from tests.marks import slow_among
 from tests.tracked import (
     STEPS,
     assumption,
@@ -133,7 +134,7 @@ def test_a_fading_assumption_the_loop_does_not_keep_up_with_is_refused(
         check(proof)
 
 
-@pytest.mark.parametrize("what", FORGERIES)
+@pytest.mark.parametrize("what", slow_among(FORGERIES, {"another nominal"}))
 def test_a_forged_funnel_is_refused_though_every_digest_fits(what: str, tmp_path: Path) -> None:
     proof = write(forged(designed(), what), tmp_path)
     with pytest.raises(CertificateRejected) as refusal:

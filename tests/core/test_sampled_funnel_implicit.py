@@ -20,6 +20,7 @@ from nlsid_core.running.reading import Status
 from tests import forged_tracking
 from tests.implicit_funnels import STEPS, designed
 from tests.implicit_pendulum import PERIOD, truth
+from tests.marks import slow_among
 from tests.tracked import assumption, resigned, step, write
 
 ROLES = ("model", "policy", "funnel")
@@ -34,6 +35,7 @@ def test_a_funnel_of_an_implicit_model_is_proved_exactly(form: str, tmp_path: Pa
     assert "roots" in verdict.assumptions[2]
 
 
+@pytest.mark.slow
 def test_the_reaches_of_an_implicit_model_are_tight_to_one_percent() -> None:
     design = designed()
     rng = np.random.default_rng(1)
@@ -47,7 +49,7 @@ def test_the_reaches_of_an_implicit_model_are_tight_to_one_percent() -> None:
         assert 0.99 * reach < farthest <= reach
 
 
-@pytest.mark.parametrize("form", ["response", "peak"])
+@pytest.mark.parametrize("form", slow_among(["response", "peak"], {"peak"}))
 def test_the_worst_disturbance_of_an_implicit_model_stays_in_the_tube(form: str) -> None:
     design = designed(form)
     funnel, policy = design.funnel, design.policy
@@ -155,7 +157,7 @@ FORGERIES = [
 ]
 
 
-@pytest.mark.parametrize("what", FORGERIES)
+@pytest.mark.parametrize("what", slow_among(FORGERIES, {"another nominal"}))
 def test_a_forged_implicit_funnel_is_refused_though_every_digest_fits(
     what: str, tmp_path: Path
 ) -> None:

@@ -219,6 +219,7 @@ def test_the_same_files_bound_again_are_proved(files: Files, tmp_path: Path) -> 
 # -- more inputs, bad input --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_saturated_funnel_comes_near_the_radius_known_in_closed_form() -> None:
     """ẋ = x + clip(u, ±1), |x(1)| ≤ 0.2: at the limit x(0) = 1 - 0.8/e, and no start beyond it."""
     field = VectorField.from_function(lambda x, u: np.array([x[0] + u[0]]), 1, 1)
@@ -231,6 +232,7 @@ def test_a_saturated_funnel_comes_near_the_radius_known_in_closed_form() -> None
     assert radius * found.policy.K(0.0)[0, 0] > 1.5  # it asks for far more than there is
 
 
+@pytest.mark.slow
 def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     def pair(x: Any, u: Any) -> Any:
         return np.array([x[0] + x[0] ** 3 / 6 + u[0], x[1] / 2 + x[0] / 4 + u[1]])
@@ -251,6 +253,7 @@ def test_two_inputs_have_nine_modes_and_all_are_proved(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_pushes_and_limits_are_proved_together(tmp_path: Path) -> None:
     def pushed(x: Any, u: Any, w: Any) -> Any:
         return np.array([x[1] + w[1], x[0] - x[0] ** 3 / 6 + u[0] + w[0] - 2 * w[2]])
@@ -293,6 +296,7 @@ def test_a_nominal_beyond_the_limits_is_refused() -> None:
         design_funnel(field, nominal, goal=GOAL, limits=[[0, 0.5, 6.0]])
 
 
+@pytest.mark.slow
 def test_the_command_line_takes_limits_from_a_problem_file(tmp_path: Path) -> None:
     field, _ = pendulum.problem()
     asked = FunnelProblem(

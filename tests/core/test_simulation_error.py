@@ -41,6 +41,7 @@ from nlsid_core.identification.validation import simulation_percent, validate
 from nlsid_core.models import StateAffineModel
 from nlsid_core.proofs import check
 from tests.conftest import synthetic_dataset
+from tests.marks import slow_among
 from tests.state_affine_rows import EXACT, dense, near_identity, problem
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -178,6 +179,7 @@ def test_weights_that_make_no_sense_are_refused() -> None:
             rows.weighted(wrong)
 
 
+@pytest.mark.slow
 def test_the_last_step_of_a_linear_model_keeps_its_proof_and_never_goes_up() -> None:
     dataset = synthetic_dataset(0.4)
     regression = build_regression(dataset, 3)
@@ -203,6 +205,7 @@ def checked(model: StateAffineModel, folder: Path) -> str:
     return check(folder / "model.proof.json").statement
 
 
+@pytest.mark.slow
 def test_the_last_step_of_a_state_affine_model_keeps_its_proof(tmp_path: Path) -> None:
     """From the first certified iterate, so that there is something left to gain."""
     stacked = problem(
@@ -273,12 +276,15 @@ def two_resonances(seed: int, *, noise: float) -> Dataset:
 
 @pytest.mark.parametrize(
     ("seed", "noise", "lags", "stuck", "reached"),
-    [
-        (3, 0.02, 2, 90.0, 6.5),
-        (4, 0.1, 2, 90.0, 18.0),
-        (8, 0.1, 2, 35.0, 18.0),
-        (1, 0.1, 4, 20.0, 18.0),
-    ],
+    slow_among(
+        [
+            (3, 0.02, 2, 90.0, 6.5),
+            (4, 0.1, 2, 90.0, 18.0),
+            (8, 0.1, 2, 35.0, 18.0),
+            (1, 0.1, 4, 20.0, 18.0),
+        ],
+        {8, 1},
+    ),
 )
 def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_minimum(
     seed: int, noise: float, lags: int, stuck: float, reached: float
@@ -303,7 +309,7 @@ def beside_another_output(data: Dataset) -> Dataset:
     return Dataset((Trajectory(t=trial.t, y=y, u=trial.u, name="two"),))
 
 
-@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("outputs", slow_among([1, 2], {2}))
 def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(outputs: int) -> None:
     one = two_resonances(4, noise=0.1)
     data, lags, least = (one, 2, 17.3) if outputs == 1 else (beside_another_output(one), 1, 11.0)
@@ -316,6 +322,7 @@ def test_state_affine_models_of_one_and_several_outputs_have_other_starts_too(ou
     assert fit.proof.rate < 1.0
 
 
+@pytest.mark.slow
 def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> None:
     data = beside_another_output(two_resonances(1, noise=0.1))
     rows = build_state_affine_rows(data, StateAffineClass(2)).rows
@@ -327,6 +334,7 @@ def test_few_steps_a_bound_never_go_up_and_end_where_whole_minimisers_end() -> N
     assert SimulationError(rows).at(few[-1].theta).J <= few[-1].J * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
     data = two_resonances(1, noise=0.1)
     whole = identify(data, StateAffineClass(4), method=Rse(), comparators=())
@@ -336,6 +344,7 @@ def test_a_large_problem_has_fewer_bounds_from_every_start(monkeypatch: pytest.M
     assert whole.errors["train"]["rse"] < short.errors["train"]["rse"] < 18.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3])
 def test_among_poles_at_the_slowest_rate_the_last_step_is_not_above_the_iterates(seed: int) -> None:
     """The truth forgets more slowly than a trial can tell: the limit on the rate is active."""

@@ -9,6 +9,7 @@ import pytest
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.implicit_step import SingleStep
 from tests import implicit_models
+from tests.marks import slow_among
 
 EVERY: dict[str, Callable[[], ImplicitModel]] = {
     "quintic": implicit_models.quintic,
@@ -21,7 +22,7 @@ EVERY: dict[str, Callable[[], ImplicitModel]] = {
 
 
 @pytest.mark.parametrize("name", EVERY)
-@pytest.mark.parametrize("size", [0.3, 3.0, 300.0])
+@pytest.mark.parametrize("size", slow_among([0.3, 3.0, 300.0], {300.0}))
 def test_a_single_step_is_the_step_of_whole_arrays(name: str, size: float) -> None:
     """Also far away, where Newton's full steps fail and the model's own solver takes over."""
     model, rng = EVERY[name](), np.random.default_rng(0)

@@ -57,6 +57,7 @@ def test_the_number_of_points_is_the_number_of_equalities() -> None:
     assert np.linalg.norm(program.points, axis=1) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_every_l_step_along_the_satellite_is_proved_by_the_kernel_and_shown_in_floats() -> None:
     program = SphereProgram(6)
     steps = satellite.l_steps(satellite.nominal())

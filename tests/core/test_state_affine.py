@@ -97,6 +97,7 @@ def test_documents_validate_against_the_published_schemas(documents: tuple[Json,
                 jsonschema.validate(damaged, schema)
 
 
+@pytest.mark.slow
 def test_certified_iterates_cost_little_and_never_go_up(stacked: StateAffineRows) -> None:
     certified = [iterate.J for iterate in certified_simulation_error(stacked, iterations=6)]
     free = [iterate.J for iterate in robust_simulation_error(stacked.rows, iterations=6)]
@@ -150,6 +151,7 @@ def test_certified_iterates_refuse_degrees_they_have_no_set_for() -> None:
         next(certified_simulation_error(many))
 
 
+@pytest.mark.slow
 def test_five_inputs_multiply_the_past_in_a_certified_iterate() -> None:
     """1024 corners of ten entries of the window, each with its matrix in the set."""
     rng = np.random.default_rng(0)

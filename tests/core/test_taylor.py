@@ -1,5 +1,6 @@
 """Taylor models enclose what they stand for, and funnels of them hold for the true dynamics."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeE
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.proofs import check
 from tests.funnel_files import saved, write
+from tests.marks import slow_among
 
 
 def swinging(x: Any, u: Any) -> list[Any]:
@@ -94,6 +96,9 @@ EVERYTHING: dict[str, Any] = {
     "division": lambda x, u: [1 / (4 - x[0]) - u[0] / -(3 + x[0])],
     "powers": lambda x, u: [-(x[0] ** 3) * u[0] + x[0] ** 7 - (2 + x[0]) ** -2],
     "roots": lambda x, u: [np.sqrt(2 + x[0] * u[0]) + (3 + u[0]) ** 0.5 + (3 + x[0]) ** -0.5],
+    "squares": lambda x, u: [
+        np.sqrt(x[0] ** 2 - x[0] + 0.4) + 1 / (u[0] ** 2 + 0.3 - x[0] ** 2 / 9)
+    ],
     "tan": lambda x, u: [np.tan(x[0] / 2) - np.tan(3 + u[0] / 4)],
     "exp": lambda x, u: [np.exp(-x[0] * u[0]) + np.log(2 + x[0])],
     "tanh": lambda x, u: [np.tanh(3 * x[0]) - np.arctan(u[0] + 2 * x[0])],
@@ -105,7 +110,7 @@ EVERYTHING: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("name", EVERYTHING)
-@pytest.mark.parametrize("size", [0.05, 0.5])
+@pytest.mark.parametrize("size", slow_among([0.05, 0.5], {0.05}))
 def test_every_operation_encloses(name: str, size: float) -> None:
     centre, radius = np.array([1.0, -0.5]), size * np.array([1.0, 1.5])
     cubics, bounds = expanded(EVERYTHING[name], centre, radius, states=1)
@@ -114,6 +119,19 @@ def test_every_operation_encloses(name: str, size: float) -> None:
     assert left[0] <= bounds[0] + 1e-13
     if size < 0.1:
         assert bounds[0] < 0.02
+
+
+def test_a_square_is_not_taken_to_be_negative() -> None:
+    for drag in (
+        lambda x, u: [u[0] - x[0] * np.sqrt(x[0] ** 2 + 0.25)],
+        lambda x, u: [u[0] - x[0] / (0.25 + x[0] ** 2)],
+        lambda x, u: [u[0] - np.log(0.25 + (x[0] - 0.3) ** 2)],
+    ):
+        centre, radius = np.array([0.1, 0.0]), np.array([0.7, 1.0])
+        cubics, bounds = expanded(drag, centre, radius, states=1)
+        box = np.array([[0.0, 0.1], *np.stack([centre - radius, centre + radius], axis=1)])
+        left = left_over(drag, cubics, box, 1, 1)
+        assert left[0] <= bounds[0], "x0² + 1/4 is no less than 1/4"
 
 
 def test_time_and_disturbances_are_expanded_too() -> None:
@@ -161,6 +179,28 @@ def test_many_inexact_rates_are_pushes_and_exact_ones_have_none() -> None:
 def test_what_is_not_supported_says_what_is(function: Any, said: str) -> None:
     with pytest.raises(NlsidError, match=said):
         expanded(function, [1.0, -0.5], [0.5, 0.75], states=1)
+
+
+def test_arguments_with_a_default_keep_it() -> None:
+    def damped(x: Any, g: float = 9.81, *, u: Any, damping: float = 0.5) -> list[Any]:
+        return [x[1], -g * np.sin(x[0]) - damping * x[1] + u[0]]
+
+    def plain(x: Any, u: Any) -> list[Any]:
+        return [x[1], -9.81 * np.sin(x[0]) - 0.5 * x[1] + u[0]]
+
+    box = [1.0, -0.5, 0.0], [0.5, 0.75, 1.0]
+    (found, bounds), (wanted, same) = (expanded(f, *box, states=2) for f in (damped, plain))
+    for got, expected in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(got.exponents, expected.exponents)
+        np.testing.assert_array_equal(got.coefficients, expected.coefficients)
+    np.testing.assert_array_equal(bounds, same)
+
+    def falling(x: Any, rate: float = 2.0) -> list[Any]:
+        return [-rate * x[0]]
+
+    assert VectorField.from_function(falling, 1, 0)(0.0, [[3.0]], [[]]).tolist() == [[-6.0]]
+    twice = partial(falling, rate=4.0)
+    assert VectorField.from_function(twice, 1, 0)(0.0, [[3.0]], [[]]).tolist() == [[-12.0]]
 
 
 def test_a_radius_that_makes_no_sense_is_refused() -> None:
@@ -211,6 +251,7 @@ def test_a_funnel_of_taylor_models_holds_for_the_true_dynamics(
         assert np.abs(design.funnel.outline(float(t), (0, 1))[:, 0]).max() <= 0.4 + 1e-3
 
 
+@pytest.mark.slow
 def test_bounds_of_one_span_do_not_hold_in_another() -> None:
     field, _ = caught()
     assert [j for j, _, _ in field.validity(3)] == [0, 1, 2]

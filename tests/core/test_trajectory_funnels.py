@@ -70,6 +70,7 @@ def test_a_satellite_funnel_is_proved_for_every_t(satellite: FunnelDesign, tmp_p
     assert funnel.volume(5.0) == pytest.approx(6.883e-3, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDesign) -> None:
     parts = (satellite.model, satellite.policy, satellite.funnel)
     rng = np.random.default_rng(3)
@@ -81,6 +82,7 @@ def test_no_start_on_the_boundary_leaves_and_larger_ones_do(satellite: FunnelDes
     assert smallest_escape(*parts, goal_matrix(), starts=300, rng=rng) < 1.4
 
 
+@pytest.mark.slow
 def test_alternation_ends_where_the_sweep_does() -> None:
     field, nominal = hanging()
     design = design_funnel(field, nominal, goal=20 * np.eye(2))
@@ -114,6 +116,7 @@ def test_only_dynamics_nominal_and_weights_are_needed() -> None:
     assert design.model.document() == field.document()
 
 
+@pytest.mark.slow
 def test_the_one_dimensional_example_comes_near_the_best_radius() -> None:
     t = np.linspace(-1, 1, 401)
     best = one_dimensional.true_sets(t)[1]
@@ -190,6 +193,7 @@ def test_many_pushes_are_bounded_and_the_funnel_stays_where_its_dynamics_are_val
         check(write(forged, tmp_path))
 
 
+@pytest.mark.slow
 def test_a_pendulum_with_its_true_sine_stays_within_its_torque_limits() -> None:
     found = pendulum.designed()
     for t in found.funnel.t:
@@ -264,13 +268,14 @@ def test_value_gradient_volume_and_outline_agree() -> None:
     step = 1e-6
     moved = (funnel.value(0.5, points + np.array([step, 0])) - funnel.value(0.5, points)) / step
     assert funnel.gradient(0.5, points)[:, 0] == pytest.approx(moved, abs=1e-5)
-    assert funnel.contains_ellipsoid(1.0, [1, 2], np.eye(2))
-    assert not funnel.inside_ellipsoid(1.0, [1, 2], np.eye(2))
+    assert ellipsoid_inside([1, 2], np.eye(2), funnel.nominal(1.0), funnel.shape(1.0)) is not None
+    assert ellipsoid_inside(funnel.nominal(1.0), funnel.shape(1.0), [1, 2], np.eye(2)) is None
 
 
 # -- command line ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.pictures
 def test_the_command_line_designs_draws_and_checks_a_funnel(tmp_path: Path) -> None:
     field, nominal = hanging(9)

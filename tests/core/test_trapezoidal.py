@@ -56,6 +56,7 @@ def test_the_accelerations_coefficients_are_the_physical_ones() -> None:
         assert coefficient(model, exponent) == pytest.approx(value, rel=0.05, abs=0.02)
 
 
+@pytest.mark.slow
 def test_free_run_of_the_identified_model_follows_the_truth() -> None:
     data = recorded()
     model = identified(data)
@@ -102,6 +103,7 @@ def test_a_trapezoidal_model_reads_back_from_its_document_bit_for_bit() -> None:
     assert files.encode(again.document()) == text
 
 
+@pytest.mark.slow
 def test_without_repeats_nothing_is_identified() -> None:
     with pytest.raises(DataError, match="repeated"):
         identified(recorded(1))

@@ -107,6 +107,7 @@ def test_the_lyapunov_equation_has_its_closed_form_along_a_constant_loop() -> No
     assert (P[-1] == np.eye(2)).all()
 
 
+@pytest.mark.slow
 def test_gains_between_knots_come_closer_from_constant_to_linear_to_cubic() -> None:
     fine_field, fine = driven(801)
     exact = tvlqr(fine_field, fine, Q=Q, R=R, S_final=np.eye(2), gain="cubic").policy

@@ -70,7 +70,7 @@ class Source:
         return {entry.package for entry in self.imports}
 
     def _imports(self) -> Iterator[Import]:
-        for node in ast.walk(self.tree):
+        for node in self._statements:
             if isinstance(node, ast.Import):
                 yield from (Import(alias.name, None, node.lineno) for alias in node.names)
             elif isinstance(node, ast.ImportFrom):
@@ -80,7 +80,20 @@ class Source:
 
     def has_relative_imports(self) -> bool:
         """Whether there is one."""
-        return any(isinstance(n, ast.ImportFrom) and n.level for n in ast.walk(self.tree))
+        return any(isinstance(n, ast.ImportFrom) and n.level for n in self._statements)
+
+    @cached_property
+    def _statements(self) -> list[ast.stmt]:
+        """All of them, also those inside others; imports are among them, in no expression."""
+        found, left = [], list[ast.AST](self.tree.body)
+        while left:
+            node = left.pop()
+            if isinstance(node, ast.expr):
+                continue
+            if isinstance(node, ast.stmt):
+                found.append(node)
+            left += ast.iter_child_nodes(node)
+        return found
 
 
 @cache

@@ -15,6 +15,7 @@ def drake() -> DrakeAlternation:
     return DrakeAlternation(satellite.nominal(), limit=120.0)
 
 
+@pytest.mark.slow
 def test_drakes_multiplier_shows_what_our_l_step_shows(drake: DrakeAlternation) -> None:
     """g - m + μ(1 - |z|²) is nonnegative everywhere with our m, to Drake's tolerance."""
     i = 95

@@ -23,6 +23,7 @@ def test_every_benchmark_is_in_the_list() -> None:
     assert {entry.module for entry in BENCHMARKS.values()} == runnable
 
 
+@pytest.mark.slow
 def test_a_result_has_its_date_machine_load_and_commit() -> None:
     found = measured(Benchmark("first_order_bias", ("--trials", "1")), None, 120.0)
     assert set(found) == {"command", "date", "machine", "commit", "load", "seconds", "result"}

@@ -7,6 +7,8 @@ import sys
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import pytest
+
 from tests.house.sources import PACKAGES, ROOT, ROS, Source, modules_loaded_by, sources
 
 # Each package may import itself and those before it.
@@ -217,6 +219,7 @@ def test_checking_and_monitoring_load_nothing_but_numpy() -> None:
     assert loaded_by(modules) - loaded_by(["numpy"]) == {"nlsid_core"}
 
 
+@pytest.mark.slow
 def test_the_core_and_the_bags_load_no_ros() -> None:
     modules = [source.name for source in sources("nlsid_core", "bags")]
     loaded = loaded_by([name for name in modules if not name.endswith("__main__")])

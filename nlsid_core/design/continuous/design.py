@@ -20,7 +20,7 @@ from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
-from nlsid_core.design.continuous.setting import Goal, Setting, final_level, prepare
+from nlsid_core.design.continuous.setting import MOST_KNOTS, Goal, Setting, final_level, prepare
 from nlsid_core.design.continuous.shape import enlarge_shape, refuse_shape, validity_caps
 from nlsid_core.design.continuous.sweep import Ends, sweep_rho
 from nlsid_core.designs import Design
@@ -33,10 +33,12 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.progress import Progress, silent
 
 RETRIES = 6
-MOST_KNOTS = 100  # of a motion that is given more: each takes programs of its own
 HALVINGS = 6  # of intervals where P is far from linear
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
+FINER = ("knots", "remainder")  # what is less where knots are closer
+FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
+GAIN_SECONDS = 20.0  # of processor time for each
 KIND = "continuous_funnel"
 
 
@@ -46,7 +48,8 @@ class ContinuousSearch:
 
     proved.margins: (pieces,) of -V̇ on the boundary, in 1/s, as found in floating point. first: a
     first guess to compare with, of which nothing is proved. history: (what, ∫ volume dt). seconds:
-    wall clock of each stage.
+    wall clock of each stage. cost: what a hold and measurement errors take, in words. tried: what
+    was refused with other weights before, in words.
     """
 
     goal: Goal
@@ -54,12 +57,15 @@ class ContinuousSearch:
     first: ContinuousFunnel
     history: tuple[tuple[str, float], ...]
     seconds: dict[str, float]
+    cost: str = ""
+    tried: str = ""
 
     def __str__(self) -> str:
-        return (
+        volume = (
             f"volume integral {self.history[-1][1]:.4g}, found and proved in "
             f"{sum(self.seconds.values()):.2f} s"
         )
+        return "\n".join(row for row in (self.tried, self.cost, volume) if row)
 
 
 _Found: TypeAlias = tuple[Setting, ContinuousFunnel, Proved, float]
@@ -106,7 +112,8 @@ def design_funnel(
     started = time.perf_counter()
     try:
         again = prepared if policy is None else None
-        setting, funnel, proved, margin = _tried(setting, again, progress)
+        gains = () if policy is not None or R is not None or not setting.steps.field.m else FACTORS
+        (setting, funnel, proved, margin), tried = _with_gains(setting, again, gains, progress)
         if decay is not None:
             proved = prove_decay(setting.steps, setting.policy, funnel)
     except Infeasible as refusal:
@@ -124,7 +131,7 @@ def design_funnel(
         except Infeasible as refusal:  # what is proved already stays
             history.append((f"shape rho kept: {refusal}", funnel.volume_integral()))
         seconds["P"] = time.perf_counter() - started
-    return decided(setting, funnel, proved, history=history, seconds=seconds)
+    return decided(setting, funnel, proved, history=history, seconds=seconds, tried=tried)
 
 
 def decided(
@@ -134,6 +141,7 @@ def decided(
     *,
     history: list[tuple[str, float]],
     seconds: dict[str, float],
+    tried: str = "",
 ) -> FunnelDesign:
     """The design, once the kernel has decided its proof; Infeasible with its reason if not."""
     started = time.perf_counter()
@@ -149,7 +157,9 @@ def decided(
     if setting.hold is not None:
         claim |= setting.hold.claim()
         proof |= setting.rate_proof(funnel, proved.pieces.basis)
-    found = ContinuousSearch(goal, proved, setting.first_guess(), tuple(history), seconds)
+    found = ContinuousSearch(
+        goal, proved, setting.first_guess(), tuple(history), seconds, _cost(setting, funnel), tried
+    )
     try:
         design = Design.proved(
             setting.steps.field, policy, funnel, claim=claim, proof=proof, found=found
@@ -158,6 +168,24 @@ def decided(
         raise Infeasible(f"the kernel refuses what was found: {refusal}") from refusal
     seconds["proof"] = time.perf_counter() - started
     return design
+
+
+def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
+    """Half-widths at the start with the hold and the errors of the state, and without them."""
+    if setting.hold is None or setting.free is None:
+        return ""
+    part = float(np.sqrt(funnel.rho[0] / setting.free[0]))
+    free = replace(funnel, rho=funnel.rho / part**2)
+    held, unheld = (
+        ", ".join(f"x{i} {width:.3g}" for i, width in enumerate(f.widths(funnel.t0).tolist()))
+        for f in (funnel, free)
+    )
+    causes = [f"the hold of {setting.hold.period:g} s"] if setting.hold.period else []
+    causes += ["the errors of the measured state"] if setting.hold.error.any() else []
+    return (
+        f"{' and '.join(causes)} leave {part:.3g} of the half-widths at {funnel.t0:g} s: {held}; "
+        f"without, {unheld} were found for this policy, not proved"
+    )
 
 
 def _in_use(setting: Setting) -> str:
@@ -180,25 +208,75 @@ def _simulated(setting: Setting) -> str:
         return ""
 
 
+def _with_gains(
+    setting: Setting,
+    again: Callable[..., Setting] | None,
+    factors: tuple[float, ...],
+    progress: Progress,
+) -> tuple[_Found, str]:
+    """`_tried`, and where that fails also with R times these factors, each for GAIN_SECONDS.
+
+    Feedback that acts faster first where w is the cause, else feedback that acts slower. Returns
+    what was tried before in words.
+    """
+    try:
+        return _tried(setting, again, progress), ""
+    except Infeasible as error:
+        refusal = error
+    said = [f"with R as it is by default {_reason(refusal)}"]
+    if again is not None:
+        nominal = Nominal(setting.policy.x, setting.policy.u)
+        faster = isinstance(refusal, NoFunnel) and refusal.diagnosis.dominant == "disturbance"
+        for factor in sorted(factors, reverse=not faster):
+            try:
+                other = again(nominal, R=factor * setting.weights[1])
+                found = _found(other, _limited(progress))
+            except Infeasible as error:
+                said.append(f"with {factor:g} R {_reason(error)}")
+            else:
+                return found, f"found with {factor:g} R: {'; '.join(said)}"
+    if len(said) == 1:
+        raise refusal
+    raise Infeasible(f"{refusal}. Tried as well: {'; '.join(said[1:])}") from refusal
+
+
+def _reason(refusal: Infeasible) -> str:
+    """A refusal in few words."""
+    found = refusal if isinstance(refusal, NoFunnel) else refusal.__cause__
+    if not isinstance(found, NoFunnel):
+        return f"there is none ({refusal})"
+    return f"there is none at {found.diagnosis.t:.3g} s, because of {found.diagnosis.cause}"
+
+
+def _limited(progress: Progress) -> Progress:
+    """Progress that ends a search after GAIN_SECONDS of processor time."""
+    end = time.process_time() + GAIN_SECONDS
+
+    def told(what: str, fraction: float) -> None:
+        if time.process_time() > end:
+            raise Infeasible(f"stopped at {what}, after {GAIN_SECONDS:g} s of processor time")
+        progress(what, fraction)
+
+    return told
+
+
 def _tried(
     setting: Setting, again: Callable[[Nominal], Setting] | None, progress: Progress
 ) -> _Found:
     """ρ for the cost-to-go; where w stops that, for what the pushed linear loop reaches.
 
-    Where knots stop it, it is tried with twice as many.
+    Where one of `FINER` stops it, it is tried with twice as many knots.
     """
     try:
         return _found(setting, progress)
     except Infeasible as refusal:
         term = refusal.diagnosis.dominant if isinstance(refusal, NoFunnel) else "knots"
-        if term == "disturbance":
-            pushed = _pushed(setting, again)
-            if pushed is None:
-                raise
+        pushed = _pushed(setting, again) if term == "disturbance" else None
+        if pushed is not None:
             with suppress(Infeasible):
                 return _found(pushed, progress)
         K = len(setting.policy.t)
-        if term != "knots" or again is None or 2 * K - 1 > MOST_KNOTS:
+        if term not in FINER or again is None or 2 * K - 1 > MOST_KNOTS:
             raise
         nominal = Nominal(setting.policy.x, setting.policy.u)
         with suppress(Infeasible):
@@ -219,7 +297,8 @@ def _pushed(setting: Setting, again: Callable[[Nominal], Setting] | None) -> Set
             steps.tightness = found.tightness
             rho, _ = final_level(steps, policy, found.P, setting.goal, setting.expansion)
             return replace(setting, P=found.P, rho_final=rho)
-        if again is None or not found.coarse.any():
+        more = int(found.coarse.sum())
+        if again is None or not more or len(policy.t) + more > MOST_KNOTS:
             return None
         setting = again(Nominal(policy.x, policy.u).halved(found.coarse))
     return None
@@ -242,7 +321,7 @@ def _found(setting: Setting, progress: Progress) -> _Found:
         return _swept(setting, validity_caps(steps.field, policy, P), progress)
     else:
         expansion, free = None, _free(setting, progress)
-    hold = setting.hold
+    setting, hold = replace(setting, free=free), setting.hold
     assert hold is not None
     span = float(setting.policy.t[-1] - setting.policy.t[0])
     if hold.shortest > span:

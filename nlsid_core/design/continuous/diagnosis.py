@@ -66,6 +66,12 @@ class Diagnosis:
         largest = max(TERMS, key=lambda name: self.taken[name])
         return "linear" if self.taken[largest] <= -self.linear else largest
 
+    @property
+    def cause(self) -> str:
+        """The term to act on, in words."""
+        words = {"knots": "what lies between knots", "linear": "the linear closed loop itself"}
+        return (NAMES | words)[self.dominant].rstrip(",")
+
     def __str__(self) -> str:
         total = sum(part for part in self.taken.values() if part > 0) or 1.0
         shares = sorted(((p, name) for name, p in self.taken.items() if p > 0), reverse=True)
@@ -79,7 +85,7 @@ class Diagnosis:
                 f"{self.left:.3g} 1/s at this instant, but it is not shown to fall in the whole "
                 f"interval between the knots: {ADVICE['knots']}"
             )
-        cause = "that" if self.dominant == "linear" else NAMES[self.dominant].rstrip(",")
+        cause = "that" if self.dominant == "linear" else self.cause
         return (
             f"no funnel at t = {self.t:.6g} s: around the motion within ({sizes}) the linear "
             f"closed loop lets V fall by {self.linear:.3g} 1/s, and "

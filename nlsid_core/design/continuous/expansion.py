@@ -5,6 +5,8 @@ makes the funnel smaller: so the sweep chooses ρ and the box of every interval 
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from traceback import extract_tb
 
 import numpy as np
 
@@ -30,6 +32,8 @@ BETWEEN = np.linspace(
 )  # of an interval, where bounds are looked at, no program solved
 STEEP = 0.01  # of (Δρ/ρ)² over the interval's length: left where 1/ρ is far from linear in time
 LINEAR = 1e-3  # of a box's size: there a cubic is as good as the derivative
+HALVINGS = 6  # of an interval on which the motion's own box is too wide: then it is not the box
+PACKAGE = Path(__file__).parents[2]  # lines of code outside are those of who wrote the equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,21 +51,61 @@ class Expansion:
         for i, least, most in [] if limits is None else limits.tolist():
             j = self.rates.n + int(i)
             low[j], high[j] = max(low[j], least), min(high[j], most)
+        return self._expanded(low, high, k)
+
+    def _expanded(self, low: FloatArray, high: FloatArray, k: int) -> Cubic:
         t = self.nominal.t
-        return self.rates.on(low, high, (float(t[k]), float(t[k + 1])))
+        try:
+            return self.rates.on(low, high, (float(t[k]), float(t[k + 1])))
+        except (DataError, OverflowError, ZeroDivisionError) as error:
+            raise NoExpansion(self, low, high, k, error) from error
 
     def linear(self) -> VectorField:
         """The field to linearise: expanded close to the motion."""
-        size = np.hstack([self.nominal.x.ends(), self.nominal.u.ends()])
-        reach = LINEAR * np.maximum(np.ptp(size, axis=0), LINEAR)
-        cubics = [self.on(k, reach) for k in range(len(self.nominal.t) - 1)]
+        cubics = [self.on(k, self._near()) for k in range(len(self.nominal.t) - 1)]
         return field_of(cubics, self.nominal.t)
+
+    def _near(self) -> FloatArray:
+        """(n + m,) so far from the motion a cubic is as good as the derivative."""
+        size = np.hstack([self.nominal.x.ends(), self.nominal.u.ends()])
+        return np.asarray(LINEAR * np.maximum(np.ptp(size, axis=0), LINEAR))
+
+    def refined(self, most: int) -> "Expansion":
+        """Around the motion with knots, `most` in all, where it has no cubics as it is."""
+        nominal = self.nominal
+        for _ in range(HALVINGS):
+            coarse = []
+            for k in range(len(nominal.t) - 1):
+                try:
+                    Expansion(self.rates, nominal).on(k, self._near())
+                    coarse.append(False)
+                except NoExpansion:
+                    coarse.append(True)
+            if not any(coarse) or len(nominal.t) + sum(coarse) > most:
+                break
+            nominal = nominal.halved(coarse)
+        return Expansion(self.rates, nominal)
 
     def nonlinear_states(self) -> tuple[int, ...]:
         """The states that enter nonlinearly on some interval."""
         reach = np.full(self.rates.n + self.rates.m, LINEAR**2)
         found = [set(self.on(k, reach).nonlinear_states()) for k in (0, len(self.nominal.t) - 2)]
         return tuple(sorted(set.union(*found)))
+
+    def room(self, policy: ContinuousPolicy, P: FloatArray, k: int, after: float) -> float:
+        """The share of ρ = `after` at the end of interval k with which there are cubics on it.
+
+        1, or a power of BACK. Raises NoExpansion where the motion's own box is too wide.
+        """
+        share = 1.0
+        while True:
+            try:
+                self.around(policy, P, k, (LOWEST * after, share * after))
+                return share
+            except NoExpansion:
+                if share < LOWEST:
+                    raise
+                share *= BACK
 
     def around(
         self, policy: ContinuousPolicy, P: FloatArray, k: int, rho: tuple[float, float],
@@ -82,6 +126,46 @@ class Expansion:
         if held is not None:
             reach[self.rates.n :] += held
         return self.on(k, ROOM * reach, policy.limits)
+
+
+class NoExpansion(Infeasible):
+    """No cubics on a box: when, in which line of the equations, and which entries are too wide."""
+
+    def __init__(
+        self, expansion: Expansion, low: FloatArray, high: FloatArray, k: int, cause: Exception
+    ) -> None:
+        self.expansion, self.low, self.high, self.k, self.cause = expansion, low, high, k, cause
+
+    def __str__(self) -> str:
+        rates, t = self.expansion.rates, self.expansion.nominal.t
+        frames = extract_tb(self.cause.__traceback__)
+        own = [f for f in frames if PACKAGE not in Path(f.filename).parents and f.line]
+        place = f", in `{own[-1].line}`" if own else ""
+        wide = [
+            f"{'x' if j < rates.n else 'u'}{j if j < rates.n else j - rates.n} in "
+            f"[{self.low[j]:.3g}, {self.high[j]:.3g}]"
+            for j in rates.expanded
+            if self._narrower(j)
+        ]
+        if not wide:
+            why = "and no single state or input is the cause: the equations are not smooth there"
+        else:
+            why = f"because of {' or '.join(wide)}"
+        return (
+            f"the equations cannot be expanded between {t[self.k]:.6g} and {t[self.k + 1]:.6g} s: "
+            f"{self.cause}{place}, {why}"
+        )
+
+    def _narrower(self, j: int) -> bool:
+        """Whether the equations can be expanded where entry j of (x, u) is in its middle."""
+        low, high = self.low.copy(), self.high.copy()
+        low[j] = high[j] = (low[j] + high[j]) / 2
+        t = self.expansion.nominal.t
+        try:
+            self.expansion.rates.on(low, high, (float(t[self.k]), float(t[self.k + 1])))
+        except (DataError, OverflowError, ZeroDivisionError):
+            return False
+        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,34 +190,38 @@ def sweep_expanded(
     """The largest ρ(t) backward from rho_final, each interval expanded around what it gives.
 
     margin: what (ρ̇ - Ẇ)/ρ keeps above zero, in 1/s. Raises Infeasible naming the earliest time that
-    was reached, and why it was not passed at first.
+    was reached, and why it was not passed where least was missing.
     """
     K = len(P)
     rho, caps = np.full(K, rho_final), np.full(K, np.inf)
     ends: dict[int, Ends] = {}
     k, back = K - 2, 0
-    farthest, refusal = K, Infeasible("")
+    farthest, refusal, left = K, Infeasible(""), -np.inf
     while k >= 0:
         pair = (section_at(steps, policy, P, k, 0.0), section_at(steps, policy, P, k, 1.0))
-        step = _Interval(expansion, steps, policy, P, k, pair, float(rho[k + 1]), margin)
-        ratio = rho[k + 1] / rho[k + 2] if k + 2 < K else 1.0
-        try:
-            rho[k], ends[k] = step.largest(ratio, ends.get(k + 1), float(caps[k]))
-        except Infeasible as found:
-            # What ρ_{k+1} leaves at the end of this interval may be too much for its feedback.
-            if k < farthest:
-                farthest, refusal = k, found
-            back += 1
-            if back > MAX_BACK:
-                raise refusal from None
-            caps[k + 1] = BACK * rho[k + 1]
-            if k == K - 2:
-                rho[-1] = caps[-1]
-            else:
-                k += 1
-            continue
-        progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
-        k -= 1
+        after = float(rho[k + 1])
+        share = expansion.room(policy, P, k, after)
+        if share == 1.0:
+            step = _Interval(expansion, steps, policy, P, k, pair, after, margin)
+            ratio = rho[k + 1] / rho[k + 2] if k + 2 < K else 1.0
+            try:
+                rho[k], ends[k] = step.largest(ratio, ends.get(k + 1), float(caps[k]))
+                progress(f"rho at {pair[0].t:.3g} s", 1 - k / (K - 1))
+                k -= 1
+                continue
+            except NoFunnel as found:
+                if k < farthest or (k == farthest and found.diagnosis.left > left):
+                    farthest, refusal, left = k, found, found.diagnosis.left
+                back += 1
+                if back > MAX_BACK:
+                    raise refusal from None
+                share = BACK
+        # What ρ_{k+1} leaves at the end of this interval is too much for its box or its feedback.
+        caps[k + 1] = share * after
+        if k == K - 2:
+            rho[-1] = caps[-1]
+        else:
+            k += 1
     return Swept(rho, [ends[k] for k in range(K - 1)], [steps.local[k] for k in range(K - 1)])
 
 
@@ -152,7 +240,7 @@ class _Interval:
         """Take the cubics around the funnel with this ρ at the start; False if there are none."""
         try:
             cubic = self.expansion.around(self.policy, self.P, self.k, (rho, self.after))
-        except (DataError, OverflowError, ZeroDivisionError):
+        except NoExpansion:
             return False
         self.steps.local[self.k] = cubic
         self.steps.bound_pushes(self.pair[1], self.after)

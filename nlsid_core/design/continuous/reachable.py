@@ -24,6 +24,7 @@ SHARPNESS = (
 SPREAD = 0.1  # of the mean: what every direction of the start counts at least
 ROUNDS, STEPS = 8, 6  # of what is lost between knots; of κ in each
 FAR = 3.0  # times the goal: it does not come back from there
+LOST = 1e6  # times the goal: beyond, numbers overflow
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Reached:
 
 
 def reached(setting: Setting) -> Reached | None:
-    """The ellipsoids along the motion of a setting; None if w does more than push."""
+    """The ellipsoids along the motion of a setting; None if w does more than push or it is LOST."""
     loop = _Loop.of(setting)
     if loop is None:
         return None
@@ -52,6 +53,10 @@ def reached(setting: Setting) -> Reached | None:
     for _ in range(ROUNDS):
         state, X = loop.improved(state, slack + lost)
         size = loop.size(X[-1])
+        if not size < LOST:
+            if least == np.inf:  # nothing is lost between knots yet: more of them are no help
+                return None
+            break
         least = min(least, size)
         scale = np.linalg.det(X) ** (1 / X.shape[1])
         scale /= scale[-1]
@@ -118,7 +123,9 @@ class _Loop:
         return cls(h, across, ends, np.array(pushes), radius, goal, np.linalg.inv(goal))
 
     def size(self, X: FloatArray) -> float:
-        """The smallest copy of the goal that holds {x'X⁻¹x ≤ 1}."""
+        """The smallest copy of the goal that holds {x'X⁻¹x ≤ 1}; inf if X overflows."""
+        if not np.isfinite(X).all():
+            return np.inf
         L = np.linalg.cholesky(self.goal)
         return float(np.sqrt(np.linalg.eigvalsh(L.T @ X @ L)[-1]))
 
@@ -129,11 +136,12 @@ class _Loop:
         added = np.einsum("kij,kj,klj->kil", self.G, step[:, None] * self.r * chosen.kappa, self.G)
         X, knots = chosen.start, [chosen.start]
         begins = np.empty_like(self.across)
-        for k, parts in enumerate(self.across):
-            for i, F in enumerate(parts):
-                begins[k, i] = X
-                X = growth[k] * F @ X @ F.T + added[k]
-            knots.append(X)
+        with np.errstate(over="ignore", invalid="ignore"):  # what explodes is not finite
+            for k, parts in enumerate(self.across):
+                for i, F in enumerate(parts):
+                    begins[k, i] = X
+                    X = growth[k] * F @ X @ F.T + added[k]
+                knots.append(X)
         return np.array(knots), begins
 
     def improved(self, chosen: _Choice, slack: FloatArray) -> tuple[_Choice, FloatArray]:
@@ -146,6 +154,8 @@ class _Loop:
         step = self.h / PARTS
         for _ in range(STEPS):
             X, begins = self.forward(chosen, slack)
+            if not self.size(X[-1]) < LOST:
+                return chosen, X
             growth = np.exp(step * ((self.r / chosen.kappa).sum(axis=1) + slack))
             values, vectors = np.linalg.eigh(L.T @ X[-1] @ L)
             turned = L @ vectors

@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_are
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
-from nlsid_core.design.continuous.expansion import Expansion
+from nlsid_core.design.continuous.expansion import Expansion, NoExpansion
 from nlsid_core.design.continuous.held import Hold, prove_rates
 from nlsid_core.design.continuous.lstep import (
     MAX_DEGREE,
@@ -30,6 +30,7 @@ from nlsid_core.errors import DataError, Infeasible, NotPolynomial
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
 from nlsid_core.policies.continuous import ContinuousPolicy
 
+MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its own
 GOAL_ROOM = 1.01  # S(t_f) over the goal's matrix: the funnel ends strictly inside
 START_ROOM = 1 + 1e-6  # of the next funnel's matrix: the checker decides in rationals
 MARGIN = 5e-4  # of V's rate of change: L-steps solved to 1e-5 of their spread tell it from zero
@@ -60,7 +61,8 @@ class Setting:
     expansion: for dynamics that are not polynomial; the L-steps' field is then the linearisation's.
     hold: how the input that is applied may differ from the policy's; None if it may not. rates:
     (K-1, m) what |dũ/dt| stays below in every funnel that is looked for. weights: Q (n, n) and R
-    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved.
+    (m, m) of the feedback. needed: 1/s, the margin with which a larger funnel was proved. free:
+    (K,) ρ as it was found without the hold, of which nothing may be proved.
     """
 
     steps: LSteps
@@ -73,6 +75,7 @@ class Setting:
     hold: Hold | None = None
     rates: FloatArray | None = None
     needed: float = 0.0
+    free: FloatArray | None = None
 
     def first_guess(self) -> ContinuousFunnel:
         """P(t) with the thesis's first ρ = ρ(t_f) exp(-3 (t_f - t)/(t_f - t₀)): to compare with."""
@@ -123,7 +126,10 @@ def prepare(
     """The arguments of `design_funnel`, checked and completed; see there for what is raised."""
     sizes = nominal.x.control.shape[2], nominal.u.control.shape[2]
     held = Hold.of(hold, error, sizes[0])
-    field, expansion = _dynamics(dynamics, nominal, sizes, uncertain, held)
+    field, expansion = _dynamics(
+        dynamics, nominal, sizes, uncertain, held, fixed=policy is not None
+    )
+    nominal = nominal if expansion is None else expansion.nominal
     refuse_nominal(field if expansion is None else expansion.rates, nominal)
     refuse_degree(field)
     wanted = _wanted_goal(goal, nominal, field.n)
@@ -184,10 +190,13 @@ def _dynamics(
     sizes: tuple[int, int],
     uncertain: ArrayLike | None,
     held: Hold | None,
+    *,
+    fixed: bool,
 ) -> tuple[VectorField, Expansion | None]:
     """The field; or, where it is no polynomial of a degree that fits, its linearisation.
 
-    A hold needs fields that are affine in each input, and cubics at most.
+    A hold needs fields that are affine in each input, and cubics at most. fixed: whether the motion
+    keeps its knots, else it gets more where they are too far apart to expand anything.
     """
     if isinstance(dynamics, VectorField):
         if uncertain is not None:
@@ -202,7 +211,7 @@ def _dynamics(
     except NotPolynomial:
         pass
     rates = Rates.of(dynamics, *sizes, uncertain, affine=held is not None)
-    expansion = Expansion(rates, nominal)
+    expansion = Expansion(rates, nominal).refined(len(nominal.t) if fixed else MOST_KNOTS)
     return expansion.linear(), expansion
 
 
@@ -310,7 +319,7 @@ def _kept(
     if expansion is not None:
         try:
             around = expansion.around(policy, S, section.interval, (rho, rho))
-        except DataError:  # the box is too wide to expand anything
+        except NoExpansion:  # the box is too wide to expand anything
             return False
         steps.local[section.interval] = around
     steps.bound_pushes(section, rho)
@@ -342,11 +351,13 @@ def final_level(
             )
         return low, Goal(end, S[-1] / (GOAL_ROOM * low))
     low, high = 0.0, 1.0
-    d = end - goal.centre
-    if not d.any():
-        return 1.0, goal
-    for _ in range(40):
-        middle = (low + high) / 2
-        found = ellipsoid_inside(end, S[-1] / middle, goal.centre, goal.P)
-        low, high = (low, middle) if found is None else (middle, high)
-    return low * (1 - 1e-6), goal
+    d, rho = end - goal.centre, 1.0
+    if d.any():
+        for _ in range(40):
+            middle = (low + high) / 2
+            found = ellipsoid_inside(end, S[-1] / middle, goal.centre, goal.P)
+            low, high = (low, middle) if found is None else (middle, high)
+        rho = low * (1 - 1e-6)
+    if expansion is not None:
+        rho *= expansion.room(policy, S, len(S) - 2, rho)
+    return rho, goal

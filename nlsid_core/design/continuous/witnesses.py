@@ -19,7 +19,7 @@ from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.witness import multiplier, witness
+from nlsid_core.sos.witness import Scale, multiplier, witness
 
 SHARE = 0.5  # of what the constant can lose that becomes the margin
 FIT = 0.4  # of the least eigenvalue of the scaled Gram matrices: how well factors have to fit
@@ -148,7 +148,7 @@ def rate_documents(funnel: ContinuousFunnel, pieces: Pieces, c: Graded) -> list[
 
 
 def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:
-    squares = witness(pieces.basis, curves.fitted(curves.grams[b]))
+    squares = witness(pieces.basis, curves.fitted(pieces.basis, curves.grams[b]))
     return {
         "interval": int(pieces.interval[b]),
         "vertex": int(pieces.vertex[b]),
@@ -164,15 +164,12 @@ def _written(pieces: Pieces, curves: "_Curves", b: int) -> Json:
 class _Curves:
     """grams: (B, N+1, k, k) Bernstein control points of Q(s), c = v'Qv. room: (B, N+1) of hρ(s).
 
-    one: the place of the monomial 1 in v. charged: (k, k) one place of each product of v: what the
-    kernel charges for that monomial.
+    one: the place of the monomial 1 in v.
     """
 
     grams: FloatArray
     room: FloatArray
     one: int
-    of_pairs: IntArray
-    charged: tuple[IntArray, IntArray]
 
     @classmethod
     def of(cls, funnel: ContinuousFunnel, pieces: Pieces, polynomials: Graded) -> "_Curves":
@@ -193,62 +190,37 @@ class _Curves:
         rho = (1 - at) * ends[0][:, None] + at * ends[1][:, None]
         h = np.diff(funnel.t)[pieces.interval]
         one = int(np.flatnonzero(~basis.any(axis=1))[0])
-        return cls(
-            (grams + grams.swapaxes(-1, -2)) / 2,
-            h[:, None] * rho,
-            one,
-            of_pairs,
-            _charged(of_pairs),
-        )
+        return cls((grams + grams.swapaxes(-1, -2)) / 2, h[:, None] * rho, one)
 
     def scaled(self) -> FloatArray:
         """The Gram matrices with a unit diagonal."""
         root = np.sqrt(np.maximum(np.diagonal(self.grams, axis1=2, axis2=3), 1e-300))
         return np.asarray(self.grams / root[..., :, None] / root[..., None, :])
 
-    def fitted(self, grams: FloatArray) -> FloatArray:
+    def fitted(self, basis: IntArray, grams: FloatArray) -> FloatArray:
         """(J+1, k, k) control points of the lowest degree that are near enough to (N+1, k, k)."""
-        N, k = len(grams) - 1, grams.shape[1]
-        diagonal = np.diagonal(grams, axis1=1, axis2=2).max(axis=0)
-        scale = np.exp2(-np.round(np.log2(diagonal) / 2))  # as the factors are scaled
-        S = grams * scale[:, None] * scale
+        N = len(grams) - 1
         for J in range(min(N, 1), min(N, MAX_DEGREE) + 1):
             lift = _lift(J, N)
-            points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), S)
-            lowest = float(np.linalg.eigvalsh(points)[:, 0].min())
-            gap = _sums(S - np.einsum("kj,jab->kab", lift, points), self.of_pairs, None)
-            rows, columns = self.charged
-            errors = np.zeros((N + 1, k, k))
-            errors[:, rows, columns] = np.abs(gap)
-            errors[:, columns, rows] = np.abs(gap)
-            if errors.sum(axis=2).max() <= FIT * lowest:
-                return np.asarray(points / scale[:, None] / scale)
+            points = np.einsum("jk,kab->jab", np.linalg.pinv(lift), grams)
+            scale = Scale.of(basis, points)
+            scaled = points / scale.diagonal[:, None] / scale.diagonal
+            room = FIT * float(np.linalg.eigvalsh(scaled)[:, 0].min()) * scale.small**2
+            written = scale.diagonal / scale.small
+            gap = (grams - np.einsum("kj,jab->kab", lift, points)) / written[:, None] / written
+            if (scale.lost(gap) <= room).all():
+                return np.asarray(points)
         raise Infeasible(f"the Gram matrices of a piece need factors of degree above {MAX_DEGREE}")
 
 
-def _sums(Q: FloatArray, of_pairs: IntArray, count: int | None) -> FloatArray:
+def _sums(Q: FloatArray, of_pairs: IntArray, count: int) -> FloatArray:
     """(..., M) coefficients of v'Qv for Q (..., k, k)."""
     order = np.argsort(of_pairs, kind="stable")
     present, starts = np.unique(of_pairs[order], return_index=True)
     sums = np.add.reduceat(Q.reshape(*Q.shape[:-2], -1)[..., order], starts, axis=-1)
-    if count is None:
-        return np.asarray(sums)
     result = np.zeros((*Q.shape[:-2], count))
     result[..., present] = sums
     return result
-
-
-def _charged(of_pairs: IntArray) -> tuple[IntArray, IntArray]:
-    """For each product of v, in increasing order: itself if it is a square, else its first pair."""
-    k = round(len(of_pairs) ** 0.5)
-    table = of_pairs.reshape(k, k)
-    homes: dict[int, tuple[int, int]] = {}
-    for i in range(k):
-        for j in range(i + 1, k):
-            homes.setdefault(int(table[i, j]), (i, j))
-    homes |= {int(table[i, i]): (i, i) for i in range(k)}
-    places = np.array([homes[m] for m in sorted(homes)])
-    return places[:, 0], places[:, 1]
 
 
 def _lift(J: int, N: int) -> FloatArray:

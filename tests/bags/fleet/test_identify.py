@@ -160,6 +160,7 @@ def test_a_fleet_of_one_folder_gives_what_identify_gives(tmp_path: Path) -> None
     assert contents(tmp_path / "alone") == contents(tmp_path / "fleet")
 
 
+@pytest.mark.slow
 def test_storage_gives_the_same_numbers_and_digests_of_its_own(
     tmp_path: Path, config: Path, bucket: Bucket
 ) -> None:
@@ -329,6 +330,7 @@ def test_what_is_answered_is_on_the_disk_and_not_in_memory(tmp_path: Path) -> No
     assert peak < 1e6, "60 answers are 6 MB"
 
 
+@pytest.mark.slow
 def test_the_death_of_a_worker_costs_at_most_the_bag_that_kills_it(tmp_path: Path) -> None:
     bags = {}
     for name in "abcdef":
@@ -389,6 +391,7 @@ def test_an_answer_says_what_reading_took(tmp_path: Path) -> None:
     assert (answer.content, answer.requests, answer.kept) == (b"a.mcap a", 0, False)
 
 
+@pytest.mark.slow
 def test_storage_that_fails_costs_the_bags_it_fails_for(tmp_path: Path, config: Path) -> None:
     """Busy for ever, vanished after it was listed, busy for a while, of another type: each once."""
     pytest.importorskip("fsspec")

@@ -209,6 +209,7 @@ def test_a_server_that_stays_busy_is_given_up_after_the_patience(tmp_path: Path)
         read_signals(remote(f"{url}/d.mcap", patience=1.0), [SPEED])
 
 
+@pytest.mark.slow
 def test_ranges_are_the_same_whether_obstore_or_fsspec_fetches_them(
     bucket: Bucket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -357,6 +358,7 @@ def test_a_bag_of_sqlite_is_refused_in_storage(bucket: Bucket, tmp_path: Path) -
         Bag(bucket.put(tmp_path / "x.db3", "x.db3"))
 
 
+@pytest.mark.slow
 def test_commands_are_found_where_no_image_is(bucket: Bucket, tmp_path: Path) -> None:
     """Channels that stand in some chunks only."""
     local = drive(tmp_path / "d.mcap", image_bytes=30_000, chunk_size=4000)

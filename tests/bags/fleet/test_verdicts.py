@@ -18,7 +18,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from bags.chain.config import load_config
-from bags.chain.steps import design_funnel_files, identify_bags
 from bags.commands import fleet_cli
 from bags.commands.cli import app
 from bags.designs import documents
@@ -37,7 +36,6 @@ from bags.monitoring.replay import replay_bag
 from bags.recordings.remote import TAIL_BYTES
 from bags.samples import f1tenth
 from nlsid_core.errors import DataError
-from nlsid_core.progress import silent
 from nlsid_core.running.comparison import Centre
 from nlsid_core.running.reading import Reading
 from tests.bag_messages import START_NS
@@ -46,14 +44,10 @@ from tests.bags.fleet.storage import drive, web_server
 CONFIG = Path("config/f1tenth.yaml")
 
 
-@pytest.fixture(scope="module")
-def design(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of F1TENTH's design."""
-    out = tmp_path_factory.mktemp("design")
-    config = load_config(CONFIG)
-    identify_bags(f1tenth(), config, out, progress=silent)
-    design_funnel_files(out / documents.MODEL, config, out)
-    return out / documents.FUNNEL
+@pytest.fixture
+def design(f1tenth_chain: Path) -> Path:
+    """F1TENTH's design."""
+    return f1tenth_chain / documents.FUNNEL
 
 
 def judged(spent: float, month: str = "2026-01", **other: str) -> Judged:
@@ -97,6 +91,7 @@ def test_the_calibration_spends_what_the_safety_factor_leaves(design: Path) -> N
     assert max(spent) == pytest.approx(1.0 / tube.safety_factor**2, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_bags_that_made_the_design_are_not_counted_for_the_next(design: Path) -> None:
     proved = documents.load_proved(design)
     bags = {path.name: path for path in f1tenth()}
@@ -333,7 +328,9 @@ def test_monitor_counts_as_check_does_and_lists_all_that_is_not_inside(
     assert f"0 of them known from {kept}, 15 asked of now" in lines[1]
     for name in ("cut", "empty", "other", "copy", "back", "gap"):
         assert f"  r9/2022-01/{name}: " in said
-    assert re.search(r"r9/2022-01/back: from \d.* s on: time went back by .* on /odom", said)
+    assert re.search(
+        r"r9/2022-01/back: \d+ samples from \d.* s: time went back by .* on /odom", said
+    )
     assert "r9/2022-01/back: stamps of /cmd_vel go back in 1 place, by up to 0.225 s; " in said
     worst = lines.index("the 10 bags that spent the most, and when:")
     assert "robots with trouble: " in said

@@ -142,6 +142,7 @@ def test_usual_units_stay_as_they_are() -> None:
         assert unit_label(usual) == usual
 
 
+@pytest.mark.slow
 def test_combinations_are_counted_before_they_are_listed() -> None:
     """1024 corners x 27 modes x 9999 intervals of a file of 1 MB: 276 million table entries."""
     knots = 10_000

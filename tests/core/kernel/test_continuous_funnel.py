@@ -21,6 +21,7 @@ from nlsid_core.kernel.files import Rejected
 from nlsid_core.kernel.polynomials import Polynomial, Ring
 from tests.core.kernel.oracle_continuous import Oracle
 from tests.funnel_files import FIELD, FUNNEL, POLICY, PROOF, Files, bind, copy_of, saved, write
+from tests.marks import slow_among
 
 NUMBERS: list[Callable[[np.random.Generator], float]] = [
     lambda rng: float(rng.integers(-16, 17)) / 8,
@@ -203,7 +204,7 @@ def fraction(rng: np.random.Generator, size: int = 3) -> Fraction:
     return Fraction(int(rng.integers(-99 * size, 99 * size)), int(rng.integers(1, 99)))
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", slow_among(range(40), {5, *range(10, 40)}))
 def test_the_kernel_rebuilds_exactly_what_the_page_says(
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -308,7 +309,7 @@ def changed(rng: np.random.Generator, files: Files) -> str:
     return f"{which} times {factor}"
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", slow_among(range(60), range(15, 60)))
 def test_whatever_is_proved_of_changed_files_holds_at_random_points(
     seed: int, files: Files
 ) -> None:

@@ -17,6 +17,7 @@ from nlsid_core.models import CellNetwork, ImplicitModel, StateAffineModel
 from nlsid_core.running.stepping import Stepper
 from tests.core.kernel import oracle_dissipation as oracle
 from tests.core.kernel.dissipation_claims import MODEL, MODELS, claim, decide, loop
+from tests.marks import slow_among
 
 SCHEMAS = Path(__file__).resolve().parents[3] / "docs" / "schema"
 NAMES = list(MODELS)
@@ -130,7 +131,7 @@ def runs(name: str, rng: np.random.Generator, samples: int = 60) -> tuple[FloatA
     return other - base, found[1] - found[0]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "cascade"}))
 def test_no_two_runs_of_the_model_itself_differ_by_more(name: str) -> None:
     rng, (_, proof) = np.random.default_rng(5), claim(name)
     stated, model = proof["claim"], MODELS[name]()
@@ -150,7 +151,7 @@ def test_no_two_runs_of_the_model_itself_differ_by_more(name: str) -> None:
         assert most > 0.2 * number  # the runs are not all harmless
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "cascade"}))
 def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
     """Every number moved at random, a little or by its size: true and false claims."""
     rng = random.Random(name)
@@ -303,6 +304,7 @@ def test_inputs_that_are_remembered_for_too_long_are_refused_at_once(name: str, 
         decide(model, proof)
 
 
+@pytest.mark.slow
 def test_a_model_of_too_many_terms_is_refused_before_they_are_written_out() -> None:
     model, proof = claim("moving")
     terms = [[i, j] for i in range(20) for j in range(20)]

@@ -34,6 +34,7 @@ from tests.core.kernel.falsification_claims import (
 )
 from tests.core.kernel.mutations import corpus
 from tests.core.kernel.oracle_stability import exact, solved
+from tests.marks import slow_among
 
 EVERY = pytest.mark.parametrize("name", MODELS)
 Change = Callable[[Json, dict[str, Json]], Any]
@@ -208,7 +209,7 @@ def kept_run(
     return y, u
 
 
-@EVERY
+@pytest.mark.parametrize("name", slow_among(MODELS, {"two_outputs", "moving_lags"}))
 def test_a_run_that_keeps_the_assumption_is_not_falsified(name: str) -> None:
     """Whatever the weights are, and wherever the window is."""
     _, about = claim(name)
@@ -356,6 +357,7 @@ def test_inputs_have_to_reach_back_as_far_as_the_model_does() -> None:
     assert not oracle.agrees(document, about)
 
 
+@pytest.mark.slow
 def test_a_window_that_would_take_minutes_is_refused_before_it_is_decided() -> None:
     document, about = claim("linear")
     count = 16_000

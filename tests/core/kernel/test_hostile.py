@@ -32,6 +32,7 @@ from nlsid_core.kernel.implicit_models import read_stack
 from nlsid_core.kernel.polynomials import Polynomial, Ring, Work
 from nlsid_core.kernel.positivity import read_squares
 from nlsid_core.kernel.terms import read_names
+from tests.marks import slow_among
 
 SECONDS = 20.0  # of processor time that any one refusal may take, on a slow machine
 json_values = st.recursive(
@@ -437,7 +438,7 @@ def test_monomials_whose_exponents_would_run_into_each_other_are_refused() -> No
         p * p
 
 
-@pytest.mark.parametrize("bits", [30, 500, 2000, 8000])
+@pytest.mark.parametrize("bits", slow_among([30, 500, 2000, 8000], {8000}))
 def test_the_work_that_is_counted_bounds_the_time_it_takes(bits: int) -> None:
     """10^8 counted products take half a minute, 0.3 µs each; 1.5 µs leave room for a slow core."""
     work = Work(10**9)

@@ -87,11 +87,11 @@ def test_the_multiplier_of_a_step_is_decided_as_the_page_says(multiplier: float)
 
 
 def test_no_mutant_is_wrongly_proved() -> None:
-    outcomes = mutations.run(300, np.random.default_rng(1))
+    outcomes = mutations.run(100, np.random.default_rng(1))
     assert outcomes["false_proved"] == 0
     assert outcomes["not decided"] == 0, "a refusal without a reason of its own"
-    assert outcomes["rejected"] > 150
-    assert outcomes["proved"] > 10  # some are still proofs, and an oracle has confirmed them
+    assert outcomes["rejected"] > 50
+    assert outcomes["proved"] > 3  # some are still proofs, and an oracle has confirmed them
 
 
 @pytest.mark.slow

@@ -377,6 +377,7 @@ def test_a_missing_file_is_rejected_by_name(design_folder: Path, name: str) -> N
 # -- the oracle ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_random_claims_are_decided_as_the_oracle_decides(design: OutputTubeDesign) -> None:
     """Every number moved at random, a little or by its size: true and false claims."""
     rng, decided = random.Random(3), {True: 0, False: 0}

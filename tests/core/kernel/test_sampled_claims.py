@@ -13,6 +13,7 @@ from nlsid_core import files
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from tests.core.kernel import oracle_sampled as oracle
 from tests.core.kernel.sampled_claims import DIGEST, UP, Scalar, one_step
+from tests.marks import slow_among
 
 
 @pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
@@ -269,7 +270,10 @@ def signed(documents: dict[str, Any]) -> dict[str, Any]:
     return {"model": model, "policy": policy, "funnel": documents["funnel"] | bound}
 
 
-@pytest.mark.parametrize("form", ["peak", "response", "energy", "fading"])
+FORMS = ["peak", "response", "energy", "fading"]
+
+
+@pytest.mark.parametrize("form", slow_among(FORMS, {"peak", "energy", "fading"}))
 def test_no_mutation_of_a_claim_is_proved_that_a_grid_of_states_refutes(form: str) -> None:
     rng = random.Random(f"mutate {form}")
     outcomes = {"proved": 0, "refused": 0}

@@ -63,10 +63,15 @@ def value(p: Polynomial, ring: Ring, point: list[Fraction]) -> Fraction:
 
 
 CASES = (
-    [(explicit, form) for form in ("response", "peak", "energy", "fading")]
-    + [(implicit, form) for form in ("response", "peak")]
-    + [(two_joints, "response")]
-)
+    [(explicit, "response"), (implicit, "peak")]
+    + [
+        pytest.param(make, form, marks=pytest.mark.slow)
+        for make, form in (
+            (explicit, "peak"), (explicit, "energy"), (explicit, "fading"), (implicit, "response"),
+            (two_joints, "response"),
+        )
+    ]
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(("make", "form"), CASES)

@@ -25,6 +25,7 @@ from tests.core.kernel.stability_claims import (
     state_affine,
 )
 from tests.core.kernel.stability_forgeries import CHANGES
+from tests.marks import slow_among
 
 NAMES = list(MODELS)
 NO_INPUT = ("cascade", "network", "monotone", "straight", "linear")  # in the increments of these
@@ -86,7 +87,7 @@ def test_the_kernels_matrices_are_those_of_the_specification(name: str) -> None:
                 assert (min(values), max(values)) == (min(kept), max(kept))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split", "cascade"}))
 def test_random_claims_are_decided_as_the_oracle_decides(name: str) -> None:
     """Every number moved at random, a little or by its size: true and false claims."""
     rng = random.Random(name)
@@ -364,7 +365,7 @@ def test_a_missing_piece_of_the_proof_is_named(tmp_path: Path, place: tuple[str,
         proofs.check(path)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", slow_among(NAMES, {"network", "split", "ends"}))
 def test_a_proof_that_is_written_by_the_prover_is_the_same_every_time(name: str) -> None:
     model = MODELS[name]()
     first, second = (prove_stability(model) for _ in range(2))

@@ -13,9 +13,19 @@ from nlsid_core import files, proofs
 from nlsid_core.arrays import Json
 from nlsid_core.errors import CertificateMismatch, CertificateRejected
 from tests.core.kernel import oracle_tube as oracle
-from tests.core.kernel.tube_claims import FUNNEL, MODEL, MODELS, attacks, claim, decide, design
+from tests.core.kernel.tube_claims import (
+    FUNNEL,
+    LONG,
+    MODEL,
+    MODELS,
+    attacks,
+    claim,
+    decide,
+    design,
+)
+from tests.marks import slow_among
 
-EVERY = pytest.mark.parametrize("name", MODELS)
+EVERY = pytest.mark.parametrize("name", slow_among(MODELS, LONG))
 Change = Callable[[SimpleNamespace], Any]
 
 BESIDE = "watched as well, not needed for this sentence"

@@ -29,6 +29,8 @@ def recorded(model: ImplicitModel, *window: tuple[int, int]) -> ImplicitModel:
     return replace(model, y=y, u=(Signal("u", "N", "/u:data"),), window=window)
 
 
+# A design of each takes about a second.
+LONG = {"two_following", "implicit_linear", "split", "network", "moving_lags", "cascade"}
 MODELS: dict[str, Callable[[], Any]] = {
     **{name: stability_claims.MODELS[name] for name in
        ("linear", "quadratic", "moving_lags", "two_outputs", "split", "cascade", "network",
