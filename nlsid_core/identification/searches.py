@@ -35,6 +35,7 @@ from nlsid_core.identification.implicit_search import (
     least_squares_coefficients,
     minimise_implicit_rie,
     prove_in_set,
+    refuse_large_program,
 )
 from nlsid_core.identification.linear import (
     LinearClass,
@@ -378,6 +379,7 @@ def _best_minimum(
 def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[ImplicitModel]:
     """Implicit models in a stable set of thesis Chapter 2."""
     rows = build_implicit_rows(train, model_class)
+    refuse_large_program(rows)
     trail: Trail[ImplicitModel] = Trail(
         task,
         lambda model: prove_in_set(model, rows),
