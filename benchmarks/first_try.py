@@ -15,18 +15,17 @@ import argparse
 import ast
 import inspect
 import json
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.machine import describe
 from benchmarks.thesis.soundness import OneSet, simulate_boundary, simulate_held
 from nlsid_core import files
@@ -232,26 +231,6 @@ def lines_of(problem: Callable[..., Any]) -> int:
     assert isinstance(body, ast.FunctionDef)
     first = body.body[1].lineno
     return sum(bool(line.strip()) for line in source.splitlines()[first - 1 :])
-
-
-class OutOfTimeError(BaseException):
-    """A design took more than its processor time; no `except Exception` on the way is for it."""
-
-
-@contextmanager
-def stopped_after(seconds: float) -> Iterator[None]:
-    """Raise OutOfTimeError in what runs inside once it has used this much processor time."""
-
-    def stop(*_: object) -> None:
-        raise OutOfTimeError(f"stopped: not ended after {seconds:g} s of processor time")
-
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        signal.signal(signal.SIGPROF, before)
 
 
 def designed(

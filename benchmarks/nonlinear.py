@@ -1,15 +1,22 @@
 """Public data sets: the best proved model of all classes, beside comparators and published figures.
 
-python -m benchmarks.nonlinear --data DIR [--json] [NAME ...]
+python -m benchmarks.nonlinear --data DIR [--json] [--limit S] [--out FILE] [NAME ...]
 
 DIR holds exchanger, wh2009, emps, kuka_kr300, schunk_arm, f1tenth and dart. One ladder of classes
 and methods serves every set, those for one input and output where a set has one of each. What is
-best is chosen, among the models with a proof, by the simulation error over training and validation
-data together, each third simulated by a model of the others, which no choice of the search has
-seen; it is fitted again to all of them, then simulated once over the test data.
+best is chosen among the models with a proof. Training and validation data are cut into three equal
+parts, and each is simulated by a model of the others, which no choice of the search has seen: the
+cross-validated error. The same three models are simulated over the recorded inputs played at twice
+their speed, where nothing was measured; how far they are apart there is what the data leave open.
+The class with the least root of the sum of both squares is taken. It is tried with one lag more
+while that makes the sum less, fitted again to all data, and simulated once over the test data.
 Trials are as the owners divide them; where they name no validation data it is the end, or every
 third, of the training data. Comparators are chosen in the same way. On sets of more than
 `SAMPLES` training samples the choice is made on that many, and fitted to all.
+
+A set takes at most --limit of processor time: a candidate that is not judged in `SHARE` of it, or
+that no time is left for, is listed as not tried. What is known of each set is printed, and written
+to --out, when it is known.
 """
 
 import os
@@ -20,7 +27,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -32,8 +39,10 @@ from scipy.io import loadmat
 from bags.samples import convert_dart
 from benchmarks import machine
 from benchmarks.arms import kuka, schunk
+from benchmarks.limits import OutOfTimeError, stopped_after
 from benchmarks.recorded import heat_exchanger, single, wiener_hammerstein
 from benchmarks.subspace import n4sid
+from nlsid_core import files
 from nlsid_core.arrays import FloatArray
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import NlsidError
@@ -61,6 +70,11 @@ SAMPLES = 10_000
 STEPS = 15  # of an iterated search
 FOLDS = 3
 ORDERS = (2, 4)
+FASTER = 2  # times the recorded speed, at which models of the parts are compared
+MOST_LONGER = 4  # lags more than the ladder's
+LIMIT = 900.0  # s of processor time for one set
+SHARE = 0.2  # of it for one candidate
+KEPT = 0.3  # of it for fitting what was chosen to all data
 PERCENT = "%"
 Simulator = Callable[[Dataset], list[FloatArray]]
 
@@ -239,42 +253,59 @@ def ladder(data: Dataset) -> Iterator[tuple[Any, Method]]:
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """What a search chose, in words, with its validation and test error."""
+    """What a search chose, in words, how it was judged, and its test error."""
 
     what: str
     validation: float
     test: float
 
 
+@dataclass(eq=False)
+class Budget:
+    """Processor time of one set. refused: candidates that were not tried, and why."""
+
+    limit: float
+    started: float
+    refused: list[str]
+
+    def left(self, kept: float) -> float:
+        """Seconds that are left, a share of the limit kept back."""
+        return self.limit * (1.0 - kept) - (time.process_time() - self.started)
+
+
 def best_of(
-    case: PublicSet, candidates: Sequence[tuple[Any, Method]], data: tuple[Dataset, ...], *,
-    proved: bool,
+    case: PublicSet, candidates: Sequence[tuple[Any, Method]], data: tuple[Dataset, ...],
+    budget: Budget, *, proved: bool,
 ) -> Best | None:  # fmt: skip
-    """The candidate with the least cross-validated error, fitted again and tested."""
+    """The candidate that is judged best, fitted again and tested."""
     train, validation, test = data
     both = Dataset((*train.trajectories, *validation.trajectories))
-    found: list[tuple[float, Any, Method]] = []
-    for model_class, method in candidates:
-        started = time.process_time()
 
-        def simulator(
-            few: Dataset, model_class: Any = model_class, method: Method = method
-        ) -> Simulator:
+    def judged(model_class: Any, method: Method) -> float:
+        def simulator(few: Dataset) -> Simulator:
             model = fitted(case, few, model_class, method, proved=proved).model
             return lambda trials: simulate_trials(model, trials.trajectories)
 
-        error = crossed(case, simulator, both)
-        if error is None:
-            continue
-        found.append((error, model_class, method))
-        seconds = time.process_time() - started
-        print(
-            f"    {error:10.4g} {case.unit:6s}{seconds:7.1f} s  {describe(model_class)}", flush=True
-        )
+        return judge(case, simulator, both, budget, describe(model_class))
+
+    found = [(judged(*one), *one) for one in candidates]
+    best, model_class, method = min(found, key=lambda entry: entry[0])
+    for _ in range(MOST_LONGER):
+        if not np.isfinite(best) or not hasattr(model_class, "lags"):
+            break
+        model_class = replace(model_class, lags=model_class.lags + 1)
+        found.append((judged(model_class, method), model_class, method))
+        if found[-1][0] >= best:
+            break
+        best = found[-1][0]
     for error, model_class, method in sorted(found, key=lambda entry: entry[0]):
+        if not np.isfinite(error):
+            break
         try:
-            fit = fitted(case, both, model_class, method, proved=proved)
-        except NlsidError:
+            with stopped_after(max(budget.left(0.0), 1.0)):
+                fit = fitted(case, both, model_class, method, proved=proved)
+        except (NlsidError, OutOfTimeError) as reason:
+            budget.refused.append(f"{describe(model_class)}, fitted to all data: {reason}")
             continue
         with np.errstate(over="ignore", invalid="ignore"):
             outputs = simulate_trials(fit.model, test.trajectories)
@@ -283,25 +314,59 @@ def best_of(
     return None
 
 
+def judge(
+    case: PublicSet,
+    simulator: Callable[[Dataset], Simulator],
+    data: Dataset,
+    budget: Budget,
+    name: str,
+) -> float:
+    """Cross-validated error and disagreement as one, printed; infinite where there is no model."""
+    started, least = time.process_time(), 1.0
+    seconds = min(budget.left(KEPT), SHARE * budget.limit)
+    try:
+        if seconds < least:
+            raise OutOfTimeError(f"the set's {budget.limit:g} s are used up")
+        with stopped_after(seconds), np.errstate(over="ignore", invalid="ignore"):
+            error, apart = crossed(case, simulator, data)
+    except (NlsidError, ValueError, np.linalg.LinAlgError, OutOfTimeError) as reason:
+        budget.refused.append(f"{name}: {reason}")
+        print(f"    not tried: {name}: {str(reason)[:100]}", flush=True)
+        return float("inf")
+    used = time.process_time() - started
+    print(f"    {error:10.4g} {apart:10.4g} {case.unit:6s}{used:7.1f} s  {name}", flush=True)
+    return float(np.hypot(error, apart))
+
+
 def crossed(
     case: PublicSet, simulator: Callable[[Dataset], Simulator], data: Dataset
-) -> float | None:
-    """The error over all folds, each simulated by a model of the others' first SAMPLES samples.
-
-    None if some of them make no model.
+) -> tuple[float, float]:
+    """The error over all folds, each simulated by a model of the others' first SAMPLES samples;
+    and how far these models are from their mean on the inputs at `FASTER` speed, rms.
     """
     parts = folds(data)
+    faster = Dataset(
+        tuple(
+            replace(trial, t=trial.t[: len(trial.t[::FASTER])], y=trial.y[::FASTER],
+                    u=trial.u[::FASTER])
+            for trial in shortened(data)
+        )
+    )  # fmt: skip
     outputs: list[FloatArray] = []
+    beyond: list[list[FloatArray]] = []
     for k, judged in enumerate(parts):
         others = Dataset(tuple(trial for part in parts[:k] + parts[k + 1 :] for trial in part))
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                outputs += simulator(shortened(others))(judged)
-        except (NlsidError, ValueError, np.linalg.LinAlgError) as reason:
-            print(f"    no model: {str(reason)[:100]}", flush=True)
-            return None
+        simulate = simulator(shortened(others))
+        outputs += simulate(judged)
+        beyond.append(simulate(faster))
     whole = Dataset(tuple(trial for part in parts for trial in part))
-    return case.score(outputs, whole, skipped=case.skipped)
+    mean = [np.mean(each, axis=0) for each in zip(*beyond, strict=True)]
+    if not all(np.isfinite(y).all() for y in mean):
+        return case.score(outputs, whole, skipped=case.skipped), float("inf")
+    agreed = Dataset(tuple(replace(trial, y=y) for trial, y in zip(faster, mean, strict=True)))
+    apart = [case.score(each, agreed, skipped=case.skipped) for each in beyond]
+    error = case.score(outputs, whole, skipped=case.skipped)
+    return error, float(np.sqrt(np.mean(np.square(apart))))
 
 
 def folds(data: Dataset) -> list[Dataset]:
@@ -339,7 +404,7 @@ def shortened(data: Dataset) -> Dataset:
     return Dataset(tuple(kept))
 
 
-def subspace(case: PublicSet, data: tuple[Dataset, ...]) -> Best | None:
+def subspace(case: PublicSet, data: tuple[Dataset, ...], budget: Budget) -> Best | None:
     """N4SID of the orders, chosen in the same way."""
     train, validation, test = data
 
@@ -348,27 +413,27 @@ def subspace(case: PublicSet, data: tuple[Dataset, ...]) -> Best | None:
         return lambda trials: [model.simulate(trial) for trial in trials]
 
     both = Dataset((*train.trajectories, *validation.trajectories))
-    found = []
-    for order in ORDERS:
-        error = crossed(case, partial(simulator, order=order), both)
-        if error is not None:
-            found.append((error, order))
-    if not found:
-        return None
+    found = [
+        (judge(case, partial(simulator, order=order), both, budget, f"n4sid, order {order}"), order)
+        for order in ORDERS
+    ]
     error, order = min(found)
+    if not np.isfinite(error):
+        return None
     outputs = simulator(shortened(both), order)(test)
     return Best(f"order {order}", error, case.score(outputs, test, skipped=case.skipped))
 
 
-def measure(case: PublicSet, folder: Path) -> dict[str, Any]:
+def measure(case: PublicSet, folder: Path, limit: float) -> dict[str, Any]:
     """The promised keys of one set."""
     started = time.process_time()
     data = case.load(folder / case.folder)
     one = all(part.shape[1] == 1 for t in data[0] for part in (t.y, t.u))
     linear = [(LinearClass(n) if one else StateAffineClass(n), LeastSquares()) for n in ORDERS]
-    ours = best_of(case, list(ladder(data[0])), data, proved=True)
-    naive = best_of(case, linear, data, proved=False)
-    usual = subspace(case, data)
+    budget = Budget(limit, started, [])
+    naive = best_of(case, linear, data, budget, proved=False)
+    usual = subspace(case, data, budget)
+    ours = best_of(case, list(ladder(data[0])), data, budget, proved=True)
     return {
         "best_proved": None if ours is None else ours.test,
         "unit": case.unit,
@@ -378,6 +443,7 @@ def measure(case: PublicSet, folder: Path) -> dict[str, Any]:
         "seconds": time.process_time() - started,
         "best": None if ours is None else ours.what,
         "validation": None if ours is None else ours.validation,
+        "not_tried": budget.refused,
     }
 
 
@@ -386,6 +452,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder of the sets' folders")
     parser.add_argument("--json", action="store_true", help="last line is one JSON object")
+    parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time a set")
+    parser.add_argument("--out", type=Path, help="a file for the results, as they come")
     parser.add_argument("names", nargs="*", help="parts of names; all by default")
     arguments = parser.parse_args()
     wanted = [s for s in SETS if not arguments.names or any(n in s.name for n in arguments.names)]
@@ -396,12 +464,14 @@ def main() -> None:
         if not (arguments.data / case.folder).is_dir():
             print(f"    no folder {case.folder}")
             continue
-        rows[case.name] = row = measure(case, arguments.data)
+        rows[case.name] = row = measure(case, arguments.data, arguments.limit)
         cells = [f"{key} {row[key]:.4g}" for key in ("best_proved", "least_squares", "n4sid")
                  if row[key] is not None]  # fmt: skip
         published = ", ".join(f"{source} {value:g}" for source, value in case.published.items())
         print(f"  {', '.join(cells)} {case.unit}; published: {published or 'none read'}; "
               f"{row['seconds']:.0f} s\n  {row['best']}", flush=True)  # fmt: skip
+        if arguments.out is not None:
+            files.write_atomically(arguments.out, (json.dumps(rows, indent=1) + "\n").encode())
     if arguments.json:
         print(json.dumps(rows))
 

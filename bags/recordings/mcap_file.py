@@ -10,7 +10,7 @@ Source: the MCAP specification, https://mcap.dev/spec.
 import re
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar
@@ -105,10 +105,15 @@ class McapFile:
         return False
 
     def batches(self, channels: Collection[int]) -> Iterator[tuple[int, Batch]]:
-        """(channel id, messages) block by block, in the order of the file.
+        """(channel id, messages) block by block, in the order of the file; of a file that is not
+        on this machine, several blocks together.
 
         Raises BagError if a block is damaged or not what its index says.
         """
+        if self._prepared is not None:
+            for blocks in self._prepared.groups(channels):
+                yield from self._prepared_batches(blocks, channels)
+            return
         for block in self.contents.blocks:
             yield from self.block_batches(block, channels)
 
@@ -117,20 +122,33 @@ class McapFile:
         index = block.index
         if index is not None and not any(channel in index for channel in channels):
             return
+        if isinstance(block, ListedBlock):
+            yield from self._prepared_batches([block], channels)
+            return
         where = f"the message index of the chunk at byte {block.offset}"
-        edges: IntArray | None = None
-        if isinstance(block, ListedBlock) and self._prepared is not None:
-            buffer, offsets, edges = self._prepared.records(block, channels)
-        elif index is None:
-            buffer = self.content(block)
+        buffer = self.content(block)
+        if index is None:
             offsets = {c: np.array(o, dtype=np.int64) for c, o in walk_messages(buffer).items()}
             where = f"the block at byte {block.offset}"
         else:
-            buffer = self.content(block)
             offsets = {c: self._indexed(*index[c]) for c in channels if c in index}
         for channel in channels:
             if len(found := offsets.get(channel, ())):
-                yield channel, messages_at(buffer, np.asarray(found), channel, where, edges)
+                yield channel, messages_at(buffer, np.asarray(found), channel, where)
+
+    def _prepared_batches(
+        self, blocks: Sequence[ListedBlock], channels: Collection[int]
+    ) -> Iterator[tuple[int, Batch]]:
+        """The messages of blocks that the summary lists, one batch per channel that has any."""
+        assert self._prepared is not None
+        buffer, offsets, edges = self._prepared.records(blocks, channels)
+        where = f"the message index of the chunk at byte {blocks[0].offset}"
+        if len(blocks) > 1:
+            where += f", or of one up to byte {blocks[-1].offset},"
+        for channel in channels:
+            found = offsets.get(channel)
+            if found is not None and len(found):
+                yield channel, messages_at(buffer, found, channel, where, edges)
 
     def content(self, block: Block) -> bytes:
         """The block's records, decompressed; BagError if they are not what the chunk states."""

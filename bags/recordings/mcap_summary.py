@@ -2,13 +2,17 @@
 
 The summary lists channels, counts and chunks. A chunk that is wanted is fetched with its message
 index; of an uncompressed one only the index and then the messages, at the places that it names.
+With an index comes the beginning of the next chunk, as far as the last chunk begins with wanted
+messages: it is a large message that fills a chunk, so small ones often follow it in the next.
 Source: the MCAP specification, https://mcap.dev/spec.
 """
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import groupby, pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -31,6 +35,7 @@ from bags.recordings.mcap_records import (
     RECORD,
     Block,
     Contents,
+    Record,
     add_channel,
     add_schema,
     parse,
@@ -44,7 +49,10 @@ from nlsid_core.errors import BagError
 MAX_SUMMARY_BYTES: Final = 64 * 2**20  # of some 100 bytes a chunk
 WINDOW_BYTES: Final = 32 * 2**20  # of chunks that are prepared, and held, together
 WHOLE_BYTES: Final = TAIL_BYTES + GAP_BYTES  # a file no longer than this is one request
+AHEAD: Final = 1.5  # of what the last chunk begins with; the next may begin with more
+KNOWN_BYTES: Final = 16 * 2**10  # of a declaration that is kept for other bags
 _FOOTER: Final = RECORD.size + 20 + len(MAGIC)
+_INDEX: Final = struct.Struct("<BQHI")  # a message index record before its entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +105,9 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
     for opcode, at, record_end in walk_records(summary):
         content = summary[at + RECORD.size : record_end]
         if opcode == Opcode.SCHEMA:
-            add_schema(found.schemas, parse(Schema.read, content))
+            add_schema(found.schemas, _declared(Schema.read, content))
         elif opcode == Opcode.CHANNEL:
-            add_channel(found.channels, parse(Channel.read, content))
+            add_channel(found.channels, _declared(Channel.read, content))
         elif opcode == Opcode.STATISTICS:
             statistics = parse(Statistics.read, content)
             found.stated = found.counts = dict(statistics.channel_message_counts)
@@ -111,6 +119,12 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
             found.attachments.append(_attachment(parse(AttachmentIndex.read, content), start))
     if found.stated is None:
         return None
+    found.blocks.sort(key=lambda block: block.offset)
+    for block, after in pairwise(found.blocks):
+        if block.offset + block.size > after.offset:
+            raise BagError(
+                f"the summary's chunks at bytes {block.offset} and {after.offset} overlap"
+            )
     named = {channel for block in found.blocks for channel in block.index or ()}
     declared = {
         c.id for c in found.channels.values() if not c.schema_id or c.schema_id in found.schemas
@@ -125,6 +139,15 @@ def _contents(path: RemotePath, summary: bytes, start: int) -> Contents | None:
         record = path.read_range(m.offset, m.offset + m.length)
         found.metadata.append(parse(Metadata.read, record[RECORD.size :]))
     return found
+
+
+def _declared(read: Callable[[Any], Record], content: bytes) -> Record:
+    """A schema or a channel; robots of a fleet declare the same ones in every bag."""
+    found: Record = (_known if len(content) <= KNOWN_BYTES else parse)(read, content)
+    return found
+
+
+_known = lru_cache(maxsize=256)(parse)
 
 
 def _listed(chunk: ChunkIndex, limit: int) -> ListedBlock:
@@ -170,97 +193,140 @@ class Prepared:
         self._place = {block.offset: i for i, block in enumerate(self._blocks)}
         self._channels: frozenset[int] = frozenset()
         self._ready: dict[int, dict[int, IntArray]] = {}  # byte of a chunk -> its message indexes
-        self._runs: dict[int, tuple[IntArray, IntArray]] = {}  # and what is fetched of it
+        self._runs: tuple[IntArray, IntArray] = _sorted(), _sorted()  # first bytes, ends
+
+    def groups(self, channels: Collection[int]) -> Iterator[list[ListedBlock]]:
+        """What `records` takes, in the order of the file: the chunks of a window that are not
+        compressed together, a compressed one alone.
+        """
+        self._want(channels)
+        at = 0
+        while window := list(self._window(at)):
+            for compressed, run in groupby(window, key=lambda block: bool(block.compression)):
+                blocks = list(run)
+                yield from ([block] for block in blocks) if compressed else [blocks]
+            at = self._place[window[-1].offset] + 1
 
     def records(
-        self, block: ListedBlock, channels: Collection[int]
+        self, blocks: Sequence[ListedBlock], channels: Collection[int]
     ) -> tuple[bytes, dict[int, IntArray], IntArray]:
-        """Records of the block, where in them each channel's messages begin, and where any of
-        them ends at the latest.
+        """Records of one of the `groups`, or of any one block; where in them each channel's
+        messages begin; and where any of them ends at the latest.
 
         They are those of the wanted messages, one behind the other; of a compressed block, all.
         """
-        if not self._channels.issuperset(channels):
-            self._channels, self._ready = frozenset(channels), {}
-        if block.offset not in self._ready:
-            window = list(self._window(block))
-            self._path.fetch(_span(ahead) for ahead in window)
-            self._ready = {ahead.offset: self._entries_of(ahead) for ahead in window}
-            plain = [ahead for ahead in window if not ahead.compression]
-            self._runs = {ahead.offset: self._runs_of(ahead) for ahead in plain}
-            self._path.fetch(
-                (at + start, at + end)
-                for at, (starts, ends) in self._runs.items()
-                for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
-            )
-        offsets = self._ready[block.offset]
-        if block.compression:
-            header = self._path.read_range(block.record, block.end)
+        self._want(channels)
+        first, last = blocks[0], blocks[-1]
+        if first.offset not in self._ready:
+            self._prepare(list(self._window(self._place[first.offset])))
+        if first.compression:
+            offsets = self._ready[first.offset]
+            header = self._path.read_range(first.record, first.end)
             crc = int.from_bytes(header[RECORD.size + 24 : RECORD.size + 28], "little")
-            at = block.offset - block.record
-            content = uncompressed(replace(block, crc=crc), header[at : at + block.size])
-            return content, offsets, _sorted(*offsets.values(), [len(content)])
-        starts, ends = self._runs[block.offset]
+            at = first.offset - first.record
+            content = uncompressed(replace(first, crc=crc), header[at : at + first.size])
+            return content, offsets, _sorted(*offsets.values(), np.array([len(content)]))
+        here = slice(*np.searchsorted(self._runs[0], (first.offset, last.offset + last.size)))
+        starts, ends = (places[here] for places in self._runs)
         after = np.cumsum(ends - starts)
-        content = b"".join(
-            self._path.read_range(block.offset + start, block.offset + end)
-            for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
-        )
+        content = b"".join(map(self._path.read_range, starts.tolist(), ends.tolist()))
         placed = {}
-        for channel in self._channels & offsets.keys():
-            run = np.searchsorted(starts, offsets[channel], side="right") - 1
-            placed[channel] = offsets[channel] - ends[run] + after[run]
+        for channel in self._channels:
+            there = [
+                block.offset + offsets[channel]
+                for block in blocks
+                if channel in (offsets := self._ready[block.offset])
+            ]
+            if there:
+                begins = np.concatenate(there)
+                run = np.searchsorted(starts, begins, side="right") - 1
+                placed[channel] = begins - ends[run] + after[run]
         return content, placed, _sorted(*placed.values(), after)
 
-    def _window(self, first: ListedBlock) -> Iterator[ListedBlock]:
+    def _want(self, channels: Collection[int]) -> None:
+        if not self._channels.issuperset(channels):
+            self._channels, self._ready = frozenset(channels), {}
+
+    def _window(self, at: int) -> Iterator[ListedBlock]:
+        """Wanted blocks from the one with this number on."""
         held = 0
-        for block in self._blocks[self._place[first.offset] :]:
+        for block in self._blocks[at:]:
             if held and held + block.size > WINDOW_BYTES:
                 return
-            if self._channels & (block.index or {}).keys():
+            if self._is_wanted(block):
                 held += block.size
                 yield block
 
-    def _runs_of(self, block: ListedBlock) -> tuple[IntArray, IntArray]:
-        """First bytes and ends, in the block, of the wanted messages' records: of runs without a
-        gap of GAP_BYTES. A record ends where the next record of a message begins.
+    def _is_wanted(self, block: ListedBlock) -> bool:
+        return not self._channels.isdisjoint(block.index or ())
+
+    def _prepare(self, window: Sequence[ListedBlock]) -> None:
+        """Fetch what of these blocks is wanted."""
+        ahead = self._ahead()
+        self._path.fetch(self._span(block, ahead) for block in window)
+        self._ready = {block.offset: self._entries_of(block) for block in window}
+        self._runs = self._runs_of([block for block in window if not block.compression])
+        self._path.fetch(zip(*(places.tolist() for places in self._runs), strict=True))
+
+    def _ahead(self) -> int:
+        """Bytes of wanted messages with which a chunk may begin: less than a request costs, and 0
+        if the index of the last chunk, which tells, would have to be fetched for it.
         """
-        every = self._ready[block.offset]
-        starts = _sorted(*every.values(), [block.size])
-        first = _sorted(*(every[channel] for channel in self._channels & every.keys()))
+        last = self._blocks[-1]
+        if last.compression or not self._path.holds(last.indexes, last.end):
+            return 0
+        self._ready = {last.offset: self._entries_of(last)}
+        _, ends = self._runs_of([last])
+        reach = AHEAD * (ends[0] - last.record) if len(ends) else 0.0
+        return int(reach) if reach <= GAP_BYTES else 0
+
+    def _span(self, block: ListedBlock, ahead: int) -> tuple[int, int]:
+        """What is fetched of a block before its indexes are known; with so much of the next."""
+        if block.compression:
+            return block.record, block.end
+        following = self._place[block.offset] + 1
+        if following == len(self._blocks) or not self._is_wanted(self._blocks[following]):
+            return block.indexes, block.end
+        return block.indexes, min(block.end + ahead, self._blocks[following].indexes)
+
+    def _runs_of(self, blocks: Sequence[ListedBlock]) -> tuple[IntArray, IntArray]:
+        """First bytes and ends, in the file, of the wanted messages' records: of runs in a block
+        without a gap of GAP_BYTES. A record ends where the next record of a message begins.
+        """
+        others: list[IntArray] = []
+        wanted: list[IntArray] = []
+        for block in blocks:
+            for channel, offsets in self._ready[block.offset].items():
+                (wanted if channel in self._channels else others).append(block.offset + offsets)
+        edges = np.array([block.offset + block.size for block in blocks], np.int64)
+        first = _sorted(*wanted)
         if not len(first):
             return first, first
+        starts = _sorted(*others, first, edges)
         ends = starts[np.searchsorted(starts, first, side="right")]
-        gaps = np.flatnonzero(first[1:] > ends[:-1] + GAP_BYTES)
+        of = np.searchsorted(edges, first, side="right")
+        gaps = np.flatnonzero((first[1:] > ends[:-1] + GAP_BYTES) | (of[1:] != of[:-1]))
         return first[np.r_[0, gaps + 1]], ends[np.r_[gaps, -1]]
 
     def _entries_of(self, block: ListedBlock) -> dict[int, IntArray]:
-        return {channel: self._entries(block, channel) for channel in block.index or ()}
-
-    def _entries(self, block: ListedBlock, channel: int) -> IntArray:
-        """Offsets of the channel's messages in the chunk, as its index record has them."""
-        at, length = (block.index or {})[channel]
-        record = self._path.read_range(at, at + length)
-        where = f"the message index at byte {at}"
-        if length < RECORD.size + 6:
-            raise BagError(f"{where} is damaged")
-        opcode, size = RECORD.unpack_from(record)
-        of, entries = struct.unpack_from("<HI", record, RECORD.size)
-        fits = RECORD.size + size <= length and 6 + entries == size
-        if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or entries % 16:
-            raise BagError(f"{where} is damaged")
-        found: Any = np.frombuffer(record, INDEX_ENTRY, entries // 16, RECORD.size + 6)
-        if len(found) and found["offset"].max() >= block.uncompressed_size:
-            raise BagError(f"{where} points outside its chunk")
-        offsets: IntArray = found["offset"].astype(np.int64)
-        return offsets
+        """Offsets of each channel's messages in the chunk, as its index records have them."""
+        records = self._path.read_range(block.indexes, block.end)
+        found = {}
+        for channel, (at, length) in (block.index or {}).items():
+            start, where = at - block.indexes, f"the message index at byte {at}"
+            if length < _INDEX.size:
+                raise BagError(f"{where} is damaged")
+            opcode, size, of, entries = _INDEX.unpack_from(records, start)
+            fits = RECORD.size + size <= length and 6 + entries == size
+            if opcode != Opcode.MESSAGE_INDEX or of != channel or not fits or entries % 16:
+                raise BagError(f"{where} is damaged")
+            listed: Any = np.frombuffer(records, INDEX_ENTRY, entries // 16, start + _INDEX.size)
+            if len(listed) and listed["offset"].max() >= block.uncompressed_size:
+                raise BagError(f"{where} points outside its chunk")
+            found[channel] = listed["offset"].astype(np.int64)
+        return found
 
 
-def _sorted(*places: Any) -> IntArray:
-    """All of them in order, each once."""
-    return np.unique(np.concatenate([np.empty(0, np.int64), *places]).astype(np.int64))
-
-
-def _span(block: ListedBlock) -> tuple[int, int]:
-    """What is fetched of a chunk before its indexes are known."""
-    return (block.record if block.compression else block.indexes), block.end
+def _sorted(*places: IntArray) -> IntArray:
+    """All of them in order."""
+    return np.sort(np.concatenate(places)) if places else np.empty(0, np.int64)

@@ -25,7 +25,8 @@ from nlsid_core.errors import BagError
 
 GAP_BYTES: Final = 16 * 2**10  # ranges closer than this are one request, whose price they share
 HELD_BYTES: Final = 64 * 2**20  # of a file that stay in memory for who opens it again
-TAIL_BYTES: Final = 8 * 2**10  # the first request: footer and most summaries
+TAIL_BYTES: Final = 16 * 2**10  # the first request: footer, most summaries and the last index
+MARK_BYTES: Final = 8 * 2**10  # at the end, of which digests are made (docs/decisions/0027)
 TOGETHER: Final = 16  # requests that run beside each other, and fail or succeed together
 PATIENCE: Final = 60.0  # s that may be lost with failing requests, of each bag
 FIRST_WAIT: Final = 0.2  # s before the first repetition; twice as long before each next
@@ -234,12 +235,16 @@ class RemotePath(PosixPath):
             self.fetched += len(part)
             self._hold(start, part)
 
+    def holds(self, start: int, end: int) -> bool:
+        """Whether these bytes were fetched, and are held."""
+        return self._held_range(start, end) is not None
+
     def identity(self) -> bytes:
         """What tells the file from others without reading it: its entry, its last bytes and, but
         for S3, whose tags are of the content, its URL: other tags tell versions of one URL apart.
         """
         size = self.entry.size
-        tail = self.read_range(max(0, size - TAIL_BYTES), size)
+        tail = self.read_range(max(0, size - MARK_BYTES), size)
         url = "" if str(self).startswith("s3://") else f" {self}"
         return f"{size} {self.entry.tag} {hashlib.sha256(tail).hexdigest()}{url}\n".encode()
 
@@ -503,4 +508,4 @@ def _short(error: BaseException) -> str:
     for name, value in os.environ.items():
         if len(value) >= SHORTEST_SECRET and re.search("KEY|SECRET|TOKEN|PASSWORD", name):
             line = line.replace(value, "...")
-    return f"{type(error).__name__}: {_SECRET.sub('...', line)}"
+    return f"{type(error).__name__}: {_SECRET.sub('...', line)}".removesuffix(": ")

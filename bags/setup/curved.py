@@ -17,7 +17,7 @@ from bags.setup.proposal import POOR, Proposal
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import NlsidError
 from nlsid_core.identification import Sem, identify
-from nlsid_core.identification.searches import hold_out
+from nlsid_core.identification.validation import hold_out
 
 SAMPLES: Final = 2000  # of the training trials, to which these classes are fitted
 START: Final = 20  # samples of each trial that are not scored: some classes read their start there

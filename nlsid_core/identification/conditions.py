@@ -144,8 +144,9 @@ def implicit_derivatives(
     A = _slopes(shift, x) if len(shift) else np.zeros((0, n_x), dtype=object)
     next_M = _substituted(M, dict(zip(x, [*variables(list(v)), *shift], strict=True)))
     top = H1 + H1.T - next_M[:n_v, :n_v]
-    side = H2 - next_M[:n_v, n_v:] @ A
-    corner = rate**2 * M - delta * _identity(n_x) - A.T @ next_M[n_v:, n_v:] @ A
+    side = H2 - _product(next_M[:n_v, n_v:], A)
+    kept = _product(A.T, _product(next_M[n_v:, n_v:], A))
+    corner = rate**2 * M - delta * _identity(n_x) - kept
     return Inequality(filled(np.block([[top, side], [side.T, corner]])), domain)
 
 
@@ -229,6 +230,18 @@ def _slopes(polynomials: Polynomials, names: Sequence[str]) -> Polynomials:
     for i, entry in enumerate(polynomials):
         p = as_polynomial(entry)
         result[i] = jacobian([p.over(tuple(dict.fromkeys([*p.names, *names])))], names)[0]
+    return result
+
+
+def _product(left: Polynomials, right: Polynomials) -> Polynomials:
+    """left @ right; where a factor is zero, as most slopes of a shift are, nothing is added."""
+    result = np.empty((len(left), right.shape[1]), dtype=object)
+    there = [np.array([len(as_polynomial(p)) > 0 for p in column]) for column in right.T]
+    for i, row in enumerate(left):
+        known = np.array([len(as_polynomial(p)) > 0 for p in row], dtype=bool)
+        for j, column in enumerate(right.T):
+            both = known & there[j].astype(bool)
+            result[i, j] = row[both] @ column[both] if both.any() else constant(0)
     return result
 
 

@@ -8,16 +8,19 @@ Source: thesis (2.4), (2.7).
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
-from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.arrays import BoolArray, FloatArray, IntArray
 from nlsid_core.data.trajectory import Dataset
 from nlsid_core.errors import DataError
 from nlsid_core.identification.implicit_sets import Names
 from nlsid_core.identification.methods import MOST_LAGS
-from nlsid_core.identification.regressors import refuse_poor, signal_scale
+from nlsid_core.identification.regressors import FEWER, refuse_poor, signal_scale
 from nlsid_core.models import ImplicitModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.models.signal import signals_of
@@ -25,6 +28,10 @@ from nlsid_core.options import require_delays, require_one_of, require_ranges, r
 from nlsid_core.polynomial import Polynomial, monomials, variables
 from nlsid_core.polynomial.values import monomial_values
 
+MOST_TERMS = 1000  # of e and f: with 10 000 samples a step takes 2.5 s and 0.8 GB, of one core
+MOST_MONOMIALS = 1000  # of a square in an inequality of the set, before it is built
+LARGEST_BLOCK = 60  # of a program: measured 1 to 6 s each at order 55, 22 s and 1 GB at 84
+SLOW = "each of some fifty programs of a search would take longer than ten seconds"
 DELAYED = ("2.10", "2.11")  # the sets for more than one lag; the others have no known structure ã
 FARTHEST = 0.01  # weight of the outputs before the newest in the error that is bounded
 Box = tuple[tuple[float, float], ...]
@@ -121,6 +128,38 @@ class ImplicitClass:
             np.hstack([np.zeros((len(of_w), states), dtype=np.int64), of_w]),
         ])  # fmt: skip
 
+    def refuse_large(self, outputs: int, inputs: int) -> None:
+        """DataError for more terms or larger squares than a search should begin with.
+
+        Counted before anything is built: a polynomial of degree d in k variables has
+        binomial(k + d, d) terms, and so has a square's factor with half the degree.
+        """
+        n, m = self.lags * outputs, len(self.window(inputs))
+        k, d = (n + m, self.right_degree) if self.coupled else (n, self.right_degree)
+        terms = comb(outputs + self.left_degree, self.left_degree) - 1 + comb(k + d, d)
+        if not self.coupled:
+            terms += comb(m + self.input_degree, self.input_degree) - 1
+        if terms > MOST_TERMS:
+            raise DataError(
+                f"{terms} terms an equation of {n} past outputs and {m} delayed inputs, more than "
+                f"{MOST_TERMS}; {FEWER}"
+            )
+        if outputs + n > LARGEST_BLOCK:
+            raise DataError(
+                f"a semidefinite block of {outputs} outputs and {n} states, more than "
+                f"{LARGEST_BLOCK}: {SLOW}; use fewer lags"
+            )
+        curved = self.coupled or self.right_degree > 1 or self.storage_degree > 0
+        inside = outputs + (k if curved else 0)
+        half = max(self.left_degree, self.right_degree, self.storage_degree + 2) // 2
+        curves, flat = (outputs + n, 0) if curved else (outputs, n)
+        square = curves * comb(inside + half, half) + flat
+        if square > MOST_MONOMIALS:
+            raise DataError(
+                f"{square} monomials in a square of set {self.set}, more than {MOST_MONOMIALS}; "
+                f"{FEWER}"
+            )
+
 
 @dataclass(frozen=True, eq=False)
 class ImplicitRows:
@@ -148,6 +187,25 @@ class ImplicitRows:
     def states(self) -> int:
         """The number of states."""
         return len(self.y_scale[0]) * self.model_class.lags
+
+    @cached_property
+    def driven(self) -> BoolArray:
+        """(m,) which terms of f hold no state: no inequality of any set has them."""
+        return np.asarray(~self.right[:, : self.states].any(axis=1))
+
+    @cached_property
+    def reduced(self) -> tuple[FloatArray, FloatArray]:
+        """(R, F) for the coefficients c of [e; -f] that are not `driven`, (k,) an equation.
+
+        The least of the squared equation error over the driven ones is |R c|², at F c.
+        """
+        driven = np.concatenate([np.zeros(len(self.left), dtype=bool), self.driven])
+        first = int(driven.sum())
+        ordered = np.column_stack([self.R[:, driven], self.R[:, ~driven]])
+        factor = np.asarray(np.linalg.qr(ordered, mode="r"))
+        return factor[first:, first:], -solve_triangular(
+            factor[:first, :first], factor[:first, first:]
+        )
 
     @property
     def weight(self) -> FloatArray:
@@ -231,13 +289,17 @@ def build_implicit_rows(dataset: Dataset, model_class: ImplicitClass) -> Implici
     n_v, window = len(y_scale[0]), model_class.window(len(u_scale[0]))
     n = n_v * model_class.lags
     history = max(model_class.lags, *(d for _, d in window))
+    for trial in dataset:
+        if history >= len(trial):
+            raise DataError(
+                f"{trial.name}: {len(trial)} samples, a history of {history} needs more"
+            )
+    model_class.refuse_large(n_v, len(u_scale[0]))
     left = monomials(n_v, range(1, model_class.left_degree + 1))
     right = model_class.right(n, len(window))
     rows = []
     for trial in dataset:
         N = len(trial)
-        if history >= N:
-            raise DataError(f"{trial.name}: {N} samples, a history of {history} needs more")
         y, u = (trial.y - y_scale[0]) / y_scale[1], (trial.u - u_scale[0]) / u_scale[1]
         past = [y[history - k : N - k] for k in range(1, model_class.lags + 1)]
         known = np.hstack([*past, *(u[history - d : N - d, [i]] for i, d in window)])

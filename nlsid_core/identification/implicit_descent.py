@@ -29,6 +29,7 @@ from nlsid_core.identification.rollout import DIVERGED, Rollout
 from nlsid_core.models import ImplicitModel, Signal
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.polynomial import constant, variables
+from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import NormBound, Program, solve
 
 MONOTONE = 0.1  # kept of ∂e/∂v + (∂e/∂v)', where Q is 1
@@ -100,7 +101,7 @@ class ImplicitSet:
     def inside(self, step: Step) -> FloatArray:
         """θ of the step's program, a sum of squares for every inequality of the set.
 
-        Terms of f in the inputs alone are in no inequality: they are eliminated from the program.
+        Terms of f in the inputs alone are eliminated from the program.
         """
         rows, (bound,) = self.rows, variables("bound")
         n_v, n_e = len(rows.y_scale[0]), len(rows.left)
@@ -110,9 +111,8 @@ class ImplicitSet:
             [*left_coefficients(rows, i, n_v), *right_coefficients(rows, i, n_v)]
             for i in range(n_v)
         ]
-        names = np.array(columns, dtype=object).T.ravel()
-        bound_terms = np.concatenate([np.ones(n_e, bool), rows.right[:, : rows.states].any(axis=1)])
-        kept = np.repeat(bound_terms, n_v)
+        names = list(np.array(columns, dtype=object).T.ravel())
+        kept = np.repeat(np.concatenate([np.ones(n_e, dtype=bool), ~rows.driven]), n_v)
         along = step.D * step.theta / np.linalg.norm(step.D * step.theta)
         across = np.sqrt(step.damping) * (
             np.eye(len(step.D)) - (1.0 - FREE) * np.outer(along, along)
@@ -125,15 +125,16 @@ class ImplicitSet:
                 np.column_stack([everything[:, ~kept], everything[:, kept], right_side]), mode="r"
             )
         )
-        u = step.D[kept] * (names[kept] - step.theta[kept])
-        entries = factor[first:, first:-1] @ u + factor[first:, -1]
+        R = factor[first:, first:-1] * step.D[kept]
+        moving = np.column_stack([R, factor[first:, -1] - R @ step.theta[kept]])
+        entries = combinations(moving, [*names, constant(1.0)])
         program = Program(
             indeterminates_of(rows.names),
             (*set_constraints(rows, e, f, S, self.slowest), NormBound(tuple(entries), bound)),
             minimise=bound,
         )
         found, theta = solve(program), step.theta.copy()
-        theta[kept] = [float(found.value(name)) for name in names[kept]]
+        theta[kept] = [float(found.value(name)) for name in names]
         moved = step.D[kept] * (theta[kept] - step.theta[kept])
         left = factor[:first, -1] + factor[:first, first:-1] @ moved
         theta[~kept] -= solve_triangular(factor[:first, :first], left) / step.D[~kept]

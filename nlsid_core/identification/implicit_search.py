@@ -9,6 +9,8 @@ Each term bounds the robust identification error of its sample, (2.28):
     2.10, 2.11: -|ν|²_S - 2ν'ε ≤ |ε|²_{S⁻¹};  else: |a + ε|²_{P⁻¹} ≤ |a|²_{(P-S)⁻¹} + |ε|²_{S⁻¹}.
 With linear models it is equal to it (Claim 2.18: a weighted equation error). S is one for all
 samples, so what the data say is the triangular factor of their monomials, however many there are.
+Terms of f in the inputs alone are in no inequality and cost a search nothing: for any e, S and
+other terms of f, least squares gives the best.
 """
 
 from dataclasses import dataclass, replace
@@ -17,20 +19,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nlsid_core.arrays import FloatArray
-from nlsid_core.errors import Infeasible
+from nlsid_core.errors import DataError, Infeasible
 from nlsid_core.identification import conditions
 from nlsid_core.identification.conditions import GAP, Inequality, constraint
-from nlsid_core.identification.implicit_class import DELAYED, FARTHEST, ImplicitRows
+from nlsid_core.identification.implicit_class import (
+    DELAYED,
+    FARTHEST,
+    LARGEST_BLOCK,
+    SLOW,
+    ImplicitRows,
+)
 from nlsid_core.identification.implicit_proof import ImplicitProof, prove_implicit, storage_template
 from nlsid_core.identification.implicit_sets import Names
+from nlsid_core.identification.regressors import FEWER
 from nlsid_core.models import ImplicitModel
 from nlsid_core.polynomial import Polynomial, variables
 from nlsid_core.polynomial.algebra import as_polynomial
+from nlsid_core.polynomial.maps import combinations
 from nlsid_core.sos import (
     NonNegative,
     NormBound,
     Program,
     Solution,
+    compile_program,
     forms_of,
     matrix_sum_of_squares,
     solve,
@@ -85,6 +96,19 @@ def minimise_implicit_rie(rows: ImplicitRows, *, slowest: float = 1.0) -> Implic
     return ImplicitFit(model, proof, bound, *best)
 
 
+def refuse_large_program(rows: ImplicitRows) -> None:
+    """DataError if a semidefinite block of the set's program is larger than `LARGEST_BLOCK`."""
+    e, f = unknowns(rows)
+    S = symmetric_template("S", len(e))
+    program = Program(indeterminates_of(rows.names), tuple(set_constraints(rows, e, f, S, 1.0)))
+    size = max(cone.size for cone in compile_program(program).layout.cones if cone.kind == "psd")
+    if size > LARGEST_BLOCK:
+        raise DataError(
+            f"a semidefinite block of order {size} in set {rows.model_class.set}, more than "
+            f"{LARGEST_BLOCK}: {SLOW}; {FEWER}"
+        )
+
+
 def kept_in_set(
     rows: ImplicitRows, e: FloatArray, f: FloatArray, monotone: float
 ) -> tuple[ImplicitModel, ImplicitProof | None]:
@@ -130,7 +154,7 @@ def _proved(model: ImplicitModel, rows: ImplicitRows, delta: float) -> ImplicitP
 
 
 def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
-    """e in v and f in (x, w), a decision at every coefficient."""
+    """e in v and f in (x, w) without its `driven` terms, a decision at every coefficient."""
     names = rows.names
     known = (*names.x, *names.w)
     e, f = (np.empty(len(rows.y_scale[0]), dtype=object) for _ in range(2))
@@ -140,7 +164,7 @@ def unknowns(rows: ImplicitRows) -> tuple[Objects, Objects]:
             e[i] = template(f"e{i}", rows.left, names.v)
         else:
             e[i] = sum(entry * v for entry, v in zip(symmetric[i], variables(names.v), strict=True))
-        f[i] = template(f"f{i}", rows.right, known).substitute(_tied(rows, i, len(e)))
+        f[i] = template(f"f{i}", rows.right[~rows.driven], known).substitute(_tied(rows, i, len(e)))
     return e, f
 
 
@@ -218,12 +242,12 @@ def _weighted(rows: ImplicitRows, S: Objects) -> list[Constraint]:
 
 
 def _residual(rows: ImplicitRows) -> Objects:
-    """(p, n_v): R times the coefficients of [e; -f], affine in the decisions."""
-    columns, n_v = [], len(rows.y_scale[0])
+    """(p, n_v): the equation errors, affine in the decisions; least over `driven` terms of f."""
+    columns, n_v, R = [], len(rows.y_scale[0]), rows.reduced[0]
     for i in range(n_v):
         right = [-c for c in right_coefficients(rows, i, n_v)]
-        columns.append([*left_coefficients(rows, i, n_v), *right])
-    return np.asarray(rows.R @ np.array(columns, dtype=object).T)
+        columns.append(combinations(R, [*left_coefficients(rows, i, n_v), *right]))
+    return np.array(columns, dtype=object).T
 
 
 def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
@@ -235,8 +259,11 @@ def left_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
 
 
 def right_coefficients(rows: ImplicitRows, i: int, n_v: int) -> list[Polynomial]:
-    """The decisions in f of equation i, in the order of the rows' monomials."""
-    tied, names = _tied(rows, i, n_v), [f"f{i}[{k}]" for k in range(len(rows.right))]
+    """The decisions in f of equation i, in the order of those of the rows' monomials that hold a
+    state.
+    """
+    tied = _tied(rows, i, n_v)
+    names = [f"f{i}[{k}]" for k in range(int((~rows.driven).sum()))]
     return [tied.get(name, own) for name, own in zip(names, variables(names), strict=True)]
 
 
@@ -246,7 +273,7 @@ def _tied(rows: ImplicitRows, i: int, n_v: int) -> dict[str, Polynomial]:
         return {}
     left = left_coefficients(rows, i, n_v)
     of_e = {tuple(row): -c for row, c in zip(rows.left.tolist(), left, strict=True)}
-    powers = [tuple(row[: rows.states]) for row in rows.right.tolist()]
+    powers = [tuple(row[: rows.states]) for row in rows.right[~rows.driven].tolist()]
     return {f"f{i}[{k}]": of_e[row] for k, row in enumerate(powers) if sum(row) > 1}
 
 
@@ -267,11 +294,16 @@ def indeterminates_of(names: Names) -> tuple[str, ...]:
 
 
 def coefficients(found: Solution, rows: ImplicitRows) -> tuple[FloatArray, FloatArray]:
-    """e (m_e, n_v) and f (m_f, n_v)."""
+    """e (m_e, n_v) and f (m_f, n_v), the `driven` terms by least squares for the others."""
     n_v = len(rows.y_scale[0])
-    e = [[float(found.value(p)) for p in left_coefficients(rows, i, n_v)] for i in range(n_v)]
-    f = [[float(found.value(p)) for p in right_coefficients(rows, i, n_v)] for i in range(n_v)]
-    return np.array(e).T, np.array(f).T
+    e, of_x = (
+        np.array([[float(found.value(p)) for p in part(rows, i, n_v)] for i in range(n_v)]).T
+        for part in (left_coefficients, right_coefficients)
+    )
+    f = np.zeros((len(rows.right), n_v))
+    f[~rows.driven] = of_x
+    f[rows.driven] = -rows.reduced[1] @ np.concatenate([e, -of_x])
+    return e, f
 
 
 def _values(found: Solution, matrix: Objects) -> FloatArray:

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from nlsid_core.identification.block_cascade import BlockCascadeClass, identify_
 from nlsid_core.identification.cascade_fit import MAX_RADIUS
 from nlsid_core.identification.cells import CellClass, identify_cells
 from nlsid_core.identification.certified import certified_simulation_error, descend_certified
+from nlsid_core.identification.coloured import fit_in_turn
 from nlsid_core.identification.feedback import (
     FeedbackClass,
     identify_feedback,
@@ -33,6 +35,7 @@ from nlsid_core.identification.implicit_search import (
     least_squares_coefficients,
     minimise_implicit_rie,
     prove_in_set,
+    refuse_large_program,
 )
 from nlsid_core.identification.linear import (
     LinearClass,
@@ -65,6 +68,7 @@ from nlsid_core.identification.monotone import (
     minimise_monotone_simulation_error,
 )
 from nlsid_core.identification.monotone_descent import minimise_certified
+from nlsid_core.identification.noise import Noise
 from nlsid_core.identification.prediction import Model
 from nlsid_core.identification.rie import robust_identification_error
 from nlsid_core.identification.rse import robust_simulation_error
@@ -83,7 +87,7 @@ from nlsid_core.identification.state_affine import (
     build_state_affine_rows,
 )
 from nlsid_core.identification.trail import Task, Trail
-from nlsid_core.identification.validation import simulation_percent
+from nlsid_core.identification.validation import hold_out, simulation_percent
 from nlsid_core.models import (
     BlockCascade,
     CellNetwork,
@@ -105,8 +109,15 @@ CERTIFIABLE_AFFINE = 1  # of every G_k if the lagged ones depend on the input: c
 
 
 def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[DifferenceEquation]:
-    """Difference equations of one input and one output."""
-    regression = build_regression(train, model_class.lags)
+    """Difference equations of one input and one output, of white noise or of coloured."""
+    search = partial(_linear, model_class)
+    return fit_in_turn(search, train, model_class.noise_lags, task)
+
+
+def _linear(
+    model_class: LinearClass, train: Dataset, task: Task, noise: Noise | None
+) -> Trail[DifferenceEquation]:
+    regression = build_regression(train, model_class.lags, noise=noise)
     trail: Trail[DifferenceEquation] = Trail(task, prove_stability, BOUND)
     trail.add(LeastSquares, lambda _: least_squares(regression))
     radius = task.searched_rate
@@ -150,8 +161,15 @@ def linear(train: Dataset, model_class: LinearClass, task: Task) -> Trail[Differ
 def state_affine(
     train: Dataset, model_class: StateAffineClass, task: Task
 ) -> Trail[StateAffineModel]:
-    """State-affine models, of several inputs and outputs."""
-    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate)
+    """State-affine models, of several inputs and outputs, of white noise or of coloured."""
+    search = partial(_state_affine, model_class)
+    return fit_in_turn(search, train, model_class.noise_lags, task)
+
+
+def _state_affine(
+    model_class: StateAffineClass, train: Dataset, task: Task, noise: Noise | None
+) -> Trail[StateAffineModel]:
+    problem = build_state_affine_rows(train, model_class, slowest=task.searched_rate, noise=noise)
     if problem.rows.errors.size > MOST_ENTRIES:
         beside = [m for m in task.comparators if isinstance(m, LeastSquares)]
         left_out = ", ".join(m.name for m in task.comparators if m not in beside)
@@ -226,18 +244,6 @@ def block_cascade(
 
     trail.add_proved(Sem, search)
     return trail
-
-
-def hold_out(train: Dataset) -> tuple[Dataset, Dataset]:
-    """(fitted, judged), judged on every third trial, the second of two or the end of one."""
-    if len(train) == 1:
-        (trial,), cut = train, 2 * len(train.trajectories[0]) // 3
-        return Dataset((trial.rows(slice(cut)),)), Dataset((trial.rows(slice(cut, None)),))
-    judged = [i % 3 == min(2, len(train) - 1) for i in range(len(train))]
-    return (
-        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if not out)),
-        Dataset(tuple(trial for trial, out in zip(train, judged, strict=True) if out)),
-    )
 
 
 def cells(train: Dataset, model_class: CellClass, task: Task) -> Trail[CellNetwork]:
@@ -373,6 +379,7 @@ def _best_minimum(
 def implicit(train: Dataset, model_class: ImplicitClass, task: Task) -> Trail[ImplicitModel]:
     """Implicit models in a stable set of thesis Chapter 2."""
     rows = build_implicit_rows(train, model_class)
+    refuse_large_program(rows)
     trail: Trail[ImplicitModel] = Trail(
         task,
         lambda model: prove_in_set(model, rows),

@@ -126,6 +126,23 @@ def monomials(n: int, degrees: Sequence[int]) -> IntArray:
     return np.array(rows, dtype=np.int64).reshape(len(rows), n)
 
 
+def added(polynomials: Sequence[Polynomial]) -> Polynomial:
+    """The sum of one or more polynomials, made in one step."""
+    names = tuple(dict.fromkeys(name for p in polynomials for name in p.names))
+    exact = any(p.is_exact for p in polynomials)
+    parts = [p.over(names).exact() if exact else p.over(names) for p in polynomials]
+    exponents = np.concatenate([p.exponents for p in parts])
+    return Polynomial(exponents, np.concatenate([p.coefficients for p in parts]), names)
+
+
+def combinations(weights: FloatArray, polynomials: Sequence[Polynomial]) -> NDArray[Any]:
+    """weights (m, k) times k polynomials: an object array (m,), each entry made in one step."""
+    names = tuple(dict.fromkeys(name for p in polynomials for name in p.names))
+    exponents, table = coefficient_table([p.over(names) for p in polynomials])
+    rows = weights @ table.T
+    return _object_array([Polynomial(exponents, row, names) for row in rows])
+
+
 def coefficient_table(polynomials: Sequence[Polynomial]) -> tuple[IntArray, FloatArray]:
     """Common monomials (m, n) of polynomials in the same variables, and coefficients (m, k)."""
     if any(p.names != polynomials[0].names for p in polynomials):

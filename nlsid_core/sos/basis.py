@@ -21,15 +21,16 @@ def gram_basis(support: IntArray) -> IntArray:
         return np.zeros((0, support.shape[1]), dtype=np.int64)
     degrees = support.sum(axis=1)
     low, high = int(np.min(degrees) + 1) // 2, int(np.max(degrees)) // 2
-    candidates = monomials(support.shape[1], range(low, high + 1))
-    within = (candidates >= (support.min(axis=0) + 1) // 2) & (
-        candidates <= support.max(axis=0) // 2
-    )
-    return drop_inconsistent(candidates[within.all(axis=1)], support)
+    return drop_inconsistent(monomials(support.shape[1], range(low, high + 1)), support)
 
 
 def drop_inconsistent(candidates: IntArray, support: IntArray) -> IntArray:
-    """Drop b while b² is neither in the support nor a product of two other candidates."""
+    """Drop b while b² is neither in the support nor a product of two other candidates.
+
+    Those outside half the box of the support, which the rule would drop one after the other, first.
+    """
+    low, high = (support.min(axis=0) + 1) // 2, support.max(axis=0) // 2
+    candidates = candidates[((candidates >= low) & (candidates <= high)).all(axis=1)]
     present = {tuple(row) for row in support.tolist()}
     while True:
         rows = candidates.tolist()

@@ -15,6 +15,7 @@ from nlsid_core.arrays import FloatArray, IntArray
 from nlsid_core.conic import ConeSolution
 from nlsid_core.errors import DataError, ShapeError
 from nlsid_core.polynomial import Gram, Polynomial
+from nlsid_core.polynomial.maps import added
 
 
 @dataclass(frozen=True)
@@ -176,13 +177,13 @@ def matrix_sum_of_squares(
         raise ShapeError(f"a square matrix of polynomials is needed, shape {M.shape} was given")
     names = forms_of(len(M))
     unit = np.eye(len(M), dtype=np.int64)
-    total: Any = 0
-    for i in range(len(M)):
-        for j in range(i, len(M)):
-            factor = 1.0 if i == j else 2.0
-            total = total + Polynomial(unit[[i]] + unit[[j]], np.array([factor]), names) * M[i, j]
+    parts = [
+        Polynomial(unit[[i]] + unit[[j]], np.array([1.0 if i == j else 2.0]), names) * M[i, j]
+        for i in range(len(M))
+        for j in range(i, len(M))
+    ]
     return SumOfSquares(
-        total, domain=domain, equalities=equalities, degree=degree, forms=names, name=name
+        added(parts), domain=domain, equalities=equalities, degree=degree, forms=names, name=name
     )
 
 

@@ -34,7 +34,7 @@ from nlsid_core.identification import (
     validate,
 )
 from nlsid_core.identification.prediction import history, simulate_trial, solve_increasing_at
-from nlsid_core.identification.searches import hold_out
+from nlsid_core.identification.validation import hold_out
 from nlsid_core.models import BlockCascade, MonotoneEquation, StateAffineModel
 from nlsid_core.models.monotone_equation import solve_increasing
 from nlsid_core.proofs import check

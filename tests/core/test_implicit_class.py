@@ -1,5 +1,6 @@
 """Implicit models searched in each stable set: bounds that hold, known truths, what is refused."""
 
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from nlsid_core import files
 from nlsid_core.data.trajectory import Dataset, Trajectory
@@ -26,6 +28,7 @@ from nlsid_core.proofs import check, proof_document
 from tests import implicit_models
 
 SCHEMA = Path(__file__).resolve().parents[2] / "docs" / "schema" / "implicit.schema.json"
+WIDE = ((-30.0, 30.0),) * 3
 STATE = (1,)  # delays where the output is the state
 SPRING = ImplicitClass(1, STATE)
 CLASSES = [
@@ -258,6 +261,51 @@ def test_the_document_keeps_signals_and_validates_against_the_published_schema()
 def test_a_class_that_no_model_can_be_in_is_refused(options: dict[str, Any], reason: str) -> None:
     with pytest.raises(DataError, match=reason):
         ImplicitClass(**options)
+
+
+def two_inputs(samples: int) -> Dataset:
+    """A first-order response to two random inputs."""
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=(samples, 2))
+    y = lfilter([0.0, 1.0], [1.0, -0.7], u[:, 0] + 0.3 * u[:, 1] ** 3)
+    y = y + 0.01 * rng.normal(size=samples)
+    return Dataset((Trajectory(t=0.1 * np.arange(samples), y=y, u=u, name="two"),))
+
+
+def test_many_terms_of_the_inputs_alone_cost_a_search_little() -> None:
+    data = two_inputs(2000)
+    started = time.process_time()
+    fit = identify(data, ImplicitClass(4, input_degree=3), comparators=())
+    assert fit.chosen.proof is not None
+    assert len(fit.model.h.exponents) > 285
+    assert time.process_time() - started < 30.0  # minutes, while they were in the program
+
+
+def test_terms_in_the_inputs_alone_are_their_least_squares() -> None:
+    data = two_inputs(400)
+    rows = build_implicit_rows(data, ImplicitClass(2, input_degree=2))
+    found = minimise_implicit_rie(rows)
+    c = np.concatenate([found.e, -found.f])
+    driven = np.concatenate([np.zeros(len(rows.left), dtype=bool), rows.driven])
+    rest = rows.R[:, ~driven] @ c[~driven]
+    best = np.linalg.lstsq(rows.R[:, driven], -rest, rcond=None)[0]
+    np.testing.assert_allclose(c[driven], best, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [
+        (ImplicitClass(4, input_degree=5), "3010 terms an equation of 4 past outputs and 10"),
+        (ImplicitClass(99), "99 states, more than 60: .*; use fewer lags"),
+        (ImplicitClass(2, left_degree=9, right_degree=2, coupled=True, box=WIDE), "monomials"),
+        (ImplicitClass(5, right_degree=2, coupled=True, box=WIDE), "semidefinite block of order"),
+    ],
+)
+def test_a_class_too_large_for_a_search_is_refused(made: ImplicitClass, reason: str) -> None:
+    started = time.process_time()
+    with pytest.raises(DataError, match=reason):
+        identify(two_inputs(1000), made)
+    assert time.process_time() - started < 20.0
 
 
 def test_data_that_do_not_fit_the_class_are_refused() -> None:

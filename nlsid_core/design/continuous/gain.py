@@ -5,7 +5,7 @@ limit makes it quadratic, and it is taken at first order. One semidefinite progr
     maximise Σ_k weight_k m_k   subject to   φ(z; K) + ρ̇/ρ - m_k = v'Qv,  Q ⪰ 0
 at both ends of every interval k in every case, with bounds of what K and its change ask of each
 input. It only proposes gains: a sweep finds the funnel that they have.
-Source: thesis (6.4), in the sphere form; docs/decisions/0037-gains-are-searched-on-request.md.
+Source: thesis (6.4), in the sphere form; docs/decisions/0038-gains-are-searched-on-request.md.
 """
 
 from dataclasses import dataclass, replace

@@ -33,7 +33,7 @@ from bags.fleet.monitor import (
 from bags.fleet.trials import read_fleet
 from bags.fleet.workers import Workers
 from bags.monitoring.replay import replay_bag
-from bags.recordings.remote import TAIL_BYTES
+from bags.recordings.remote import MARK_BYTES
 from bags.samples import f1tenth
 from nlsid_core.errors import DataError
 from nlsid_core.running.comparison import Centre
@@ -202,7 +202,7 @@ def test_what_a_web_server_tells_of_two_recordings_may_be_the_same(
             drive(web / f"{name}.mcap", samples=400, seed=seed, chunk_size=2**12),
             ns=(10**18, 10**18),
         )
-    tails = {file.name: file.read_bytes()[-TAIL_BYTES:] for file in web.iterdir()}
+    tails = {file.name: file.read_bytes()[-MARK_BYTES:] for file in web.iterdir()}
     assert tails["a.mcap"] == tails["b.mcap"]
     with web_server(web) as url:
         found = monitor_fleet(
