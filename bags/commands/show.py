@@ -16,7 +16,7 @@ from bags.chain.gains import Gain, signals
 from bags.chain.steps import Identified
 from bags.designs import documents
 from bags.designs.design import AnyDesign
-from bags.designs.displacement import displacement_half_width, washout_of
+from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.monitoring.catching import WIDE, Breaking, Catching, Caught
 from bags.monitoring.replay import Replay
 from bags.pictures.choices import Scored
@@ -244,6 +244,7 @@ def funnel_table(design: OutputTubeDesign) -> Table:
         lasts = f"{len(design.policy)} samples, which span {text.below(played)} s"
         table.add_row("and", f"the policy's plan, {engaged}, for {lasts}")
     signals = (model.y,) if isinstance(model.y, Signal) else model.y
+    washouts = washouts_of(signals)
     for tube in funnel.tubes:
         lasting = "for ever"
         if tube.samples is not None:
@@ -257,8 +258,8 @@ def funnel_table(design: OutputTubeDesign) -> Table:
         if tube.follows is not None:
             said += " times sqrt(g), which follows the commands"
         table.add_row("half-width", f"{said}, {lasting}")
-        for width, signal in zip(tube.half_widths.tolist(), signals, strict=True):
-            if (time := washout_of(signal)) is not None and tube.samples is None:
+        for time, width, signal in zip(washouts, tube.half_widths.tolist(), signals, strict=True):
+            if time is not None and tube.samples is None:
                 moved = text.above(displacement_half_width(width, time, time))
                 times = " times the largest sqrt(g) meanwhile" if tube.follows is not None else ""
                 table.add_row(

@@ -8,6 +8,7 @@ The position may leave the model's for ever; over a span it does so by no more t
 over the messages of the signal, so every one of them has to be a sample.
 """
 
+from collections.abc import Sequence
 from fractions import Fraction
 
 from bags.signals.expressions import Expression
@@ -15,13 +16,24 @@ from nlsid_core.errors import BagError
 from nlsid_core.models import Signal
 
 
-def washout_of(signal: Signal) -> Fraction | None:
-    """T in s of a signal whose samples are messages, washed out; None if it is no such signal."""
-    try:
-        window = Expression.parse(signal.path).washed_out
-    except BagError:  # not read from a topic
-        return None
-    return None if window is None else Fraction(window)
+def washouts_of(signals: Sequence[Signal]) -> list[Fraction | None]:
+    """T in s of each response of a model that is washed out and whose every message is a sample.
+
+    None of others: on another topic than the first response's, messages may come between samples,
+    and what they add to a displacement is in no sample.
+    """
+    parsed: list[Expression | None] = []
+    for signal in signals:
+        try:
+            parsed.append(Expression.parse(signal.path))
+        except BagError:  # not read from a topic
+            parsed.append(None)
+    first = parsed[0]
+    windows = [
+        one.washed_out if one and first and one.path.topic == first.path.topic else None
+        for one in parsed
+    ]
+    return [None if window is None else Fraction(window) for window in windows]
 
 
 def displacement_half_width(half_width: float, span: Fraction, washout: Fraction) -> Fraction:

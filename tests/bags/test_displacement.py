@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 from bags.commands.cli import app
-from bags.designs.displacement import displacement_half_width, washout_of
+from bags.designs.displacement import displacement_half_width, washouts_of
 from bags.samples import f1tenth
 from nlsid_core.models import Signal
 
@@ -42,10 +42,16 @@ def test_no_errors_of_the_washed_out_position_add_up_to_more_and_the_worst_do_to
     assert worst == pytest.approx(bound, rel=0.01)
 
 
-def test_a_signal_that_is_not_washed_out_tells_no_displacement() -> None:
-    assert washout_of(Signal("x", "m", "/a:b|washout(0.5 s)")) == Fraction(1, 2)
-    assert washout_of(Signal("x", "m", "/a:b")) is None
-    assert washout_of(Signal("x", "m")) is None
+def test_a_displacement_is_told_of_samples_that_are_washed_out_messages() -> None:
+    x, y, other, plain = (
+        Signal("x", "m", path)
+        for path in ("/a:x|washout(0.5 s)", "/a:y|washout(2 s)", "/b:z|washout(1 s)", "/a:x")
+    )
+    assert washouts_of([x, y]) == [Fraction(1, 2), Fraction(2)]
+    assert washouts_of([plain, y]) == [None, Fraction(2)]
+    assert washouts_of([Signal("x", "m")]) == [None]
+    # Of /b only the messages at the stamps of /a are samples, and others may come between them.
+    assert washouts_of([x, other]) == [Fraction(1, 2), None]
 
 
 @pytest.mark.slow
