@@ -135,10 +135,11 @@ def said_briefly(bags: Sequence[Path]) -> str:
     letters = takewhile(
         lambda column: len(set(column)) == 1, zip(*(b.name for b in bags), strict=False)
     )
-    for pattern in (folder, folder / f"{''.join(column[0] for column in letters)}*"):
+    begin = f"{folder}/{''.join(column[0] for column in letters)}"
+    for given, star in ((str(folder), ""), (begin, "*")):
         with suppress(BagError):
-            if set(expand_bags([pattern])) == meant:
-                return str(pattern)
+            if set(expand_bags([Path(f"{given}{star}")])) == meant:
+                return f"{shlex.quote(given)}{star}"
     return MANY
 
 

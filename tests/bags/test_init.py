@@ -460,6 +460,14 @@ def test_many_bags_are_said_as_their_folder_or_a_pattern(tmp_path: Path) -> None
     assert said_briefly([*bags[1:], tmp_path / "other"]) == "BAGS"
 
 
+def test_a_pattern_can_be_pasted_where_its_folder_has_a_space(tmp_path: Path) -> None:
+    folder = tmp_path / "two axes"
+    for name in ("run_0", "run_1", "run_2", "run_3", "other"):
+        two_axes(folder / name)
+    said = said_briefly([folder / f"run_{k}" for k in range(4)])
+    assert said == f"'{folder}/run_'*"
+
+
 def test_units_keep_their_letters_at_the_head_of_the_file() -> None:
     proposal = Proposal({}, error=3.0, varies=", in which T varies by 10.5 degC, rms")
     said = "# Expect 3 % error in simulation (of trials held back, in which T varies by 10.5 degC"
