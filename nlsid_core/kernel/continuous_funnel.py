@@ -417,6 +417,7 @@ def _range(ends: tuple[Fraction, Fraction]) -> str:
     return f"[{text.exact(ends[0])}, {text.exact(ends[1])}]"
 
 
+Change = dict[tuple[int, ...], Polynomial]  # by monomials in (δ, w); () is 1
 Key = tuple[int, int, tuple[int, ...]]  # interval, vertex; mode, or input, sign and mode
 
 
@@ -436,6 +437,7 @@ def _decide_pieces(
     _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits))
     values = [tuple((a + b) / 2 for a, b in field.box)] if kappa else list(product(*field.box))
     vertices, modes = list(product(hold.corners, values)), _modes(policy)
+    equations = [[_moved(e, field, hold.moved) for e in span] for span in field.equations]
     decays = isinstance(falls, Decay)
     names = "tau" if decays else "mu" + " tau" * bool(policy.limits)
     names += " mode" * bool(policy.limits)
@@ -447,14 +449,13 @@ def _decide_pieces(
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, mode), level, index, i = order[number]
         corner, w = vertices[v]
-        key = ring.width, k, level, index, mode, corner
+        key = ring.width, k, level, index, mode
         if key not in loops:
             loops.clear()
-            push = hold.push(k, corner)
-            loops[key] = _Loop(ring, field, policy, funnel, spans[k], key[1:4], mode, push)
-            loops[key].grow(field, kappa[k] if kappa else [], falls)
+            loops[key] = _Loop(ring, equations[spans[k]], policy, funnel, key[1:4], mode)
+            loops[key].grow(field.box, kappa[k] if kappa else [], falls)
         loop, piece = loops[key], pieces[i]
-        c = loop.condition(multiplier, piece, stated, w)
+        c = loop.condition(multiplier, piece, stated, (*hold.push(k, corner), *w))
         squares = read_squares(piece | {"basis": stated["basis"]}, loop.ring)
         positive(c, squares, loop.ring, f"piece {i} (interval {k}, vertex {v}, mode {mode})")
 
@@ -487,18 +488,24 @@ def _decide_rates(
     names = "input sign tau" + " mode" * bool(limited)
     order, pieces = _in_order(stated["rate_pieces"], names, needed, len(limited), work)
     halves = {j: (field.box[j][1] - field.box[j][0]) / 2 for j in pushing}
+    equations = [[_moved(e, field, hold.moved) for e in span] for span in field.equations]
+    loops: dict[tuple[object, ...], _Loop] = {}  # as above
 
     def decide_piece(ring: Ring, number: int) -> None:
         (k, v, (i, sign, *mode)), level, index, place = order[number]
         (corner, w), what = vertices[v], f"rate piece {place} (interval {k}, vertex {v}, input {i})"
-        push = hold.push(k, corner)
-        loop = _Loop(ring, field, policy, funnel, spans[k], (k, level, index), tuple(mode), push)
-        room = hold.rates[k][i]
+        key = ring.width, k, level, index, tuple(mode)
+        if key not in loops:
+            loops.clear()
+            loops[key] = _Loop(ring, equations[spans[k]], policy, funnel, key[1:4], key[4])
+        loop, room = loops[key], hold.rates[k][i]
         for j, half in halves.items():
             column = [_pushed(equation, j, field) for equation in field.equations[spans[k]]]
             room -= half * max(abs(_product(gain[i], column)) for gain in policy.K[k])
-        c = loop.rate_condition(room, i, sign, pieces[place], stated, w)
-        positive(c, read_squares(pieces[place] | {"basis": stated["basis"]}, ring), ring, what)
+        off = (*hold.push(k, corner), *w)
+        c = loop.rate_condition(room, i, sign, pieces[place], stated, off)
+        squares = read_squares(pieces[place] | {"basis": stated["basis"]}, loop.ring)
+        positive(c, squares, loop.ring, what)
 
     for number in range(len(order)):
         at_width(field.n, work, partial(decide_piece, number=number))
@@ -521,6 +528,27 @@ def _pushing(field: Field) -> list[int]:
     rows = [e for span in field.equations for equation in span for e, _ in equation]
     return [
         j for j in range(len(field.box)) if all(sum(row) == 1 for row in rows if row[first + j])
+    ]
+
+
+def _moved(equation: Terms, field: Field, moved: int) -> Terms:
+    """The equation with u + δ for u, if inputs are off: δ has its exponents before those of w.
+
+    It has degree at most 1 in each input.
+    """
+    first, last = 1 + field.n, 1 + field.n + field.m
+    if not moved:
+        return equation
+    return [
+        (
+            e[:first]
+            + tuple(a - b for a, b in zip(e[first:last], off, strict=True))
+            + off
+            + e[last:],
+            c,
+        )
+        for e, c in equation
+        for off in product(*(range(d + 1) for d in e[first:last]))
     ]
 
 
@@ -568,15 +596,16 @@ def _in_order(
 class _Loop:
     """What pieces of one part of time and one mode share: polynomials in x̄, and in s on it.
 
-    held: what is nonnegative in the mode. gap: ρ - W. forms: t, x and u for the field's equations.
+    equations: with δ. held: what is nonnegative in the mode. gap: ρ - W. field: f by monomials in
+    (δ, w), of clip(ũ).
     """
 
     def __init__(
-        self, ring: Ring, field: Field, policy: Policy, funnel: Funnel, span: int,
-        place: tuple[int, int, int], mode: tuple[int, ...], push: Sequence[Fraction],
+        self, ring: Ring, equations: list[Terms], policy: Policy, funnel: Funnel,
+        place: tuple[int, int, int], mode: tuple[int, ...],
     ) -> None:  # fmt: skip
         (self.k, level, index), self.ring, x = place, ring, ring.variables
-        self.funnel, self.policy, self.equations = funnel, policy, field.equations[span]
+        self.funnel, self.policy = funnel, policy
         k, self.h = self.k, funnel.t[self.k + 1] - funnel.t[self.k]
         self.in_time = in_time = partial(ring.bernstein, level=level, index=index)
         self.rho = in_time(funnel.rho[k : k + 2])
@@ -595,10 +624,10 @@ class _Loop:
                 inputs[i] = ring.made(low if side < 0 else high)
             else:
                 self.held.append((high - wanted) * (wanted - low))
-        inputs = [u + delta for u, delta in zip(inputs, push, strict=True)] if push else inputs
         centres = zip(*funnel.x[k], strict=True)
         states = [in_time(points) + e for points, e in zip(centres, x, strict=True)]
-        self.forms = [in_time(funnel.t[k : k + 2]), *states, *inputs]
+        self.field = _apart(ring, equations, [in_time(funnel.t[k : k + 2]), *states, *inputs])
+        self.changes: dict[int, Change] = {}
 
     def _gains(self, i: int) -> list[Polynomial]:
         """Row i of K."""
@@ -609,8 +638,17 @@ class _Loop:
         """dx₀/ds."""
         return [self.in_time(_slope(p)) for p in zip(*self.funnel.x[self.k], strict=True)]
 
-    def grow(self, field: Field, kappa: Sequence[Fraction], falls: Decay | Fraction) -> None:
-        """`rest` and, by monomials in w, `growth`: all of c(s, x̄) but its multipliers.
+    def _along(self, direction: list[Polynomial], scale: Fraction) -> Change:
+        """scale direction'f."""
+        return {off: scale * self.ring.dot(rates, direction) for off, rates in self.field.items()}
+
+    def grow(
+        self,
+        box: list[tuple[Fraction, Fraction]],
+        kappa: Sequence[Fraction],
+        falls: Decay | Fraction,
+    ) -> None:
+        """`rest` and, by monomials in (δ, w), `growth`: all of c(s, x̄) but its multipliers.
 
         falls: the decay, or the margin on the boundary. `shell`: what is nonnegative for a decay.
         """
@@ -621,9 +659,10 @@ class _Loop:
         ]
         # 2x̄'P dx₀/ds - x̄'(dP/ds)x̄: what of -dW/ds does not come from f
         rest = 2 * ring.dot(self._motion(), self.Px) - ring.form(bend, x)
-        self.growth = _along(ring, self.equations, self.Px, self.forms, 2 * h)
-        for j, (bound, (low, high)) in enumerate(zip(kappa, field.box, strict=False)):
-            unit = tuple(int(i == j) for i in range(len(field.box)))
+        self.growth = self._along(self.Px, 2 * h)
+        moved = len(next(iter(self.field), ())) - len(box)
+        for j, (bound, (low, high)) in enumerate(zip(kappa, box, strict=False)):
+            unit = tuple(int(i == j) for i in range(-moved, len(box)))
             along = self.growth.get(unit, ring.made(0))  # 2h x̄'Pg
             half = (high - low) / 2
             rest -= half * bound / (4 * h) * (along * along) + half * h / bound
@@ -638,13 +677,13 @@ class _Loop:
 
     def condition(
         self, multiplier: list[tuple[int, ...]], piece: dict[str, Node], stated: dict[str, Node],
-        w: Sequence[Fraction],
+        off: Sequence[Fraction],
     ) -> Polynomial:  # fmt: skip
-        """c(s, x̄) of a piece at a vertex w."""
+        """c(s, x̄) of a piece at a vertex of (δ, w)."""
         parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.rest)]
         if "mu" in piece:
             parts.append((1, self._multiplied(multiplier, piece["mu"])))
-        parts += [(-weight, growth) for weight, growth in _at(w, self.growth)]
+        parts += [(-weight, growth) for weight, growth in _at(off, self.growth)]
         if "tau" in piece:
             parts += self._taken(piece["tau"], self.shell + self.held, stated)
         return self.ring.weighted(parts)
@@ -662,23 +701,24 @@ class _Loop:
 
     def rate_condition(
         self, room: Fraction, i: int, sign: int, piece: dict[str, Node], stated: dict[str, Node],
-        w: Sequence[Fraction],
+        off: Sequence[Fraction],
     ) -> Polynomial:  # fmt: skip
-        """h room - sign dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l, of ũ = u₀ - Kx̄, at a vertex w."""
-        ring, k, x = self.ring, self.k, self.ring.variables
-        gains = self._gains(i)
-        turning = [self.in_time(_slope(p)) for p in zip(*(K[i] for K in self.policy.K[k]),
-                                                        strict=True)]  # fmt: skip
-        parts: list[tuple[Fraction | int, Polynomial]] = [
-            (1, ring.made(self.h * room)),
-            (-sign, self.in_time(_slope([u[i] for u in self.policy.u[k]]))),
-            (sign, ring.dot(turning, x)),
-            (-sign, ring.dot(gains, self._motion())),
-        ]
-        moved = _along(ring, self.equations, gains, self.forms, self.h)
-        parts += [(sign * weight, rate) for weight, rate in _at(w, moved)]
+        """h room - sign dũ_i/ds - τ_0 (ρ - W) - Σ_l τ_l q_l, of ũ = u₀ - Kx̄, at a vertex."""
+        if i not in self.changes:
+            self.changes[i] = self._change(i)
+        parts: list[tuple[Fraction | int, Polynomial]] = [(1, self.ring.made(self.h * room))]
+        parts += [(-sign * weight, change) for weight, change in _at(off, self.changes[i])]
         parts += self._taken(piece["tau"], [self.gap, *self.held], stated)
-        return ring.weighted(parts)
+        return self.ring.weighted(parts)
+
+    def _change(self, i: int) -> Change:
+        """dũ_i/ds."""
+        ring, k, gains = self.ring, self.k, self._gains(i)
+        rows = zip(*(K[i] for K in self.policy.K[k]), strict=True)
+        turning = [self.in_time(_slope(points)) for points in rows]
+        own = self.in_time(_slope([u[i] for u in self.policy.u[k]]))
+        own += ring.dot(gains, self._motion()) - ring.dot(turning, ring.variables)
+        return {(): own} | self._along(gains, -self.h)
 
     def _taken(
         self, taus: Node, held: list[Polynomial], stated: dict[str, Node]
@@ -696,27 +736,22 @@ def _slope(points: Sequence[Fraction]) -> list[Fraction]:
     return [(len(points) - 1) * (b - a) for a, b in pairwise(points)] or [Fraction(0)]
 
 
-def _at(
-    w: Sequence[Fraction], parts: dict[tuple[int, ...], Polynomial]
-) -> list[tuple[Fraction, Polynomial]]:
-    """What multiplies each polynomial at a vertex w."""
+def _at(off: Sequence[Fraction], parts: Change) -> list[tuple[Fraction, Polynomial]]:
+    """What multiplies each polynomial at a vertex of (δ, w)."""
     return [
-        (prod((value for value, e in zip(w, used, strict=True) if e), start=Fraction(1)), part)
+        (prod((value for value, e in zip(off, used, strict=False) if e), start=Fraction(1)), part)
         for used, part in parts.items()
     ]
 
 
-def _along(
-    ring: Ring, equations: list[Terms], direction: list[Polynomial], forms: list[Polynomial],
-    scale: Fraction,
-) -> dict[tuple[int, ...], Polynomial]:  # fmt: skip
-    """scale direction'f by its monomials in w, for t, x, u as forms in x̄ and s."""
+def _apart(
+    ring: Ring, equations: list[Terms], forms: list[Polynomial]
+) -> dict[tuple[int, ...], list[Polynomial]]:
+    """f by its monomials in (δ, w), for t, x, u as forms in x̄ and s."""
     rates: dict[tuple[int, ...], list[Terms]] = {}
     n, known = len(equations), len(forms)
     for i, equation in enumerate(equations):
         for e, c in equation:
             rates.setdefault(e[known:], [[] for _ in range(n)])[i].append((e[:known], c))
     found = ring.substituted([p for parts in rates.values() for p in parts], forms)
-    return {
-        used: scale * ring.dot(found[n * i : n * i + n], direction) for i, used in enumerate(rates)
-    }
+    return {used: found[n * i : n * i + n] for i, used in enumerate(rates)}

@@ -152,18 +152,25 @@ def rate_polynomial(
 ) -> Graded:
     """h room - sign dũ_i/ds - τ(ρ - x̄'Px̄) of every piece, as `closed_loop_polynomial` writes c.
 
-    w: (B, n_w). room: (B,) in input units per s. entry: (B,) i. τ: the first of the piece's.
+    w: (B, n_w). room: (B,) in input units per s. entry: (B,) i. τ: the first of the piece's. Pieces
+    that differ in entry and sign only follow each other, in the same frame T.
     """
     n, k = field.n, pieces.interval
     loop = _Loop(field, policy, funnel, pieces, w, end)
+    case = np.column_stack([k, pieces.level, pieces.index, pieces.vertex, pieces.mode])
+    new = np.r_[True, (case[1:] != case[:-1]).any(axis=1)]
+    first = np.flatnonzero(new)
+    rates = _Loop(field, policy, funnel, pieces.select(first), w[first], end).field_times_h()
+    shared = np.cumsum(new) - 1
     every = np.arange(len(k))
     gains = policy.K.control[k][every, :, entry]
     turned = _product(loop.restricted(_slope(gains))[:, :, None], pieces.T)[:, :, 0]
     steered = loop.restricted(_slope(policy.u.control[k][every, :, entry]))
     change: Graded = {0: steered[:, :, None], 1: -turned}
     along, x_rate = loop.restricted(gains), loop.nominal_rate()
-    for j, rate in enumerate(loop.field_times_h()):
-        error = add(rate, {0: -x_rate[:, :, j][:, :, None]})
+    for j, rate in enumerate(rates):
+        here = {q: part[shared] for q, part in rate.items()}
+        error = add(here, {0: -x_rate[:, :, j][:, :, None]})
         change = add(change, multiply({0: -along[:, :, j][:, :, None]}, error, n))
     c: Graded = {q: -sign[:, None, None] * part for q, part in change.items()}
     c = add(c, {0: (np.diff(funnel.t)[k] * room)[:, None, None]})

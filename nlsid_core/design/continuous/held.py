@@ -220,10 +220,10 @@ def _batches(
     limited = steps.limits[:, 0].astype(int).tolist()
     cases = [
         (v, entry, sign, mode)
+        for mode in range(len(steps.modes))
         for v in range(len(values) * len(steps.corners))
         for entry in range(field.m)
         for sign in (-1, 1)
-        for mode in range(len(steps.modes))
         if entry not in limited or not steps.modes[mode][limited.index(entry)]
     ]
     vertex, entry, sign, mode = np.array(cases).reshape(-1, 4).T
