@@ -23,6 +23,7 @@ from nlsid_core.errors import DocumentError
 T = TypeVar("T")
 VERSION = 2  # of every document
 MAX_BYTES = 64 * 2**20  # a proof of hundreds of Gram matrices is a few MB; more is not ours
+_SCALARS = json.JSONEncoder(allow_nan=False)
 
 
 def load_document(path: Path | str) -> Json:
@@ -60,8 +61,7 @@ def parse_document(text: bytes | str, *, source: str = "document") -> Json:
 
 def encode(document: Json) -> bytes:
     """The bytes of a document's file: indented JSON, shortest exact floats."""
-    text = json.dumps(document, indent=1, allow_nan=False)
-    return _join_short_arrays(text).encode("ascii") + b"\n"
+    return _written(document).encode("ascii") + b"\n"
 
 
 def canonical(content: Json) -> bytes:
@@ -221,21 +221,15 @@ def _bounded_int(text: str) -> int:
     return value
 
 
-def _join_short_arrays(text: str) -> str:
-    """Put innermost arrays on one line: a matrix reads as rows."""
-    lines = text.split("\n")
-    joined: list[str] = []
-    index = 0
-    while index < len(lines):
-        if lines[index].endswith("["):
-            end = index + 1
-            while end < len(lines) and not lines[end].endswith(("[", "{", "]", "],", "}", "},")):
-                end += 1
-            if end < len(lines) and lines[end].strip() in ("]", "],"):
-                inner = " ".join(line.strip() for line in lines[index + 1 : end])
-                joined.append(lines[index] + inner + lines[end].strip())
-                index = end + 1
-                continue
-        joined.append(lines[index])
-        index += 1
-    return "\n".join(joined)
+def _written(value: Any, margin: str = "") -> str:
+    """Indented by a space for each level, but an array of scalars is one line: a matrix's row."""
+    arrays, inner = (dict, list, tuple), f"\n{margin} "
+    if isinstance(value, dict) and value:
+        rows = [
+            f"{_SCALARS.encode(key)}: {_written(part, inner[1:])}" for key, part in value.items()
+        ]
+        return f"{{{inner}{f',{inner}'.join(rows)}\n{margin}}}"
+    if isinstance(value, list | tuple) and any(isinstance(part, arrays) for part in value):
+        rows = [_written(part, inner[1:]) for part in value]
+        return f"[{inner}{f',{inner}'.join(rows)}\n{margin}]"
+    return _SCALARS.encode(value)
