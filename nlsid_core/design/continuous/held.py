@@ -37,6 +37,7 @@ LEAST_QUARTIC = 1e-3  # of the linear part's size
 NEWTONS = 6  # for a multiplier: any will do, and six are at the best one
 FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
+LARGEST_RATIO = 0.5  # of a change to the last, whose geometric series is taken in one step
 SETTLED = 1.005  # of the rates before: ROOM holds what is left
 
 
@@ -158,6 +159,7 @@ def fastest(
     """(intervals, m) R and W for a funnel: each for the other, R with room."""
     rates = np.zeros((len(funnel.t) - 1, steps.field.m))
     parts, h = [Part(k, 0, 0) for k in range(len(rates))], np.diff(funnel.t)
+    last = np.zeros_like(rates)
     for _ in range(MAX_ROUNDS if hold.period else 0):
         steps.widths, before = hold.widths(policy, rates), rates.copy()
         for batch in _batches(steps, policy, parts, proof_basis(steps.program)):
@@ -167,6 +169,9 @@ def fastest(
                 np.maximum.at(rates, (k, batch.entry), ROOM * (shown.least / h[k] + batch.taken))
         if (rates <= SETTLED * before).all():
             break
+        change = rates - before
+        ratio = np.minimum(change / np.where(last > 0, last, np.inf), LARGEST_RATIO)
+        rates, last = rates + change * ratio / (1 - ratio), change
     return rates, hold.widths(policy, rates)
 
 
