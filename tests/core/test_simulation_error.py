@@ -317,7 +317,8 @@ def several(*modes: tuple[float, float]) -> list[complex]:
 def multisine(samples: int, harmonics: int) -> FloatArray:
     phases = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, harmonics)
     k = np.arange(1, harmonics + 1)
-    return np.cos(2 * np.pi * np.outer(np.arange(samples), k) / samples + phases).sum(axis=1)
+    waves = np.cos(2 * np.pi * np.outer(np.arange(samples), k) / samples + phases)
+    return np.asarray(waves.sum(axis=1))
 
 
 ARM = (several((0.998, 0.15), (0.995, 0.35), (0.98, 0.9)), multisine(2048, 199), 0.002)
