@@ -410,3 +410,17 @@ def test_several_outputs_are_certified_to_degree_1_and_beyond_are_told_what_to_u
         data, quadratic, method=Rse(2), comparators=[CertifiedRse(2)], allow_unproved=True
     )
     assert beside.methods == ("rse",)
+
+
+@pytest.mark.slow
+def test_products_of_lags_and_five_inputs_are_certified() -> None:
+    rng = np.random.default_rng(0)
+    u, y = rng.standard_normal((400, 5)), np.zeros(400)
+    for t in range(1, 400):
+        y[t] = (0.6 + 0.05 * u[t - 1, 0]) * y[t - 1] + u[t - 1] @ [1.0, -0.5, 0.3, 0.2, 0.1]
+    measured = y + 0.05 * np.std(y) * rng.standard_normal(400)
+    data = Dataset((Trajectory(t=0.1 * np.arange(400), y=measured, u=u),))
+    model_class = StateAffineClass(1, lagged_degree=1)
+    fit = identify(data, model_class, method=CertifiedRse(3), comparators=())
+    assert fit.proof.rate < 1.0
+    assert fit.errors["train"]["rse_certified"] < 7.0

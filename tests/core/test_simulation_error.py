@@ -301,6 +301,30 @@ def test_where_iterates_from_the_identity_stop_far_off_other_starts_reach_the_mi
     assert all(candidate.proof is not None for candidate in fit.candidates)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 11])
+def test_three_resonances_from_rest_are_found_to_the_noise_where_the_identity_is_not(
+    seed: int,
+) -> None:
+    """10 % noise, which no simulation is far below; none in the samples that a simulation begins
+    with, which three slow modes would carry through the whole trial.
+    """
+    rng = np.random.default_rng(seed)
+    modes = ((0.995, 0.06), (0.99, 0.3), (0.98, 0.6))
+    poles = [r * np.exp(s * 1j * angle) for r, angle in modes for s in (1, -1)]
+    moving = np.arange(1024) >= 8
+    u = np.repeat(rng.normal(size=128), 8) * moving
+    y = lfilter(np.concatenate([[0.0], 0.1 * rng.normal(size=6)]), np.poly(poles).real, u)
+    y += 0.1 * np.std(y) * rng.normal(size=len(u)) * moving
+    data = Dataset((Trajectory(t=0.002 * np.arange(len(u)), y=y, u=u, name="arm"),))
+    regression = build_regression(data, 6)
+    *_, stuck = robust_simulation_error(regression.rows)
+    assert simulation_percent(regression.model(stuck.theta, stuck.p), data) > 15.0
+    fit = identify(data, LinearClass(6), method=CertifiedSem())
+    assert 9.0 < fit.errors["train"]["sem_certified"] < 10.3
+    assert fit.proof.rate <= fit.max_rate
+
+
 def beside_another_output(data: Dataset) -> Dataset:
     """The data's output, and one sample later half of it with some noise, as two outputs."""
     (trial,), rng = data, np.random.default_rng(0)
