@@ -75,6 +75,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "nonlinear": Benchmark("nonlinear", data="."),
         "one_dimensional": Benchmark("one_dimensional"),
         "quadrotor": Benchmark("quadrotor"),
+        "reachability": Benchmark("reachability"),
         "recorder": Benchmark("recorder"),
         "repeated_experiments": Benchmark("repeated_experiments", ("--minutes", "70")),
         "robots": Benchmark("robots", data="."),

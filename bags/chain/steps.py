@@ -227,7 +227,7 @@ def by_use(labelled: Dataset, config: Config) -> Trials:
         fitted = (*trials.train, *(trials.validation or ()))
         check_apart(fitted, trials.calibration)
     named = (*config.split.test, *config.split.validation, *config.split.calibration)
-    absent = tuple(name for name in named if not _of_bags(labelled, [name]))
+    absent = tuple(name for name in named if not _of_bags(labelled.names, [name]))
     skipped, filled = skipped_samples(labelled), filled_samples(labelled)
     return replace(trials, skipped=skipped, filled=filled, absent=absent)
 
@@ -252,20 +252,10 @@ def split(
 ) -> Trials:
     """The trials by name of their bag; DataError if a name is for two uses, or a part is empty."""
     chosen = _held_out(
-        dataset, {"test": test, "validation": validation, "calibration": calibration}
+        dataset.names, {"test": test, "validation": validation, "calibration": calibration}
     )
-    present = listed(dataset.names)
-    if not chosen["test"]:
-        raise DataError(
-            "none of the bags is a test trial, so no model can be scored; split.test names "
-            f"{', '.join(test) or 'nothing'}, the bags are {present}"
-        )
-    held_out = [name for names in chosen.values() for name in names]
-    if len(held_out) == len(dataset):
-        uses = [use for use, names in chosen.items() if names]
-        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     return Trials(
-        dataset.without(held_out),
+        dataset.without([name for names in chosen.values() for name in names]),
         dataset.select(chosen["test"]),
         _selected(dataset, chosen["validation"]),
         _selected(dataset, chosen["calibration"]),
@@ -280,11 +270,8 @@ def cut(
     calibration: Sequence[str] = (),
 ) -> Trials:
     """Test trials are the `share` at the end of every trial that is not named for another use."""
-    chosen = _held_out(dataset, {"validation": validation, "calibration": calibration})
+    chosen = _held_out(dataset.names, {"validation": validation, "calibration": calibration})
     held_out = [name for names in chosen.values() for name in names]
-    if len(held_out) == len(dataset):
-        uses = [use for use, names in chosen.items() if names]
-        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     parts: tuple[list[Trajectory], list[Trajectory]] = ([], [])
     for trial in dataset.without(held_out):
         count = round(share * len(trial.t))
@@ -303,17 +290,44 @@ def cut(
     )
 
 
-def _held_out(dataset: Dataset, named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """The trials of each use; DataError if a name is for two, or if nothing is for validation."""
-    for (use, names), (other, others) in combinations(named.items(), 2):
-        if twice := set(names) & set(others):
+def check_split(names: Sequence[str], config: Config) -> None:
+    """DataError if bags called so cannot be split as configured, which needs none to be read.
+
+    A bag may turn out to have gaps: its parts may be named.
+    """
+    split = config.split
+    named = {"validation": split.validation, "calibration": split.calibration}
+    if split.share is None:
+        named = {"test": split.test, **named}
+    wanted = {name for part in named.values() for name in part}
+    parts = sorted(name for name in wanted if name.rpartition(".")[0] in names)
+    _held_out([*names, *parts], named)
+
+
+def _held_out(trials: Sequence[str], named: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """The trials of each use, of those called so.
+
+    DataError if a name or a trial is for two, if none is for test or for a validation that names
+    some, or if none is left to train on.
+    """
+    chosen = {use: _of_bags(trials, names) for use, names in named.items()}
+    for use, other in combinations(named, 2):
+        twice = set(named[use]) & set(named[other]) or set(chosen[use]) & set(chosen[other])
+        if twice:
             raise DataError(f"split: '{min(twice)}' is named for {use} and for {other}")
-    chosen = {use: _of_bags(dataset, names) for use, names in named.items()}
+    if "test" in named and not chosen["test"]:
+        raise DataError(
+            "none of the bags is a test trial, so no model can be scored; split.test names "
+            f"{', '.join(named['test']) or 'nothing'}, the bags are {listed(trials)}"
+        )
     if named["validation"] and not chosen["validation"]:
         raise DataError(
             "none of the bags is a validation trial; split.validation names "
-            f"{', '.join(named['validation'])}, the bags are {', '.join(dataset.names)}"
+            f"{', '.join(named['validation'])}, the bags are {listed(trials)}"
         )
+    if sum(map(len, chosen.values())) == len(trials):
+        uses = [use for use, found in chosen.items() if found]
+        raise DataError(f"all of the bags are {' or '.join(uses)} trials; give some to train on")
     return chosen
 
 
@@ -321,7 +335,7 @@ def _selected(dataset: Dataset, names: Sequence[str]) -> Dataset | None:
     return dataset.select(names) if names else None
 
 
-def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
+def _of_bags(trials: Sequence[str], names: Sequence[str]) -> list[str]:
     """The trials of the bags called so; a bag with gaps has several, `bag.1`, `bag.2`, ...
 
     A name with `*` or `?` in it is a pattern.
@@ -331,7 +345,7 @@ def _of_bags(dataset: Dataset, names: Sequence[str]) -> list[str]:
     def called(name: str) -> bool:
         return name in names or any(fnmatchcase(name, pattern) for pattern in patterns)
 
-    return [name for name in dataset.names if called(name) or called(name.rpartition(".")[0])]
+    return [name for name in trials if called(name) or called(name.rpartition(".")[0])]
 
 
 def design_funnel_files(model_path: Path, config: Config, out: Path) -> OutputTubeDesign:

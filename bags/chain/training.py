@@ -52,8 +52,11 @@ def load_held_back(path: Path | str, *, model: str) -> dict[str, Dataset]:
     return decoded(path.read_bytes(), model=model, source=f"{path}: not trials held back")
 
 
-def encoded(parts: Mapping[str, Dataset], *, model: str = "") -> bytes:
-    """The .npz content of trials by what they are for, of the model with this digest if of one."""
+def encoded(parts: Mapping[str, Dataset], *, model: str = "", compressed: bool = True) -> bytes:
+    """The .npz content of trials by what they are for, of the model with this digest if of one.
+
+    Compressing some kilobytes takes three times as long as all the rest.
+    """
     arrays: dict[str, np.ndarray] = {}
     labels: list[dict[str, Any]] = []
     for use, dataset in parts.items():
@@ -64,7 +67,7 @@ def encoded(parts: Mapping[str, Dataset], *, model: str = "") -> bytes:
     document = json.dumps({"model": model, "trials": labels})
     arrays["labels"] = np.frombuffer(document.encode(), dtype=np.uint8)
     stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    (np.savez_compressed if compressed else np.savez)(stream, **arrays)  # type: ignore[arg-type]
     return stream.getvalue()
 
 

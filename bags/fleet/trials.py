@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from bags.chain.config import Config
-from bags.chain.steps import Trials, by_use, read_signals_of
+from bags.chain.steps import Trials, by_use, check_split, read_signals_of
 from bags.chain.training import decoded, encoded
 from bags.fleet.bags import Recordings, same_as
 from bags.fleet.manifest import Manifest
@@ -44,7 +44,8 @@ class ReadTrials:
 
     def __call__(self, bag: Path, name: str) -> bytes:
         """The trials, as `training.encoded` writes them."""
-        return encoded({"": read_signals_of([bag], self.config, names=[name])})
+        trials = read_signals_of([bag], self.config, names=[name])
+        return encoded({"": trials}, compressed=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,10 @@ def read_fleet(
     """`read_trials` of bags by name, by workers; what they read is kept in OUT/fleet.sqlite.
 
     A bag that cannot be read or used is left out, and so is a second copy of one recording; with
-    `strict` the first of them raises BagError.
+    `strict` the first of them raises BagError. DataError, before any is read, if their names leave
+    nothing to train on, or nothing for a use that the configuration names bags for.
     """
+    check_split(list(bags), config)
     with Manifest(out / MANIFEST) as manifest:
         given = ask(ReadTrials(config), bags, workers, manifest, strict=strict, progress=progress)
         found = usable_trials(given, config)

@@ -10,6 +10,7 @@ four-byte encapsulation header.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -90,6 +91,19 @@ class Layout(NamedTuple):
     whole: bool
 
 
+@lru_cache(maxsize=256)
+def _met(
+    msgtype: str,  # noqa: ARG001 - what it is kept for
+    types: Typestore,  # noqa: ARG001
+    targets: tuple[Target, ...],  # noqa: ARG001
+) -> list[Layout]:
+    """The layout that was met last for these targets, if any: bags of a fleet have the same.
+
+    Threads share it: take a copy, and replace what is in it at once.
+    """
+    return []
+
+
 class Gatherer:
     """Gathers the numbers at `targets` from messages of one type."""
 
@@ -98,7 +112,7 @@ class Gatherer:
         self.types = types
         self.targets = targets
         self._static: dict[str, bool] = {}
-        self._layout: Layout | None = None
+        self._met = _met(msgtype, types, tuple(targets))
 
     def gather(self, batch: Batch) -> FloatArray:
         """(targets, N) values of the batch's N messages.
@@ -106,17 +120,19 @@ class Gatherer:
         Raises UnreadableMessageError, with the message's place in the batch, if one is damaged.
         """
         values = np.empty((len(self.targets), len(batch)))
-        if self._layout is not None and _matches(self._layout, batch).all():
-            _take(self._layout, batch, values)
-            return values
+        for layout in self._met[:]:
+            if _matches(layout, batch).all():
+                _take(layout, batch, values)
+                return values
         rows = np.arange(len(batch))
         layouts = 0
         while len(rows):
             first = int(rows[0])
             try:
-                layout = self._layout = self.layout(batch.data(first))
+                layout = self.layout(batch.data(first))
             except BagError as error:
                 raise UnreadableMessageError(first, error) from error
+            self._met[:] = [layout]
             layouts += 1
             some = batch.select(rows if layouts <= MAX_LAYOUTS else rows[:1])
             same = np.zeros(len(rows), dtype=bool)

@@ -231,9 +231,9 @@ class RemotePath(PosixPath):
                 _whole(part, a, b, size) for part, a, b in zip(parts, starts, ends, strict=True)
             ]
 
-        for start, part in zip(starts, self._asked(ask), strict=True):
-            self.fetched += len(part)
-            self._hold(start, part)
+        parts = self._asked(ask)
+        self.fetched += sum(map(len, parts))
+        self._hold(zip(starts, parts, strict=True))
 
     def holds(self, start: int, end: int) -> bool:
         """Whether these bytes were fetched, and are held."""
@@ -272,14 +272,16 @@ class RemotePath(PosixPath):
         at = bisect_right(held, byte, key=lambda part: part[0]) - 1
         return held[at] if at >= 0 and byte < held[at][0] + len(held[at][1]) else None
 
-    def _hold(self, start: int, content: bytes) -> None:
-        """Keep a part in the place of those inside it; the oldest leave when there is too much."""
+    def _hold(self, parts: Iterable[tuple[int, bytes]]) -> None:
+        """Keep parts in the place of those inside them; the oldest leave when there is too much."""
         order: list[tuple[int, bytes]] = self.__dict__.setdefault("_order_held", [])
-        end = start + len(content)
-        order[:] = [p for p in order if p[0] < start or p[0] + len(p[1]) > end]
-        order.append((start, content))
-        while len(order) > 1 and sum(len(part) for _, part in order) > HELD_BYTES:
-            order.pop(0)
+        for start, content in parts:
+            end = start + len(content)
+            order[:] = [p for p in order if p[0] < start or p[0] + len(p[1]) > end]
+            order.append((start, content))
+        held = sum(len(content) for _, content in order)
+        while len(order) > 1 and held > HELD_BYTES:
+            held -= len(order.pop(0)[1])
         self.__dict__["_parts_held"] = sorted(order, key=lambda part: part[0])
 
     def _asked(self, ask: Callable[[float], T]) -> T:

@@ -41,6 +41,7 @@ from nlsid_core.running.grid import TOLERANCE as GRID_TOLERANCE
 
 PERIOD_TOLERANCE: Final = 0.05  # relative: a robot's rate and the one its configuration states
 FEW: Final = 0.01  # of the samples, left out at the ends: nobody needs to hear of it
+TOGETHER: Final = 64  # numbers that a sampler takes before it is asked for samples
 MIN_STRETCH: Final = 4  # samples between gaps; fewer say nothing of the dynamics
 REPEAT_GROUP: Final = "repeat_group"  # the custom datum that names the excitation a bag repeats
 
@@ -155,15 +156,19 @@ def _held_for(samples: Samples, gap_ns: int) -> str:
 def _sampled(sampler: Sampler, signals: Sequence[Samples]) -> Iterator[Sample]:
     """What the sampler gives for a whole recording, fed in the order of the stamps.
 
-    Of equal stamps the excitations come first, as the latest command at a stamp counts.
+    Of equal stamps the excitations come first, as the latest command at a stamp counts. On a grid
+    it is asked after every number: over a long gap the grid leaps as far as is known by then.
     """
     which = np.repeat(np.arange(len(signals)), [len(samples) for samples in signals])
     stamps = np.concatenate([samples.stamp_ns for samples in signals])
     values = np.concatenate([samples.values for samples in signals])
     order = np.lexsort((-which, stamps))
     columns = (which[order].tolist(), stamps[order].tolist(), values[order].tolist())
-    for k, stamp_ns, value in zip(*columns, strict=True):
-        yield from sampler.feed(k, stamp_ns, value)
+    for k, (signal, stamp_ns, value) in enumerate(zip(*columns, strict=True), start=1):
+        if sampler.on_grid or k % TOGETHER == 0:
+            yield from sampler.feed(signal, stamp_ns, value)
+        else:
+            sampler.add(signal, stamp_ns, value)
     yield from sampler.flush()
 
 

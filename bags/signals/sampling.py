@@ -190,7 +190,7 @@ class Sampler:
 
     def feed(self, k: int, stamp_ns: int, value: float) -> list[Sample]:
         """Take a number of signal k (as `numbers` counts), its operations done already."""
-        self._add(k, stamp_ns, value)
+        self.add(k, stamp_ns, value)
         return self._release(-math.inf)
 
     @property
@@ -219,7 +219,7 @@ class Sampler:
         if running.remembers and stamp_ns + self._kept[k].delay_ns <= self._kept[k].newest_ns:
             self._count_late(k, stamp_ns)
             return
-        self._add(k, stamp_ns, running.update(stamp_ns, value))
+        self.add(k, stamp_ns, running.update(stamp_ns, value))
 
     def _count_late(self, k: int, stamp_ns: int) -> None:
         if k >= len(self.responses):
@@ -229,7 +229,8 @@ class Sampler:
         else:
             self.late_responses += k == 0
 
-    def _add(self, k: int, stamp_ns: int, value: float) -> None:
+    def add(self, k: int, stamp_ns: int, value: float) -> None:
+        """What `feed` takes; the samples come with the next call that gives any."""
         kept = self._kept[k]
         stamp_ns += kept.delay_ns
         if k == 0 and not self.on_grid:

@@ -1,5 +1,7 @@
 """Fields gathered from serialised messages are those of a full decoder, bit for bit."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -117,6 +119,30 @@ def test_any_mixture_of_layouts_gives_what_the_decoder_gives(
         decoded = decode(data, "pkg/msg/Mixed", TYPES)
         expected = np.array([path.value(decoded) for path in paths])
         np.testing.assert_array_equal(found[:, column].view(np.uint64), expected.view(np.uint64))
+
+
+def test_threads_that_read_bags_of_other_layouts_do_not_disturb_each_other() -> None:
+    """As the workers of a Dask cluster do: what is known of a type is shared by its readers."""
+    kind = standard_types().types[JOINT_TYPE]
+    targets = [SignalPath.parse(f"/arm:{field}[0]").steps for field in ("position", "velocity")]
+
+    def recorded(name: str, value: float) -> Batch:
+        message = kind(header(1), [name], np.array([value]), np.array([-value]), np.zeros(0))
+        return batch_of([bytes(standard_types().serialize_cdr(message, JOINT_TYPE))] * 3)
+
+    def wrong(name: str, value: float) -> int:
+        batch, expected = recorded(name, value), [[value] * 3, [-value] * 3]
+        read = (Gatherer(JOINT_TYPE, standard_types(), targets).gather(batch) for _ in range(500))
+        return sum(found.tolist() != expected for found in read)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            counts = threads.map(wrong, ["a", "b" * 9, "c" * 21, "d" * 40], [1.0, 2.0, 3.0, 4.0])
+            assert list(counts) == [0, 0, 0, 0]
+    finally:
+        sys.setswitchinterval(before)
 
 
 def test_more_layouts_than_are_tried_at_once_still_read() -> None:

@@ -359,6 +359,10 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
         split(Dataset(tuple(trials)), test=["b"], validation=["c"], calibration=["c"])
     with pytest.raises(DataError, match="all of the bags are test or calibration"):
         split(Dataset(tuple(trials)), test=["b"], calibration=["a", "c"])
+    with pytest.raises(DataError, match=r"'a\.1' is named for test and for validation"):
+        split(Dataset(tuple(trials)), test=["a"], validation=["*1"])
+    with pytest.raises(DataError, match="'b' is named for test and for calibration"):
+        split(Dataset(tuple(trials)), test=["b"], calibration=["?"])
 
 
 # -- models without a proof ---------------------------------------------------------------------

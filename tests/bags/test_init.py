@@ -369,6 +369,7 @@ def thrusters(folder: Path, *, trials: int = 4) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_commands_that_have_ended_are_not_held(tmp_path: Path) -> None:
     """A base that stops by itself 0.5 s after the last command of a stream, at the bag's end."""
     bags, config = tmp_path / "bags", tmp_path / "robot.yaml"

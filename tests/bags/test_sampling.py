@@ -84,6 +84,38 @@ def fed(sampler: Sampler, events: Sequence[tuple[int, int, float]]) -> list[Samp
     return came(given + sampler.flush())
 
 
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("together", [5, 64])
+def test_numbers_taken_together_give_the_samples_of_numbers_taken_one_by_one(
+    seed: int, together: int
+) -> None:
+    """Recordings are read so: messages lost, stamps that repeat, NaN, delays and lags in them."""
+    rng, other = np.random.default_rng(seed), "/imu:angular_velocity.z"
+    driving = [f"{U}|hold(0.12 s)", f"{U}|delay(0.03 s)|lag(0.1 s)"]
+    one, many = (Sampler([Y, other], driving, period=0.05) for _ in range(2))
+    events = []
+    for k, (every, scatter) in enumerate([(50, 2), (50, 1), (70, 30), (40, 20)]):
+        stamps = every * np.arange(200) + rng.integers(-scatter, scatter + 1, 200)
+        kept = rng.random(200) > (0.0, 0.1, 0.2, 0.2)[k]
+        values = np.where(rng.random(200) < 0.02, np.nan, rng.standard_normal(200))
+        pairs = zip(stamps[kept].tolist(), values[kept].tolist(), strict=True)
+        events += [(t * MS, -k, value) for t, value in pairs]
+    given: list[Sample] = []
+    alone: list[Sample] = []
+    for count, (at, k, value) in enumerate(sorted(events, key=lambda e: e[:2]), start=1):
+        alone += one.feed(-k, at, value)
+        if count % together:
+            many.add(-k, at, value)
+        else:
+            given += many.feed(-k, at, value)
+    given += many.flush()
+    assert repr(given) == repr(alone + one.flush())
+    assert len(given) > 150
+    assert sum(not sample.missing for sample in given) > 50
+    for count_of in ("incomplete", "late", "late_responses", "duplicate_responses"):
+        assert getattr(many, count_of) == getattr(one, count_of)
+
+
 def came(samples: Sequence[Sample]) -> list[Sample]:
     """Those of which a message came."""
     return [sample for sample in samples if sample.missing != LOST]

@@ -265,6 +265,7 @@ def page(tmp_path: Path) -> Iterator[Page]:
     shutil.rmtree(tmp_path / "profile", ignore_errors=True)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_a_browser_shows_the_words_and_takes_inside_back(page: Page, watched: Scene) -> None:
     going = threading.Event()

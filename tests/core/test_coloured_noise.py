@@ -90,6 +90,7 @@ def test_the_robust_error_with_a_noise_is_least_squares_of_the_whitened_simulati
     np.testing.assert_allclose(np.r_[found.a, found.b, found.c], wanted, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_both_classes_fit_the_same_with_validation_trials_and_with_some_held_out() -> None:
     runs = [recorded(seed, pole=0.95, name=f"run {seed}") for seed in range(3)]
     train, validation = Dataset(tuple(runs[:2])), Dataset((runs[2],))

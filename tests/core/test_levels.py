@@ -12,6 +12,7 @@ from nlsid_core.funnels.level import CHANGE, VALUE, CommandLevel, LevelMeter, Te
 from nlsid_core.running.monitor import Monitor
 from nlsid_core.running.reading import Status
 from tests.core.kernel.tube_claims import MODELS, dataset, design
+from tests.marks import slow_among
 
 TERMS = (
     Term(()),
@@ -114,7 +115,7 @@ def test_the_next_trial_exceeds_the_largest_as_rarely_as_the_rank_bound_says(mov
     assert exceeded <= count / 10 + 3 * np.sqrt(count * 0.1 * 0.9)
 
 
-@pytest.mark.parametrize("name", ["following", "two_following"])
+@pytest.mark.parametrize("name", slow_among(["following", "two_following"], {"two_following"}))
 def test_an_assumption_that_follows_is_kept_by_the_calibration_trials_and_broken_by_more(
     name: str,
 ) -> None:

@@ -95,7 +95,7 @@ def test_the_monitor_says_what_the_trials_energy_and_simulation_say(name: str) -
         assert (deviation <= widths).all() or r.status is not Status.INSIDE
 
 
-@pytest.mark.parametrize("name", ["linear", "two_following"])
+@pytest.mark.parametrize("name", slow_among(["linear", "two_following"], {"two_following"}))
 def test_one_large_innovation_is_named_though_its_energy_is_not_above_the_level(name: str) -> None:
     made, trial = design(name), trial_of(name)
     tube, k = made.funnel.tubes[0], made.funnel.settling + 40

@@ -93,6 +93,7 @@ def test_an_airplane_in_half_a_metre_per_second_of_wind_is_proved_at_the_first_t
     assert found.funnel.widths(0.0)[0] > 0.1
 
 
+@pytest.mark.slow
 def test_factors_are_as_near_as_the_scale_that_they_are_written_in_needs() -> None:
     def double(x: Any, u: Any, w: Any) -> Any:
         return [x[1], u[0] + w[0]]

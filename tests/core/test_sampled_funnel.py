@@ -27,7 +27,9 @@ from tests.tracked import (
 )
 
 
-@pytest.mark.parametrize("form", ["response", "peak", "energy", "fading"])
+@pytest.mark.parametrize(
+    "form", slow_among(["response", "peak", "energy", "fading"], {"energy", "fading"})
+)
 def test_a_funnel_of_a_nonlinear_model_is_proved_exactly(form: str, tmp_path: Path) -> None:
     verdict = check(write(designed(form), tmp_path))
     assert verdict.margin > 0

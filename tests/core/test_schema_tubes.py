@@ -10,12 +10,16 @@ from nlsid_core.arrays import Json
 from nlsid_core.designs import FUNNEL, PROOF
 from tests.core.kernel.falsification_claims import claim
 from tests.core.kernel.tube_claims import design
+from tests.marks import slow_among
 
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs" / "schema"
 FILES = {FUNNEL: "funnel_tube", PROOF: "proof_output_tube"}
 
 
-@pytest.mark.parametrize("name", ["linear", "split", "implicit_box", "two_following"])
+@pytest.mark.parametrize(
+    "name",
+    slow_among(("linear", "split", "implicit_box", "two_following"), {"split", "two_following"}),
+)
 @pytest.mark.parametrize(("file", "schema"), FILES.items())
 def test_every_written_document_validates_and_a_damaged_one_does_not(
     name: str, file: str, schema: str

@@ -64,6 +64,7 @@ def test_a_benchmark_that_takes_too_long_is_ended_with_what_it_started(tmp_path:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_processes_of_a_benchmark_end_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

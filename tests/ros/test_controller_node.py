@@ -97,7 +97,7 @@ class Stage:
 def stage(funnel: Path) -> Iterator[Callable[..., Stage]]:
     """Sets a stage with parameters of the controller."""
     with ExitStack() as stack:
-        yield partial(Stage, stack, funnel)
+        yield partial(Stage, stack, funnel=funnel)
 
 
 def test_commands_come_at_the_models_rate_and_the_start_is_announced_latched(
@@ -154,16 +154,21 @@ def test_the_same_design_again_in_mid_run_does_not_stop_it(
     assert not robot.has_said("stop")
 
 
-def test_another_design_in_mid_run_stops_it(stage: Callable[..., Stage], tmp_path: Path) -> None:
+def test_another_design_in_mid_run_stops_it(
+    stage: Callable[..., Stage], funnel: Path, tmp_path: Path
+) -> None:
+    """A run of half a minute: publisher and controller each have the other design decided first."""
     used, other = tmp_path / "used", tmp_path / "other"
-    used.mkdir()
-    robot = stage(folder=used)
-    shutil.copytree(used, other)
     config = load_config(config_file("f1tenth.yaml"))
     assert config.funnel is not None
-    wider = config.funnel.model_copy(update={"safety_factor": 2.0})
-    wide = config.model_copy(update={"funnel": wider})
-    design_funnel_files(other / documents.MODEL, wide, other)  # a run would not outlast it
+    assert config.funnel.profile is not None
+    long = [*config.funnel.profile[:-1], (30.0, config.funnel.profile[-1][1])]
+    for folder, safety in ((used, 1.5), (other, 2.0)):
+        shutil.copytree(funnel.parent, folder)
+        changed = {"profile": long, "horizon": None, "safety_factor": safety}
+        settings = config.model_copy(update={"funnel": config.funnel.model_copy(update=changed)})
+        design_funnel_files(folder / documents.MODEL, settings, folder)
+    robot = stage(funnel=used / documents.FUNNEL)
     robot.track()
     for name in (documents.POLICY, documents.FUNNEL, documents.FUNNEL_PROOF):
         shutil.copyfile(other / name, used / name)

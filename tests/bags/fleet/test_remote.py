@@ -160,6 +160,7 @@ def test_an_error_tells_no_secret_of_a_redirection_or_of_the_environment(
         assert secret not in str(refusal.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["http", "s3"])
 def test_a_server_that_never_answers_is_given_up_after_the_patience(
     protocol: str, monkeypatch: pytest.MonkeyPatch
@@ -329,7 +330,7 @@ def test_damage_anywhere_is_an_error_that_names_the_file(
         read_signals(url, WANTED)
 
 
-@pytest.mark.parametrize("changes", [50, pytest.param(500, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("changes", [20, pytest.param(500, marks=pytest.mark.slow)])
 def test_any_changed_byte_gives_the_same_signals_or_an_error(tmp_path: Path, changes: int) -> None:
     """Untrusted files: nothing but a BagError, and no other numbers from a compressed one."""
     content = drive(tmp_path / "d.mcap", compression=CompressionType.LZ4, samples=30).read_bytes()

@@ -36,13 +36,13 @@ class P:
     def __add__(self, other: "P | Fraction | int") -> "P":
         total = dict(self.terms)
         for k, v in self.lifted(other).terms.items():
-            total[k] = total.get(k, Fraction(0)) + v
+            total[k] = total[k] + v if k in total else v
         return P(self.n, total)
 
     __radd__ = __add__
 
     def __sub__(self, other: "P | Fraction | int") -> "P":
-        return self + self.lifted(other) * Fraction(-1)
+        return self + P(self.n, {k: -v for k, v in self.lifted(other).terms.items()})
 
     def __rsub__(self, other: "P | Fraction | int") -> "P":
         return self.lifted(other) - self
@@ -54,7 +54,7 @@ class P:
         for a, x in self.terms.items():
             for b, y in other.terms.items():
                 k = tuple(i + j for i, j in zip(a, b, strict=True))
-                total[k] = total.get(k, Fraction(0)) + x * y
+                total[k] = total[k] + x * y if k in total else x * y
         return P(self.n, total)
 
     __rmul__ = __mul__
@@ -63,8 +63,8 @@ class P:
         return self * (Fraction(1) / other)
 
     def __pow__(self, power: int) -> "P":
-        total = P.constant(self.n, 1)
-        for _ in range(power):
+        total = self if power else P.constant(self.n, 1)
+        for _ in range(power - 1):
             total = total * self
         return total
 
