@@ -240,7 +240,9 @@ def _name(text: str) -> str:
     words = " ".join(steps[-2:])
     words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
     rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
-    return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
+    # a proof's sentence has the name alone: the position itself does not keep to its half-width
+    washed_out = " washed out" if any(op.startswith("washout") for op in operations) else ""
+    return f"{topic.strip('/').replace('/', ' ')} {words}{rate}{washed_out}".strip()
 
 
 def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], found: Found) -> None:

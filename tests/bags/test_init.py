@@ -277,15 +277,16 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
 ) -> None:
     config = tmp_path / "robot.yaml"
     slope = "|derivative(0.15 s)"  # not the window that is proposed
-    responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}"]
+    moved = "|washout(2 s)"  # in m, but not the position: the name says so
+    responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}", f"{POSITION}{moved}"]
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
     named += [argument for u in excitations for argument in ("-u", u)]
     nlsid("init", *f1tenth()[:4], "--out", config, *named)
     signals = load_config(config).signals
-    assert [signal.unit for signal in signals.response] == ["m/s", "cm/s"]
+    assert [signal.unit for signal in signals.response] == ["m/s", "cm/s", "m"]
     assert [signal.name for signal in signals.response] == [
-        "odom position x rate", "odom position x rate 2",
+        "odom position x rate", "odom position x rate 2", "odom position x washed out",
     ]  # fmt: skip
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
