@@ -726,3 +726,12 @@ def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None
     nlsid("init", bags, "--out", config, *SLOW)
     split = load_config(config).split
     assert (split.calibration, split.test) == (("run_04", "run_05"), ("run_08", "run_09"))
+
+
+def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path) -> None:
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", *f1tenth()[:6], "--yes", "--out", config, "-u", CMD, "-y", SPEED)
+    [reason] = re.findall(r"identification will refuse \((.*?)\); a response", said)
+    assert "rank 1" in reason
+    refused = nlsid("identify", *f1tenth()[:6], "--config", config, "--out", tmp_path, status=None)
+    assert reason in refused
