@@ -100,6 +100,8 @@ def write_atomically(path: Path | str, content: bytes) -> None:
 
 def member(document: Json, key: str, kind: type | tuple[type, ...], *, source: str) -> Any:
     """`document[key]`, checked to be of `kind`; DocumentError names what is missing or wrong."""
+    if not isinstance(document, dict):
+        raise DocumentError(f"{source}: should be an object, is {type(document).__name__}")
     if key not in document:
         raise DocumentError(f"{source}: '{key}' is missing; it has: {', '.join(document)}")
     value = document[key]

@@ -1,5 +1,7 @@
 """How an option of a frozen dataclass is checked when it is made: `OptionError` or nothing."""
 
+from numbers import Real
+
 from nlsid_core.errors import OptionError
 
 
@@ -41,12 +43,17 @@ def require_weights(owner: object, key: str) -> None:
 def require_positive(owner: object, key: str) -> None:
     """OptionError unless the option is a finite number above 0."""
     value = getattr(owner, key)
-    if not 0.0 < value < float("inf"):
+    if not is_number(value) or not 0.0 < value < float("inf"):
         raise OptionError(key, value, "a finite number above 0")
 
 
 def require_at_least(owner: object, key: str, least: float) -> None:
     """OptionError unless the option is a finite number that is not below `least`."""
     value = getattr(owner, key)
-    if not least <= value < float("inf"):
+    if not is_number(value) or not least <= value < float("inf"):
         raise OptionError(key, value, f"a finite number, at least {least:g}")
+
+
+def is_number(value: object) -> bool:
+    """Whether it is one real number, of Python or of NumPy; True and False are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)

@@ -136,7 +136,7 @@ def gain(
     from bags.chain.gains import gain_of
     from bags.commands import show
 
-    scales = dict(show.named_number(given) for given in scale or [])
+    scales = show.named_numbers(scale or [], "--scale")
     kind: Literal["gain", "passivity"] = "passivity" if passivity else "gain"
     found = gain_of(model, kind=kind, discount=discount, scales=scales)
     if found is None:

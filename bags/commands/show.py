@@ -1,7 +1,7 @@
 """What the commands of the chain print."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fractions import Fraction
 
 from rich.box import SIMPLE_HEAD
@@ -160,6 +160,16 @@ def named_number(given: str) -> tuple[str, float]:
     if not (found and name) or not math.isfinite(number):
         raise DataError(f"'{given}' should be NAME=VALUE, as speed=0.5")
     return name, number
+
+
+def named_numbers(given: Iterable[str], option: str) -> dict[str, float]:
+    """`named_number` of each; DataError where a name comes twice."""
+    found: dict[str, float] = {}
+    for name, number in map(named_number, given):
+        if name in found:
+            raise DataError(f"{option} {name} is given twice")
+        found[name] = number
+    return found
 
 
 def selection_table(selection: Selection[Model]) -> Table:

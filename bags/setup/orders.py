@@ -31,35 +31,42 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     alone = len(held_back) == len(names)
     fitted = train if alone else train.without(held_back)
     errors: dict[int, float] = {}
+    refused: dict[int, str] = {}
     for lags in LAGS:
         try:
             fit = identify(
                 fitted, LinearClass(lags), method=Rse(iterations=TRIED_ITERATIONS),
                 comparators=(), test=train.select(held_back),
             )  # fmt: skip
-        except NlsidError:  # too few samples for so many, or no proof
+        except NlsidError as error:  # too few samples for so many, or no proof
+            refused.setdefault(lags, str(error))
             continue
         errors[lags] = float(fit.errors["test"]["rse"])
     known = {lags: error for lags, error in errors.items() if math.isfinite(error)}
+    best = min(known.values(), default=math.inf)
     section = proposal.content["identification"]
-    if not known:
+    good = min((lags for lags, error in known.items() if error * LAGS_BETTER <= best), default=0)
+    others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
+    for lags in (good, *others) if known else ():
+        try:
+            identify(train, LinearClass(lags), comparators=())
+        except NlsidError as error:  # more data and iterations may end without a proof: the next
+            refused.setdefault(lags, str(error))
+        else:
+            section["lags"] = lags
+            break
+    else:
         proposal.why["lags"] = "a first guess"
         window = slope_window(1.0 / proposal.content["grid"]["period"])
         proposal.walls.append(
-            "no number of lags gave a model that is proved stable: identification will refuse; a "
-            f"response that adds up its command for ever needs |derivative({window:g} s), or "
-            "|washout(2 s), the time over which its way should be told"
+            "no number of lags gave a model that is proved stable: identification will refuse "
+            f"({refused[section['lags']]}); a response that adds up its command for ever needs "
+            f"|derivative({window:g} s), or |washout(2 s), the time over which its way should be "
+            "told"
         )
         return
-    best = proposal.error = min(known.values())
+    proposal.error = best
     proposal.varies = _varies(train.select(held_back))
-    good = min(lags for lags, error in known.items() if error * LAGS_BETTER <= best)
-    others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
-    for lags in (good, *others):
-        section["lags"] = lags
-        with suppress(NlsidError):  # more data and iterations may end without a proof: the next
-            identify(train, LinearClass(lags), comparators=())
-            break
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on
     proposal.why["lags"] = f"proved models simulated on {proposal.tried_on} are off by {said}"

@@ -20,7 +20,7 @@ from bags.setup.candidates import Found, slope_window
 from bags.setup.curved import say_class
 from bags.setup.grid import read_paces, say_grid
 from bags.setup.orders import followed, say_degree, say_lags
-from bags.setup.proposal import POOR, Proposal, Signal
+from bags.setup.proposal import GRADES, POOR, Proposal, Signal
 from bags.signals.columns import read_columns
 from bags.signals.delays import RELATED
 from bags.signals.expressions import Expression, factors, parse_factors
@@ -34,6 +34,7 @@ TEST_EVERY: Final = 5  # bags: every fifth only scores
 SHARE: Final = 0.25  # of every bag that only scores where there are few
 SAFETY: Final = 1.5  # on the disturbance's amplitude, the funnel's own default
 SIMULATED: Final = "/clock"
+WASHOUT: Final = 2.0  # s
 ONE_PACE: Final = 0.02  # relative: simulators keep real time no better
 
 
@@ -121,6 +122,15 @@ def propose(
         trials = _tried(proposal, bags, definitions)
     if linear:
         say_lags(proposal, trials.train)
+        if _may_add_up(proposal, found):
+            moved = propose(
+                bags, found, responses=[f"{responses[0]}|washout({WASHOUT:g} s)"],
+                excitations=excitations, robot=robot, definitions=definitions, types=types,
+            )  # fmt: skip
+            if moved.error <= proposal.error / 2.0:
+                _say_washed_out(moved, proposal.error)
+                moved.walls += _beside(moved, found) if alone else []
+                return moved
     else:
         say_degree(proposal, trials.train)
     _say_funnel(proposal)
@@ -141,6 +151,30 @@ def propose(
         _say_poor(proposal, found)
     proposal.walls += _beside(proposal, found) if alone else []
     return proposal
+
+
+def _may_add_up(proposal: Proposal, found: Found) -> bool:
+    """Whether the response is a position, of which no model is good."""
+    text = proposal.content["signals"]["response"][0]["path"]
+    position = any(c.is_position for c in found.candidates if c.text == text)
+    return position and "|washout" not in text and proposal.error > GRADES[0][0]
+
+
+def _say_washed_out(proposal: Proposal, error: float) -> None:
+    """Why the response is not taken as it is: the error of its own models."""
+    text = proposal.content["signals"]["response"][0]["path"]
+    tried = (
+        f"models of it are off by {error:.3g} %"
+        if math.isfinite(error)
+        else "no number of lags gave a model of it that is proved stable"
+    )
+    whole = text.rpartition("|")[0]
+    proposal.why[text] += f"; what {whole} moved in the last {WASHOUT:g} s or so: {tried}"
+    proposal.walls.append(
+        f"{whole} seems to add up its command, so |washout({WASHOUT:g} s) of it is proposed: the "
+        f"tube is of what it moved of late, and after {WASHOUT:g} s a third is left of an error "
+        "that does not grow; another time may suit better"
+    )
 
 
 def _beside(proposal: Proposal, found: Found) -> list[str]:
@@ -239,8 +273,11 @@ def _name(text: str) -> str:
     ]
     words = " ".join(steps[-2:])
     words = words.replace("[", " ").replace("]", "").replace("name=", "").replace("=", " ")
-    rate = " rate" if any(op.startswith("derivative") for op in operations) else ""
-    return f"{topic.strip('/').replace('/', ' ')} {words}{rate}".strip()
+    done = {"derivative": " rate", "washout": " washed out"}
+    after = "".join(
+        word for name, word in done.items() if any(op.startswith(name) for op in operations)
+    )
+    return f"{topic.strip('/').replace('/', ' ')} {words}{after}".strip()
 
 
 def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], found: Found) -> None:
@@ -261,7 +298,8 @@ def _say_signals(proposal: Proposal, chosen: Mapping[str, Sequence[Signal]], fou
                 proposal.walls.append(
                     f"{y.path} hardly follows {best.command.text} ({best}); is it the right one?"
                 )
-            if best.response.is_position and not best.command.is_position:
+            washed = "|washout" in y.path
+            if best.response.is_position and not best.command.is_position and not washed:
                 proposal.walls.append(
                     f"{y.path} is a position: if it adds up its command for ever, it is in no "
                     f"model class; take |derivative({slope_window(best.response.rate):g} s) of it"

@@ -47,6 +47,7 @@ SAMPLING: Final = ("clock", "hold", "linear", "delay", "lag")
 DRIVING: Final = ("delay", "lag")  # of what drives only
 SIGNAL_CLOCKS: Final = ("header", "log")
 TURNS: Final = {"deg": 360.0, "rev": 1.0}  # a whole turn by the number's unit; others are rad
+LONGEST: Final = 1e6  # s, of a time behind a path
 MIN_SAMPLES: Final = 3  # two give a slope without any smoothing
 BLOCK: Final = 2**20  # samples of neighbourhoods laid side by side at once
 
@@ -65,7 +66,8 @@ class Operation:
     window: float = 0.0
 
     def __str__(self) -> str:
-        argument = self.unit or (f"{self.window:g} s" if self.window else "")
+        seconds = repr(self.window).removesuffix(".0")
+        argument = self.unit or (f"{seconds} s" if self.window else "")
         return f"{self.name}({argument})" if argument else self.name
 
 
@@ -129,9 +131,14 @@ class Expression:
 
     @property
     def washed_out(self) -> float | None:
-        """T in s if each sample is a message with `washout(T s)` as its last step but units."""
+        """T in s if each sample is a message and what it recorded washed out by `washout(T s)`.
+
+        None where more was done to the number than units and `unwrap` before the washout: what a
+        slope, or a signal that was washed out already, moved is no displacement.
+        """
         steps = [found for found in self.operations if found.name not in ("unit", "to", "clock")]
-        return steps[-1].window if steps and steps[-1].name == "washout" else None
+        names = [found.name for found in steps if found.name != "unwrap"]
+        return steps[-1].window if names == ["washout"] == [steps[-1].name] else None
 
     def unit(self, msgtype: str, types: Typestore) -> str:
         """The unit of the result ("" if nothing implies one); BagError if one cannot be converted.
@@ -388,9 +395,11 @@ def _operation(part: str, text: str) -> Operation:
         return Operation(name, unit=argument)
     if name in TIMED:
         seconds = _SECONDS.fullmatch(argument)
-        window = float(seconds[1]) * UNITS[seconds[2]].scale if seconds else 0.0
-        if not 0.0 < window < 1e6:
+        if seconds is None:
             raise BagError(f"'{part}' in '{text}': state a time, e.g. {name}(0.2 s)")
+        window = float(seconds[1]) * UNITS[seconds[2]].scale
+        if not 0.0 < window < LONGEST:
+            raise BagError(f"'{part}' in '{text}': the time should be above 0 and below 1e6 s")
         return Operation(name, window=window)
     if name == "to" and argument not in UNITS:
         near = did_you_mean(argument, UNITS)

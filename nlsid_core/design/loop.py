@@ -14,6 +14,7 @@ from nlsid_core.kernel import Verdict
 
 LOOP = "small_gain.proof.json"
 KIND = "dissipation"
+TOO_LARGE = "the product of the gains is not below 1"  # the kernel's last reason to refuse
 
 
 def is_gain(path: Path | str) -> bool:
@@ -40,32 +41,37 @@ def compose_loop(paths: Sequence[Path | str], folder: Path | str) -> tuple[Path,
         if not is_gain(path):
             raise CertificateRejected(f"{path} is no proof of a gain")
         document = files.load_document(path)
-        supply = document["claim"].get("supply")
+        claim = document["claim"]
+        supply = claim.get("supply")
         kind = supply.get("kind") if isinstance(supply, dict) else None
         if kind != "gain":
             raise CertificateRejected(
                 f"{path} proves {kind or 'something else'}, not a gain: a loop is proved by two "
                 "gains, which `nlsid gain` finds without --passivity"
             )
-        binding = files.member(document["claim"]["about"], "model", dict, source=str(path))
+        given = files.member(claim, "about", dict, source=str(path))
+        binding = files.member(given, "model", dict, source=str(path))
         name = files.member(binding, "file", str, source=str(path))
         beside = path.parent / name
         if beside.name != name or not beside.is_file():
             raise CertificateMismatch(f"{path}: the model file {name!r} is not beside it")
         own = {"model": binding | {"file": f"{role}.model.json"}}
-        document = document | {"claim": document["claim"] | {"about": own}}
+        document = document | {"claim": claim | {"about": own}}
         proof = files.encode(document)
         contents |= {f"{role}.model.json": beside.read_bytes(), f"{role}.proof.json": proof}
         about[role] = {"file": f"{role}.proof.json", "digest": files.digest(proof)}
-        numbers.append(supply.get("number", 0.0))
-    one, two = numbers
-    if one * two >= 1.0:
+        numbers.append(files.number(supply, "number", source=f"{path} supply"))
+    loop = proofs.proof_document({"kind": "small_gain", "about": about}, {})
+    try:
+        verdict = proofs.decide(loop, contents)
+    except CertificateRejected as refusal:
+        if str(refusal) != TOO_LARGE:
+            raise
+        one, two = numbers
         raise Infeasible(
             f"the gains {one:.4g} and {two:.4g} have the product {one * two:.4g}; only a product "
             "below 1 proves the loop"
-        )
-    claim = proofs.proof_document({"kind": "small_gain", "about": about}, {})
-    verdict = proofs.decide(claim, contents)
+        ) from refusal
     write_beside(Path(folder), contents, [Path(path) for path in paths])
-    files.write_document(Path(folder) / LOOP, claim)
+    files.write_document(Path(folder) / LOOP, loop)
     return Path(folder) / LOOP, verdict

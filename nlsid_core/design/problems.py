@@ -116,8 +116,8 @@ class ContinuousTracking:
     assumed to act continuously). K is then linear between knots. error: (n,)
     bounds of how much each state is measured wrong (None: not at all).
 
-    decay: 1/s, λ of a claim that every solution comes nearer: V̇ ≤ λ(σ - V) wherever σ ≤ V ≤ 1, for
-    the least floor σ that is found; V is 1 on the funnel's boundary (None: only that it stays).
+    decay: 1/s, λ of a claim that V falls: V̇ ≤ λ(σ - V) wherever σ ≤ V ≤ 1, for the least floor σ
+    that is found; V is 1 on the funnel's boundary of that time (None: only that V stays below 1).
 
     shape "rho": P(t) stays and ρ(t) is swept backward. shape "P": P(t) itself is searched from
     there, for objective "volume" or for "reference", the thesis's. Source: thesis Chapters 5, 6.
@@ -145,6 +145,7 @@ class ContinuousTracking:
         require_one_of(self, "shape", get_args(Shape))
         require_one_of(self, "objective", get_args(Objective))
         require_one_of(self, "gain", GAINS)
+        require_one_of(self, "search_gain", (False, True))
 
 
 Problem = OutputTube | SampledTracking | ContinuousTracking

@@ -91,6 +91,14 @@ def test_operations_that_are_none_are_refused(text: str) -> None:
         Expression.parse(text)
 
 
+def test_a_time_out_of_range_is_not_said_to_be_missing() -> None:
+    for text in ("washout(0 s)", "washout(1e6 s)", "derivative(1000000 s)"):
+        with pytest.raises(BagError, match="should be above 0 and below 1e6 s"):
+            Expression.parse(f"/a:b|{text}")
+    with pytest.raises(BagError, match="state a time"):
+        Expression.parse("/a:b|washout(5)")
+
+
 def test_a_washed_out_signal_is_the_sum_of_its_steps_each_faded_and_gives_the_signal_back() -> None:
     rng = np.random.default_rng(4)
     stamps = np.cumsum(rng.integers(5_000_000, 200_000_000, 120))
@@ -120,7 +128,10 @@ def test_a_washout_bridges_what_is_no_number_and_refuses_stamps_that_go_back() -
         ("/a:b|washout(2 s)", 2.0),
         ("/a:b|unit(deg)|unwrap|washout(500 ms)|to(rad)|clock(log)", 0.5),
         ("/a:b|washout(2 s)|linear(0.1 s)", None),  # messages between two samples are not judged
+        ("/a:b|linear(0.1 s)|washout(2 s)", None),
         ("/a:b|washout(2 s)|derivative(1 s)", None),
+        ("/a:b|derivative(1 s)|washout(2 s)", None),  # what a slope moved is no displacement
+        ("/a:b|washout(2 s)|washout(1 s)", None),
         ("/a:b|derivative(1 s)", None),
         ("/a:b", None),
     ],
@@ -134,6 +145,7 @@ def test_only_samples_that_are_washed_out_messages_tell_a_displacement(
 def test_an_expression_prints_as_it_is_written() -> None:
     for text in (
         "/arm:position[0]|washout(2 s)",
+        "/arm:position[0]|washout(1.23456789 s)",  # all digits: a model keeps its signals as text
         "/arm:position[0]|unit(rad)|to(deg)|derivative(0.2 s)",
         f"{ODOM_YAW}|unwrap",
     ):

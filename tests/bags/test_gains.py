@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from bags.chain.gains import Gain
 from bags.commands.cli import app
 from bags.commands.show import gain_lines, named_number
 from nlsid_core import files
-from nlsid_core.errors import CertificateRejected, DataError, Infeasible
+from nlsid_core.arrays import Json
+from nlsid_core.errors import CertificateRejected, DataError, Infeasible, NlsidError
 from nlsid_core.identification import prove_gain
 from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal
@@ -104,6 +106,8 @@ def test_scales_of_unknown_signals_or_of_no_size_are_refused(tmp_path: Path) -> 
     assert "no signal is called sped; the model has speed, command" in str(result.exception)
     result = RUN.invoke(app, ["gain", str(model), "--scale", "speed=0"])
     assert "all positive" in str(result.exception)
+    result = RUN.invoke(app, ["gain", str(model), "--scale", "speed=2", "--scale", "speed=3"])
+    assert "--scale speed is given twice" in str(result.exception)
     result = RUN.invoke(app, ["gain", str(model), "--discount", "1.5"])
     assert "discount should satisfy" in str(result.exception)
 
@@ -171,6 +175,12 @@ def test_a_loop_that_is_not_small_or_does_not_fit_is_refused(tmp_path: Path) -> 
     fits = RUN.invoke(app, ["compose", paths["car"], paths["same"], *out])
     assert isinstance(fits.exception, CertificateRejected)
     assert "the units differ" in str(fits.exception)
+    # other scales make other numbers: their product says nothing
+    again = RUN.invoke(app, ["gain", str(tmp_path / "car.json"), "--scale", "speed=0.01"])
+    assert again.exit_code == 0
+    scaled = RUN.invoke(app, ["compose", paths["car"], paths["loud"], *out])
+    assert isinstance(scaled.exception, CertificateRejected)
+    assert "the scales differ" in str(scaled.exception)
     passive = written(tmp_path, feedthrough(), "passive")
     assert RUN.invoke(app, ["gain", str(passive), "--passivity"]).exit_code == 0
     proof = str(tmp_path / "passive.passivity.proof.json")
@@ -180,3 +190,28 @@ def test_a_loop_that_is_not_small_or_does_not_fit_is_refused(tmp_path: Path) -> 
     alone = RUN.invoke(app, ["compose", paths["car"], *out])
     assert "a loop is of two proved gains" in str(alone.exception)
     assert not (tmp_path / "loop").exists()
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        lambda claim: claim["supply"].update(number="0.5"),
+        lambda claim: claim["supply"].update(number=[1.0]),
+        lambda claim: claim.pop("about"),
+        lambda claim: claim.update(about=None),
+        lambda claim: claim.update(about={"model": None}),
+    ],
+)
+def test_a_loop_of_a_damaged_proof_is_refused_with_words(
+    tmp_path: Path, broken: Callable[[Json], object]
+) -> None:
+    path = written(tmp_path, linear(), "car")
+    assert RUN.invoke(app, ["gain", str(path)]).exit_code == 0
+    proof = tmp_path / "car.gain.proof.json"
+    document = files.load_document(proof)
+    broken(document["claim"])
+    files.write_document(proof, document)
+    out = str(tmp_path / "loop")
+    result = RUN.invoke(app, ["compose", str(proof), str(proof), "--out", out])
+    assert isinstance(result.exception, NlsidError)
+    assert str(proof) in str(result.exception)

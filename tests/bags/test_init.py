@@ -277,15 +277,16 @@ def test_a_signal_that_is_named_with_operations_has_the_unit_of_their_result(
 ) -> None:
     config = tmp_path / "robot.yaml"
     slope = "|derivative(0.15 s)"  # not the window that is proposed
-    responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}"]
+    moved = "|washout(2 s)"  # in m, but not the position: the name says so
+    responses = [f"{POSITION}{slope}", f"{POSITION}|unit(cm){slope}", f"{POSITION}{moved}"]
     excitations = [CMD, f"{CMD} * {POSITION}{slope}"]
     named = [argument for y in responses for argument in ("-y", y)]
     named += [argument for u in excitations for argument in ("-u", u)]
     nlsid("init", *f1tenth()[:4], "--out", config, *named)
     signals = load_config(config).signals
-    assert [signal.unit for signal in signals.response] == ["m/s", "cm/s"]
+    assert [signal.unit for signal in signals.response] == ["m/s", "cm/s", "m"]
     assert [signal.name for signal in signals.response] == [
-        "odom position x rate", "odom position x rate 2",
+        "odom position x rate", "odom position x rate 2", "odom position x washed out",
     ]  # fmt: skip
     assert [signal.unit for signal in signals.excitation] == ["m/s", ""]
     assert signals.excitation[1].name == "cmd_vel linear x times odom position x rate"
@@ -347,6 +348,44 @@ def test_several_signals_of_one_topic_go_the_whole_way(tmp_path: Path) -> None:
     )
     assert len(load_config(config).signals.response) == 2
     assert whole_way(folder, config, tmp_path / "out").count("inside") >= 6
+
+
+@pytest.mark.slow
+def test_a_position_that_adds_up_its_command_is_washed_out(tmp_path: Path) -> None:
+    """A cart with friction under a force: no stable model has its position, one has its way."""
+    bags, config, position = (
+        tmp_path / "bags",
+        tmp_path / "robot.yaml",
+        "/joint_states:position[name=joint_0]",
+    )
+    for trial in range(8):
+        rng = np.random.default_rng(trial)
+        force, speed, way = 0.0, 0.0, 0.0
+        with BagWriter(bags / f"run_{trial}") as writer:
+            for k in range(400):
+                force = float(rng.uniform(-1.0, 1.0)) if k % 10 == 0 else force
+                stamp_ns = START_NS + 50_000_000 * k
+                times = {"log_time_ns": stamp_ns, "publish_time_ns": stamp_ns}
+                measured = way + 1e-4 * rng.standard_normal()
+                writer.write("/cmd_vel", CMD_TYPE, command(stamp_ns, force), **times)
+                writer.write(
+                    "/joint_states",
+                    "sensor_msgs/msg/JointState",
+                    joints(stamp_ns, [measured]),
+                    **times,
+                )
+                way += 0.05 * speed
+                speed += 0.05 * (force - speed)
+    said = nlsid("init", bags, "--yes", "--out", config, "-u", CMD, "-y", position)
+    [response] = load_config(config).signals.response
+    assert (response.path, response.name) == (
+        f"{position}|washout(2 s)",
+        "joint_states position joint_0 washed out",
+    )
+    assert f"{position} seems to add up its command, so |washout(2 s) of it is proposed" in said
+    assert "is in no model class" not in said
+    assert re.search(r"expect [0-9.]+ % error in simulation .*: good", said)
+    assert "inside" in whole_way(bags, config, tmp_path / "out")
 
 
 def thrusters(folder: Path, *, trials: int = 4) -> Path:
@@ -688,3 +727,12 @@ def test_repeated_motions_are_in_every_part_of_the_split(tmp_path: Path) -> None
     nlsid("init", bags, "--out", config, *SLOW)
     split = load_config(config).split
     assert (split.calibration, split.test) == (("run_04", "run_05"), ("run_08", "run_09"))
+
+
+def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path) -> None:
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", *f1tenth()[:6], "--yes", "--out", config, "-u", CMD, "-y", SPEED)
+    [reason] = re.findall(r"identification will refuse \((.*?)\); a response", said)
+    assert "rank 1" in reason
+    refused = nlsid("identify", *f1tenth()[:6], "--config", config, "--out", tmp_path, status=None)
+    assert reason in refused

@@ -146,8 +146,9 @@ def test_a_function_that_is_expanded_may_decay_too() -> None:
 
 
 def test_what_cannot_decay_is_refused_with_the_reason() -> None:
-    with pytest.raises(OptionError, match="decay"):
-        tracking(decay=0.0)
+    for none in (0.0, "2", [1.0], 1j, np.array([1.0]), True):
+        with pytest.raises(OptionError, match="decay"):
+            tracking(decay=none)
     with pytest.raises(DataError, match="take shape rho"):
         design(tracking(decay=1.0, shape="P"))
     with pytest.raises(Infeasible, match="decay"):

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.thesis.soundness import simulate_boundary, simulate_held
 from nlsid_core.design import FunnelDesign, design
-from nlsid_core.errors import DataError
+from nlsid_core.errors import DataError, OptionError
 from tests.falling_pendulum import tracking
 
 HOLD, ERROR = 0.01, [0.002, 0.01]  # s; rad and rad/s
@@ -41,3 +41,5 @@ def test_a_gain_step_enlarges_a_held_funnel_that_no_run_leaves() -> None:
 def test_gains_that_no_step_is_for_are_refused() -> None:
     with pytest.raises(DataError, match="gain='constant' or 'linear'"):
         design(tracking(gain="cubic", search_gain=True))
+    with pytest.raises(OptionError, match="search_gain is 'no'; it should be one of False, True"):
+        tracking(search_gain="no")

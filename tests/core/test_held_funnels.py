@@ -165,6 +165,8 @@ def test_the_largest_hold_is_found_and_said() -> None:
     [
         ({"hold": 0.0}, "hold is 0.0"),
         ({"hold": "longest"}, "hold is 'longest'"),
+        ({"hold": True}, "seconds above 0"),
+        ({"error": "small"}, "2 bounds of 0 or more"),
         ({"error": [0.1]}, "2 bounds of 0 or more"),
         ({"error": [0.1, -0.1]}, "2 bounds of 0 or more"),
     ],

@@ -105,6 +105,7 @@ def design_funnel(
     Raises DataError on input that cannot be right, Infeasible if no funnel was found or proved.
     """
     started = time.perf_counter()
+    decay = None if decay is None else float(decay)
     prepared = partial(
         prepare, dynamics, goal=goal, policy=policy, Q=Q, R=R, gain=gain, search_gain=search_gain,
         limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,

@@ -33,6 +33,7 @@ from nlsid_core.design.continuous.witnesses import rate_documents, stated_multip
 from nlsid_core.dynamics.vector_field import VectorField
 from nlsid_core.errors import DataError, Infeasible, OptionError
 from nlsid_core.funnels.continuous import ContinuousFunnel
+from nlsid_core.options import is_number
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
@@ -61,11 +62,14 @@ class Hold:
         """What a user asks for; None if nothing. OptionError on what cannot be."""
         if hold is None and error is None:
             return None
-        hold = float(hold) if isinstance(hold, int) else hold
-        bounds = np.zeros(n) if error is None else np.asarray(error, dtype=np.float64)
-        longest = hold == "largest"
+        hold = float(hold) if is_number(hold) else hold  # type: ignore[arg-type]
+        longest = isinstance(hold, str) and hold == "largest"
         if not (longest or hold is None or (isinstance(hold, float) and 0 < hold < np.inf)):
             raise OptionError("hold", hold, "seconds above 0, 'largest' or None")
+        try:
+            bounds = np.zeros(n) if error is None else np.asarray(error, dtype=np.float64)
+        except (TypeError, ValueError):
+            bounds = np.full(n, np.nan)
         if bounds.shape != (n,) or not (np.isfinite(bounds) & (bounds >= 0)).all():
             raise OptionError("error", error, f"{n} bounds of 0 or more, one for each state")
         period = hold if isinstance(hold, float) else FIRST if longest else 0.0
