@@ -71,6 +71,11 @@ def gain_of(
     except DataError as refusal:
         box = _box(model, train)
         if box is None:
+            if train is None and "box" in str(refusal):
+                raise DataError(
+                    f"{refusal}. It is taken from the trials in {documents.TRAINING}, and these "
+                    "are not beside the model"
+                ) from refusal
             raise
         try:
             proof = prove(model, box=box, **options)

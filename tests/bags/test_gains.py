@@ -21,7 +21,7 @@ from nlsid_core.kernel import Verdict
 from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check
-from tests.core.kernel.dissipation_claims import feedthrough, integrator, moving
+from tests.core.kernel.dissipation_claims import curved, feedthrough, integrator, moving
 from tests.core.kernel.stability_claims import U, Y, linear
 
 RUN = CliRunner()
@@ -117,6 +117,13 @@ def test_a_model_that_needs_a_box_says_so_where_no_trials_lie_beside_it(tmp_path
     result = RUN.invoke(app, ["gain", str(model)])
     assert isinstance(result.exception, DataError)
     assert "needs a box of its outputs" in str(result.exception)
+    assert "training.npz, and these are not beside the model" in str(result.exception)
+
+
+def test_a_model_that_clips_its_inputs_is_said_to_have_no_index(tmp_path: Path) -> None:
+    result = RUN.invoke(app, ["gain", str(written(tmp_path, curved())), "--passivity"])
+    assert isinstance(result.exception, DataError)
+    assert "clips its inputs to a range, and so has no index" in str(result.exception)
 
 
 def test_the_box_that_runs_have_to_stay_in_is_said_where_the_gain_is(tmp_path: Path) -> None:
