@@ -16,6 +16,7 @@ from bags.designs import documents
 from bags.monitoring.catching import Catching, what_it_catches
 from bags.pictures.report import report_available, write_report
 from bags.recordings.definitions import read_definitions
+from bags.recordings.folders import trial_name
 from bags.recordings.names import listed
 from bags.signals.grid import filled_samples, read_dataset, skipped_samples
 from nlsid_core import files
@@ -165,6 +166,7 @@ def write_identified(
 
 def read_trials(bags: Sequence[Path], config: Config, *, progress: Progress) -> Trials:
     """The trials of the configured signals on the configured grid, by what they are for."""
+    check_split([trial_name(bag) for bag in bags], config)
     return by_use(read_signals_of(bags, config, progress=progress), config)
 
 

@@ -28,6 +28,7 @@ from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 
 CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
+ONE = 0.25  # of the weights, of the monomial 1
 RANK_TOLERANCE = 1e-10  # of the QR diagonal: monomials of degree 4 and 6 on a sphere keep 12 digits
 MAX_ITERATIONS = 60  # 8 to 12 are usual
 STEP_TO_BOUNDARY = 0.95  # of the way to where X or Z would be singular; 0.99 loses the centre
@@ -65,7 +66,9 @@ class SphereProgram:
 
     n: variables. nonlinear: indices of the variables that enter nonlinearly; degree-2 monomials
     are kept only if they contain one of them (default: all). half: of the degree of g, 2 or 3; 3
-    takes all variables as nonlinear. basis: (k, n) exponents of v, lower degree first; weight:
+    takes all variables as nonlinear. constant: whether v has the 1, with which g may have terms of
+    degree 1 in the others; where all are nonlinear, the sphere has it as the sum of squares.
+    basis: (k, n) exponents of v, lower degree first; weight:
     (k,), Σ (weight·monomial)² = 1 on the sphere. chosen: nonlinear, or all.
     points: (N, n) where g has to be evaluated.
 
@@ -75,6 +78,7 @@ class SphereProgram:
     n: int
     nonlinear: tuple[int, ...] | None = None
     half: int = 2
+    constant: bool = False
     chosen: tuple[int, ...] = field(init=False)
     basis: IntArray = field(init=False)
     weight: FloatArray = field(init=False)
@@ -94,9 +98,12 @@ class SphereProgram:
             raise DataError(
                 f"half = {self.half} with {len(chosen)} of {self.n} variables nonlinear"
             )
+        if self.constant and len(chosen) == self.n:
+            raise DataError("1 is |z|² on the sphere, which a program of all variables has")
         high = monomials(self.n, [self.half])
         low = monomials(self.n, [self.half - 1])
-        basis = np.vstack([low, high[high[:, list(chosen)].any(axis=1)]])
+        one = np.zeros((int(self.constant), self.n), dtype=np.int64)
+        basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis, self.half)
         weight = _weights(basis, np.isin(np.arange(self.n), chosen))
         moments = _sphere_moments(basis) * np.outer(weight, weight)
@@ -333,13 +340,17 @@ def _step(dA: FloatArray, L: FloatArray) -> float:
 def _weights(basis: IntArray, chosen: BoolArray) -> FloatArray:
     """(k,) with Σ (weight·monomial)² = 1 on the sphere.
 
-    All chosen: ½|z|^2d for both degrees d; else |z_l|² + ½|z_nl|² + ½|z_nl|²|z|².
+    All chosen: ½|z|^2d for both degrees d; else |z_l|² + ½|z_nl|² + ½|z_nl|²|z|². With 1 in the
+    basis that is three quarters of it.
     """
     weight = multinomials(basis) / 2
     linear = ~chosen[basis.argmax(axis=1)] & (basis.sum(axis=1) == 1)
     mixed = (basis.sum(axis=1) == 2) & (basis[:, ~chosen].sum(axis=1) == 1)
     weight[linear] = 1.0
     weight[mixed] = 0.5
+    one = ~basis.any(axis=1)
+    weight *= 1 - ONE * one.sum()
+    weight[one] = ONE
     return np.sqrt(weight)
 
 
@@ -354,7 +365,7 @@ def unisolvent_points(basis: IntArray, half: int) -> FloatArray:
     n = basis.shape[1]
     products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
     degree = products.sum(axis=1)
-    if len(basis) == len(monomials(n, [half - 1, half])):
+    if basis.any(axis=1).all() and len(basis) == len(monomials(n, [half - 1, half])):
         products = products[degree > 2 * half - 2]  # on the sphere they contain those below
     rng = np.random.default_rng(n)  # one fixed set per n: results repeat
     cloud = rng.normal(size=(int(CANDIDATES * len(products)) + 10, n))

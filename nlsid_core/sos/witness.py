@@ -54,7 +54,7 @@ class Scale:
         """Of matrices (J+1, k, k)."""
         exponents = _columns(Q)
         columns = _raised(monomials, exponents)
-        product, square = _products(monomials.shape, monomials.tobytes())
+        product, square = products_of(monomials)
         i, j = np.triu_indices(len(monomials), 1)
         order = np.lexsort((-columns[i] - columns[j], product[i, j]))  # stable: the first pair wins
         found, first = np.unique(product[i, j][order], return_index=True)
@@ -236,7 +236,7 @@ def _columns(Q: FloatArray) -> IntArray:
 
 def _raised(monomials: IntArray, columns: IntArray) -> IntArray:
     """Columns with columns[i] >= (columns[a] + columns[b])/2 wherever v_i² = v_a v_b."""
-    product, square = _products(monomials.shape, monomials.tobytes())
+    product, square = products_of(monomials)
     a, b = np.nonzero(np.tril(square[product] >= 0, -1))
     while True:
         raised = columns.copy()
@@ -246,9 +246,13 @@ def _raised(monomials: IntArray, columns: IntArray) -> IntArray:
         columns = raised
 
 
+def products_of(monomials: IntArray) -> tuple[IntArray, IntArray]:
+    """(k, k) which product v_i v_j is, and for each product the i whose square it is, else -1."""
+    return _products(monomials.shape, np.asarray(monomials, dtype=np.int64).tobytes())
+
+
 @lru_cache(maxsize=8)
 def _products(shape: tuple[int, int], monomials: bytes) -> tuple[IntArray, IntArray]:
-    """(k, k) which product v_i v_j is, and for each product the i whose square it is, else -1."""
     rows = np.frombuffer(monomials, dtype=np.int64).reshape(shape)
     sums = (rows[:, None] + rows).reshape(-1, shape[1])
     _, which = np.unique(sums, axis=0, return_inverse=True)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from bags.chain.choosing import compare_bags, select_bags
 from bags.chain.config import load_config
-from bags.chain.steps import Trials, split
+from bags.chain.steps import Trials, read_trials, split
 from bags.commands.cli import app
 from bags.designs import documents
 from bags.signals.grid import read_dataset, skipped_samples
@@ -363,6 +363,14 @@ def test_bags_are_split_by_name_also_where_they_were_cut() -> None:
         split(Dataset(tuple(trials)), test=["a"], validation=["*1"])
     with pytest.raises(DataError, match="'b' is named for test and for calibration"):
         split(Dataset(tuple(trials)), test=["b"], calibration=["?"])
+
+
+def test_a_split_that_no_bag_fits_is_refused_before_a_bag_is_read(tmp_path: Path) -> None:
+    config = load_config(write_config(tmp_path / "robot.yaml", {"model": "linear", "lags": 2}))
+    names = config.split.model_copy(update={"test": ["another"]})
+    given = config.model_copy(update={"split": names})
+    with pytest.raises(DataError, match="none of the bags is a test trial"):
+        read_trials([tmp_path / "not_there"], given, progress=silent)
 
 
 # -- models without a proof ---------------------------------------------------------------------

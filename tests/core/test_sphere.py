@@ -5,6 +5,7 @@ import pytest
 
 from benchmarks.rigorous import Undecided, bound_holds
 from examples import satellite
+from nlsid_core.arrays import FloatArray
 from nlsid_core.errors import (
     CertificateRejected,
     DataError,
@@ -13,6 +14,7 @@ from nlsid_core.errors import (
     SolverError,
 )
 from nlsid_core.polynomial import Gram, Polynomial, constant, monomials, variables
+from nlsid_core.polynomial.values import monomial_values
 from nlsid_core.proofs import decide
 from nlsid_core.sos import (
     Program,
@@ -161,6 +163,32 @@ def test_fewer_monomials_suffice_where_few_states_enter_nonlinearly() -> None:
     assert prove(g, proof.bound, proof) > 0
     points = rng.normal(size=(20_000, 5))
     assert proof.bound <= np.min(g(points / np.linalg.norm(points, axis=1)[:, None]))
+
+
+@pytest.mark.parametrize("nonlinear", [(2,), (1, 2)])
+def test_a_push_of_every_state_needs_the_one_beside_few_products(
+    nonlinear: tuple[int, ...],
+) -> None:
+    """g of degree 1 in all, of degree 4 with two or more factors that are nonlinear."""
+    n, rng = 3, np.random.default_rng(7)
+    program, full = SphereProgram(n, nonlinear, constant=True), SphereProgram(n)
+    assert len(program.basis) < len(full.basis) + 1
+    on_sphere = monomial_values(program.basis, program.points) * program.weight
+    assert (on_sphere**2).sum(axis=1) == pytest.approx(np.ones(len(program.points)))
+    some = program.basis[program.basis.sum(axis=1) > 0]
+    A = rng.normal(size=(len(some), len(some)))
+    push = rng.normal(size=n)
+    turned = Gram(some, A + A.T, ("a", "b", "c")).polynomial()
+
+    def g(points: FloatArray) -> FloatArray:
+        return np.asarray(turned(points) + 5 * points @ push)
+
+    found, expected = (p.solve(g(p.points)) for p in (program, full))
+    assert found.m == pytest.approx(expected.m, abs=1e-6 * float(np.ptp(g(full.points))))
+    without = SphereProgram(n, nonlinear)
+    assert without.solve(g(without.points)).m != pytest.approx(expected.m, rel=1e-2)
+    with pytest.raises(DataError, match="program of all variables"):
+        SphereProgram(n, constant=True)
 
 
 def test_a_constant_needs_no_iteration() -> None:

@@ -17,7 +17,7 @@ from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
 from nlsid_core.design.continuous.gain import faster_gain
-from nlsid_core.design.continuous.held import LONGEST, Hold, fastest
+from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
 from nlsid_core.design.continuous.pieces import Proved, proof_of, prove_pieces, unsolved
 from nlsid_core.design.continuous.reachable import reached
@@ -334,8 +334,10 @@ def _found(setting: Setting, progress: Progress) -> _Found:
     if hold.shortest > span:
         raise DataError(f"the hold of {hold.shortest:g} s is longer than the motion of {span:g} s")
 
+    known: dict[float, Changes] = {}
+
     def held(period: float) -> _Found:
-        return _held(setting, expansion, replace(hold, period=period), free, progress)
+        return _held(setting, expansion, replace(hold, period=period), known, progress)
 
     if not hold.longest:
         return held(hold.period)
@@ -361,13 +363,17 @@ def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
 
 
 def _held(
-    setting: Setting, expansion: Expansion | None, hold: Hold, free: FloatArray, progress: Progress
-) -> _Found:
+    setting: Setting, expansion: Expansion | None, hold: Hold, known: dict[float, Changes],
+    progress: Progress,
+) -> _Found:  # fmt: skip
     """The funnel for one hold, within scaled copies of the free one.
 
     A smaller copy has its own expansion, which leaves out less and has room for what is held.
+    known: by scale, what does not depend on the hold; it is added to.
     """
     steps, policy, P, field = setting.steps, setting.policy, setting.P, setting.steps.field
+    free = setting.free
+    assert free is not None
     widths: FloatArray = np.zeros((len(P) - 1, field.m))
     t = policy.t
     reached = float(t[0] + t[-1]) / 2 if hold.longest else np.inf  # else a shorter hold is tried
@@ -387,7 +393,13 @@ def _held(
             field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
             widths=np.zeros((len(P) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
         )  # fmt: skip
-        rates, widths = fastest(held, policy, outer, hold)
+        if field is not steps.field:
+            changes = Changes.of(held, policy, outer)
+        elif scale in known:
+            changes = known[scale]
+        else:
+            changes = known[scale] = Changes.of(held, policy, outer)
+        rates, widths = fastest(changes, policy, hold)
         held.widths = widths
         setting = replace(setting, steps=held, policy=policy, hold=hold, rates=rates)
         try:

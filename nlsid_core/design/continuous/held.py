@@ -15,14 +15,19 @@ import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json
 from nlsid_core.design.continuous.closed_loop import Pieces, rate_polynomial
-from nlsid_core.design.continuous.graded import Graded, monomials_of, positions
-from nlsid_core.design.continuous.lstep import LSteps, section_at
+from nlsid_core.design.continuous.graded import Graded, monomials_of
+from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.pieces import (
     MAX_LEVEL,
     Part,
-    proof_basis,
     substitution,
     unsolved,
+)
+from nlsid_core.design.continuous.rates import (
+    Frames,
+    curving_states,
+    least_rates,
+    used_of,
 )
 from nlsid_core.design.continuous.witnesses import rate_documents, stated_multipliers
 from nlsid_core.dynamics.vector_field import VectorField
@@ -33,9 +38,6 @@ from nlsid_core.policies.continuous import ContinuousPolicy
 
 MAX_DEGREE = 3  # of f: the Gram matrices of rates have squares of degree 2
 ROOM = 1.04  # of a rate over its bound at the ends of intervals: what it may be more in between
-QUARTICS = (0.03, 0.1, 0.3, 1.0, 3.0)  # λ₁ over the cubic part's size
-LEAST_QUARTIC = 1e-3  # of the linear part's size
-NEWTONS = 6  # for a multiplier: any will do, and six are at the best one
 FIRST, LONGEST, SHORTEST = 0.032, 0.064, 0.00025  # s, of a search for the longest hold
 MAX_ROUNDS = 6  # of rates for widths for rates: the change is a few percent of the last each time
 LARGEST_RATIO = 0.5  # of a change to the last, whose geometric series is taken in one step
@@ -146,31 +148,76 @@ class _Rates:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
-    """For each rate at one end of its part of time, in z: the least h(R - taken), and its witness.
+class Changes:
+    """dũ/dt in a funnel at both ends of every interval, whatever the widths of δ.
 
-    multipliers: (B, 2) λ₀ and λ₁. gram: (B, k, k) but for its constant, which is h(R - taken) more.
+    It has degree at most 1 in each δ_i, so the corners of |δ_i| ≤ 1 give it for all others. A row
+    is an input in an interval, in a mode at a vertex of w.
+
+    interval, entry, taken: (B,), see `_Rates`. products: per end, by degree in z, (B, corners, M_q)
+    coefficients of the products of δ, of -h dũ_i/dt. chosen: (corners, m) 1 where a product has
+    δ_i. signs: (corners, corners) of the products at each corner. h: (intervals,) s.
     """
 
-    least: FloatArray
-    multipliers: FloatArray
-    gram: FloatArray
+    interval: IntArray
+    entry: IntArray
+    taken: FloatArray
+    products: tuple[list[FloatArray], list[FloatArray]]
+    chosen: IntArray
+    signs: FloatArray
+    h: FloatArray
+    curving: tuple[int, ...]
+
+    @classmethod
+    def of(cls, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel) -> "Changes":
+        """Of this funnel; steps: with widths, of any size."""
+        field, count = steps.field, len(steps.corners)
+        chosen, K = (steps.corners > 0).astype(int), len(funnel.t) - 1
+        signs = np.prod(np.where(chosen == 1, steps.corners[:, None], 1.0), axis=2)
+        unit, curving = np.ones((K, field.m)), curving_states(field)
+        found: tuple[list[list[FloatArray]], list[list[FloatArray]]] = ([], [])
+        rows = []
+        intervals, no_basis = [Part(k, 0, 0) for k in range(K)], np.zeros((1, field.n), dtype=int)
+        for batch in _batches(steps, policy, intervals, no_basis, unit, signs=(1,)):
+            pieces = batch.pieces
+            corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
+            order = np.lexsort((corner, batch.entry, vertex, *pieces.mode.T, pieces.interval))
+            first = order[::count]
+            rows.append((pieces.interval[first], batch.entry[first], batch.taken[first]))
+            for end in (0, 1):
+                c, _ = _at_end(steps, policy, funnel, batch, curving, end)
+                at_corners = [part[order].reshape(len(first), count, -1) for part in c]
+                found[end].append([signs.T @ part / count for part in at_corners])
+        together = [[np.concatenate(parts) for parts in zip(*of_end, strict=True)]
+                    for of_end in found]  # fmt: skip
+        interval, entry, taken = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        return cls(interval, entry, taken, (together[0], together[1]), chosen, signs,
+                   np.diff(funnel.t), curving)  # fmt: skip
+
+    def rates(self, widths: FloatArray) -> FloatArray:
+        """(intervals, m) the largest at the ends of intervals, for δ in these widths."""
+        result = np.zeros(widths.shape)
+        weights = np.prod(np.where(self.chosen == 1, widths[:, None], 1.0), axis=2)[self.interval]
+        place = np.repeat(np.column_stack([self.interval, self.entry]), len(self.signs), axis=0)
+        h, taken = self.h[place[:, 0]], np.repeat(self.taken, len(self.signs))
+        for products in self.products:
+            p = [self.signs @ (weights[..., None] * part) for part in products]
+            for sign in (-1, 1):
+                flat = [sign * part.reshape(len(h), -1) for part in p]
+                least = least_rates(flat, self.curving).least
+                np.maximum.at(result, tuple(place.T), least / h + taken)
+        return result
 
 
 def fastest(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, hold: Hold
+    changes: Changes, policy: ContinuousPolicy, hold: Hold
 ) -> tuple[FloatArray, FloatArray]:
     """(intervals, m) R and W for a funnel: each for the other, R with room."""
-    rates = np.zeros((len(funnel.t) - 1, steps.field.m))
-    parts, h = [Part(k, 0, 0) for k in range(len(rates))], np.diff(funnel.t)
+    rates = np.zeros((len(policy.t) - 1, changes.chosen.shape[1]))
     last = np.zeros_like(rates)
     for _ in range(MAX_ROUNDS if hold.period else 0):
-        steps.widths, before = hold.widths(policy, rates), rates.copy()
-        for batch in _batches(steps, policy, parts, proof_basis(steps.program)):
-            k = batch.pieces.interval
-            for end in (0, 1):
-                shown, _ = _shown(steps, policy, funnel, batch, end)
-                np.maximum.at(rates, (k, batch.entry), ROOM * (shown.least / h[k] + batch.taken))
+        before = rates
+        rates = np.maximum(before, ROOM * changes.rates(hold.widths(policy, before)))
         if (rates <= SETTLED * before).all():
             break
         change = rates - before
@@ -188,13 +235,16 @@ def prove_rates(
     Raises Infeasible if a rate is not shown on some part of time.
     """
     waiting = [Part(k, 0, 0) for k in range(len(rates))]
+    curving = curving_states(steps.field)
+    used, widths = used_of(basis, curving), steps.widths
+    assert widths is not None  # a search for a hold sets them first
     found: list[Json] = []
     while waiting:
         written: dict[Part, list[Json | None]] = {}
-        for batch in _batches(steps, policy, waiting, basis):
-            batch = _witnessed(steps, policy, funnel, batch, rates)
+        for batch in _batches(steps, policy, waiting, basis[used], widths):
+            batch = _witnessed(steps, policy, funnel, batch, curving, rates)
             c = batch.polynomial(steps, policy, funnel, rates)
-            rows = rate_documents(funnel, batch.pieces, c)
+            rows = rate_documents(funnel, batch.pieces, c, basis, used)
             places = zip(batch.entry.tolist(), batch.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
                 part = Part(*(int(e[b]) for e in (batch.pieces.interval, batch.pieces.level,
@@ -217,8 +267,9 @@ def prove_rates(
 
 
 def _batches(
-    steps: LSteps, policy: ContinuousPolicy, parts: list[Part], basis: IntArray
-) -> Iterator[_Rates]:
+    steps: LSteps, policy: ContinuousPolicy, parts: list[Part], basis: IntArray, widths: FloatArray,
+    *, signs: tuple[int, ...] = (-1, 1),
+) -> Iterator[_Rates]:  # fmt: skip
     """Every rate on these parts of time, one span of the equations after the other."""
     field, n = steps.field, steps.program.n
     pushing = _pushing(field)
@@ -232,7 +283,7 @@ def _batches(
         for mode in range(len(steps.modes))
         for v in range(len(values) * len(steps.corners))
         for entry in range(field.m)
-        for sign in (-1, 1)
+        for sign in signs
         if entry not in limited or not steps.modes[mode][limited.index(entry)]
     ]
     vertex, entry, sign, mode = np.array(cases).reshape(-1, 4).T
@@ -245,13 +296,12 @@ def _batches(
         place = np.repeat(np.array([(p.interval, p.level, p.index) for p in alike]),
                           len(cases), axis=0)  # fmt: skip
         v, i, side, m = (np.tile(row, len(alike)) for row in (vertex, entry, sign, mode))
-        assert steps.widths is not None  # a search for a hold sets them first
         pieces = Pieces(
             basis, interval=place[:, 0], vertex=v, level=place[:, 1], index=place[:, 2],
             T=np.tile(np.eye(n), (count, 1, 1)),
             mu=np.zeros((count, 2, 0)), gram=np.zeros((count, 2, len(basis), len(basis))),
             mode=steps.modes[m], tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
-            push=steps.corners[v // len(values)] * steps.widths[place[:, 0]],
+            push=steps.corners[v // len(values)] * widths[place[:, 0]],
             stated=np.empty(count, dtype=object),
         )  # fmt: skip
         g = _pushes(field, span, pushing)
@@ -282,89 +332,28 @@ def _pushes(field: VectorField, span: int, pushing: list[int]) -> FloatArray:
     return g
 
 
-def _shown(
-    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates, end: int
-) -> tuple[_Shown, FloatArray]:
-    """The least rates at one end of each part, in z with x̄ = Tz; and T (B, n, n)."""
+def _at_end(
+    steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates,
+    curving: tuple[int, ...], end: int,
+) -> tuple[list[FloatArray], Frames]:  # fmt: skip
+    """-h sign dũ_i/dt by degree in z, (B, M_q), at one end of each part; and the frames of z."""
     pieces, n = batch.pieces, funnel.n
-    frames: dict[tuple[int, ...], FloatArray] = {}
-    T = np.empty((len(pieces), n, n))
-    for b, key in enumerate(zip(pieces.interval.tolist(), pieces.level.tolist(),
-                                pieces.index.tolist(), strict=True)):  # fmt: skip
-        if key not in frames:
-            s, k = Part(*key).ends()[end], key[0]
-            rho = (1 - s) * funnel.rho[k] + s * funnel.rho[k + 1]
-            frames[key] = np.sqrt(rho) * section_at(steps, policy, funnel.P, k, s).base
-        T[b] = frames[key]
-    framed = replace(batch, pieces=replace(pieces, T=T, tau=np.zeros_like(pieces.tau)),
-                     taken=np.zeros_like(batch.taken))  # fmt: skip
+    k, at = pieces.interval, _ends(pieces)[end]
+    frames = Frames.of(funnel, k, at, curving)
+    framed = replace(
+        batch, pieces=replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)),
+        taken=np.zeros_like(batch.taken),
+    )  # fmt: skip
     nothing = np.zeros((len(policy.t) - 1, steps.field.m))
     c = framed.polynomial(steps, policy, funnel, nothing, end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
-    parts = [c[q][:, 0] if q in c else np.zeros((len(T), size)) for q, size in enumerate(sizes)]
-    return _least(pieces.basis, [-part for part in parts]), T
-
-
-def _least(basis: IntArray, p: list[FloatArray]) -> _Shown:
-    """The least r with r - p - (λ₀ + λ₁|z|²)(1 - |z|²) a sum of squares, p by degree, (B, M_q)."""
-    n, count = basis.shape[1], len(p[0])
-    order = positions(np.eye(n, dtype=np.int64), monomials_of(n, 1))
-    linear, (quadratic, cubic) = p[1][:, order], (monomials_of(n, q) for q in (2, 3))
-    Q, C = np.zeros((count, n, n)), np.zeros((count, n, len(quadratic)))
-    for place, row in enumerate(quadratic):
-        a, b = np.repeat(np.arange(n), row).tolist()
-        Q[:, a, b] += p[2][:, place] / 2
-        Q[:, b, a] += p[2][:, place] / 2
-    for place, row in enumerate(cubic):
-        for i in np.flatnonzero(row).tolist():
-            rest = (row - np.eye(n, dtype=np.int64)[i])[None]
-            C[:, i, int(positions(rest, quadratic)[0])] += p[3][:, place] * row[i] / 3
-    D = np.where((quadratic == 2).any(axis=1), 1.0, 2.0)
-    N = C / D @ C.swapaxes(1, 2) / 4
-    size = np.linalg.norm(linear, axis=1) + np.abs(p[0][:, 0]) + np.linalg.norm(Q, axis=(1, 2))
-    size = np.maximum(size, np.finfo(float).tiny)
-    root = np.sqrt(np.linalg.norm(N, axis=(1, 2)))
-    quartic = np.multiply.outer(QUARTICS, root) + LEAST_QUARTIC * size  # (scales, B)
-    values, vectors = np.linalg.eigh(
-        Q + quartic[..., None, None] * np.eye(n) + N / quartic[..., None, None]
-    )
-    turned = np.einsum("sbij,bi->sbj", vectors, linear)
-    constant = _smallest(values, turned, LEAST_QUARTIC * size)
-    rate = p[0][:, 0] + constant + (turned**2 / (constant[..., None] - values)).sum(axis=-1) / 4
-    chosen = np.argmin(rate, axis=0), np.arange(count)
-    best, found = rate[chosen], np.stack([constant[chosen], quartic[chosen]], axis=1)
-    gram = np.zeros((count, len(basis), len(basis)))
-    one = int(np.flatnonzero(~basis.any(axis=1))[0])
-    first, second = positions(np.eye(n, dtype=np.int64), basis), positions(quadratic, basis)
-    gram[:, one, one] = -p[0][:, 0] - found[:, 0]
-    gram[:, one, first] = gram[:, first, one] = -linear / 2
-    gram[:, first[:, None], first] = (found[:, :1] - found[:, 1:])[..., None] * np.eye(n) - Q
-    gram[:, first[:, None], second] = -C / 2
-    gram[:, second[:, None], first] = -C.swapaxes(1, 2) / 2
-    gram[:, second, second] = found[:, 1:] * D
-    return _Shown(best, found, gram)
-
-
-def _smallest(values: FloatArray, b: FloatArray, least: FloatArray) -> FloatArray:
-    """μ ≥ max(values, 0) + least that makes μ + Σ b²/(μ - values)/4 least, nearly; (..., B, n).
-
-    Where it is inside, r(μ) = |b/(μ - values)|/2 = 1. Newton on 1/r, which is nearly affine.
-    Source: Moré and Sorensen, "Computing a trust region step", 1983, (3.11).
-    """
-    low = np.maximum(values[..., -1], 0.0) + least
-    mu = low
-    for _ in range(NEWTONS):
-        apart = mu[..., None] - values
-        square = (b**2 / apart**2).sum(axis=-1) / 4
-        cube = (b**2 / apart**3).sum(axis=-1) / 4
-        step = square / np.maximum(cube, np.finfo(float).tiny) * (np.sqrt(square) - 1)
-        mu = np.maximum(mu + step, low)
-    return mu
+    none = [np.zeros((len(pieces), size)) for size in sizes]
+    return [c[q][:, 0] if q in c else none[q] for q in range(4)], frames
 
 
 def _witnessed(
     steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel, batch: _Rates,
-    rates: FloatArray,
+    curving: tuple[int, ...], rates: FloatArray,
 ) -> _Rates:  # fmt: skip
     """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
     pieces, k = batch.pieces, batch.pieces.interval
@@ -372,21 +361,22 @@ def _witnessed(
     room = np.diff(funnel.t)[k] * (rates[k, batch.entry] - batch.taken)
     one = int(np.flatnonzero(~pieces.basis.any(axis=1))[0])
     for end in (0, 1):
-        shown, T = _shown(steps, policy, funnel, batch, end)
-        inverse = np.linalg.inv(T)
-        shown.gram[:, one, one] += room
+        c, frames = _at_end(steps, policy, funnel, batch, curving, end)
+        shown = least_rates([-part for part in c], curving)
+        found = shown.gram(pieces.basis)
+        found[:, one, one] += room
         constant, quartic = shown.multipliers.T
-        shape = inverse.swapaxes(1, 2) @ inverse
+        bent = frames.inverse[:, list(curving)]
         rho = funnel.rho[k] + _ends(pieces)[end] * (funnel.rho[k + 1] - funnel.rho[k])
         tau[:, end, 0, 0, 0] = constant / rho
-        tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * shape
+        tau[:, end, 0, 1:, 1:] = (quartic / rho)[:, None, None] * (bent.swapaxes(1, 2) @ bent)
         maps: dict[bytes, FloatArray] = {}  # of a part of time: the same for all of its rates
-        for b, A in enumerate(inverse):
+        for b, A in enumerate(frames.inverse):
             key = A.tobytes()
             if key not in maps:
                 maps[key] = substitution(pieces.basis, A)
             M = maps[key]
-            gram[b, end] = M.T @ shown.gram[b] @ M
+            gram[b, end] = M.T @ found[b] @ M
     return replace(batch, pieces=stated_multipliers(replace(pieces, tau=tau, gram=gram)))
 
 

@@ -20,6 +20,7 @@ class LineProgram:
 
     half: int = 2
     n: int = 1
+    constant: bool = False
     chosen: tuple[int, ...] = (0,)
     basis: IntArray = field(default_factory=lambda: np.array([[1], [2]]))
     weight: FloatArray = field(default_factory=lambda: np.sqrt(np.array([0.5, 0.5])))

@@ -126,6 +126,7 @@ class LSteps:
         refuse_degree(field)
         self.field, self.decay = field, decay
         self.pushed = (field.is_pushed if pushed is None else pushed) and policy is not None
+        limited = policy is not None and len(policy.limits) > 0
         taken = field.curved_states if self.pushed else field.nonlinear_states
         self.nonlinear = taken if nonlinear is None else nonlinear
         self.local: dict[int, Cubic] = {}
@@ -137,8 +138,9 @@ class LSteps:
         self.tightness = tightness
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
-        reduced = len(self.limits) == 0 and widths is None
-        self.program = sphere_program(field, self.nonlinear, reduced=reduced)
+        self.program = sphere_program(  # what the input is off is a term of degree 1 in Ẇ
+            field, self.nonlinear, reduced=not limited, constant=widths is not None
+        )
         self.kappa: FloatArray | None = None
         self.solved = 0
         if self.pushed and policy is not None:
@@ -225,7 +227,7 @@ class LSteps:
         The reduced basis has no product for it; the proof's Gram matrix, which has 1, does.
         """
         linear = [j for j in range(self.program.n) if j not in self.program.chosen]
-        if not linear:
+        if not linear or self.program.constant:
             return np.zeros(len(self.program.points))
         centre = self.field.uncertain.mean(axis=1)
         rate = self.rate(section, section.x[None], section.u[None], centre)[0]
@@ -285,12 +287,16 @@ class LSteps:
 
 
 def sphere_program(
-    field: VectorField, nonlinear: tuple[int, ...] | None = None, *, reduced: bool = True
+    field: VectorField,
+    nonlinear: tuple[int, ...] | None = None,
+    *,
+    reduced: bool = True,
+    constant: bool = False,
 ) -> SphereProgram | LineProgram:
     """The program for this field: squares of half the degree of Ẇ.
 
     Up to degree 3, nonlinear states come last, and degree 2 only where they occur. reduced: False
-    keeps every product, for multipliers in all states.
+    keeps every product, for multipliers in all states. constant: Ẇ may have terms of degree 1.
     """
     n, count = field.n, len(field.nonlinear_states if nonlinear is None else nonlinear)
     half = max(2, (field.degree + 2) // 2)
@@ -298,4 +304,4 @@ def sphere_program(
         return LineProgram(half=half)
     if half > 2 or count in (0, n) or not reduced:
         return SphereProgram(n, half=half)
-    return SphereProgram(n, tuple(range(n - count, n)))
+    return SphereProgram(n, tuple(range(n - count, n)), constant=constant)

@@ -23,7 +23,7 @@ from nlsid_core.errors import SolverError
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from nlsid_core.polynomial.maps import monomials
-from nlsid_core.sos.sphere import SphereProgram, SphereSolution, multinomials
+from nlsid_core.sos.sphere import ONE, SphereProgram, SphereSolution, multinomials
 
 MAX_LEVEL = 4  # halvings of an interval: what still fails then fails for lack of margin
 
@@ -186,19 +186,23 @@ def _pieces(
 
 
 def proof_basis(program: SphereProgram | LineProgram) -> IntArray:
-    """1 and the program's basis; with half = 3 every monomial up to degree 3.
+    """1 and the rest of the program's basis; with half = 3 every monomial up to degree 3.
 
     Off the sphere degrees 0 to 2·half have to be products of the basis, each of them.
     """
     if program.half > 2:
         return np.vstack([monomials_of(program.n, q) for q in range(program.half + 1)])
+    if program.constant:
+        return program.basis
     return np.vstack([np.zeros((1, program.n), dtype=np.int64), program.basis])
 
 
 def _spread(program: SphereProgram | LineProgram, basis: IntArray) -> FloatArray:
     """Weights of squares of the basis that add to 1 on the sphere: a quarter of it for the 1."""
+    if program.constant:
+        return program.weight**2
     squares = program.weight**2 if program.half == 2 else multinomials(basis[1:]) / program.half
-    return np.concatenate([[0.25], 0.75 * squares])
+    return np.concatenate([[ONE], (1 - ONE) * squares])
 
 
 def draft(steps: LSteps, parts: list[Part], T: FloatArray) -> Pieces:
