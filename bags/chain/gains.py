@@ -70,12 +70,14 @@ def gain_of(
         proof = prove(model, **options)
     except DataError as refusal:
         box = _box(model, train)
-        if box is None:
+        if "box" not in str(refusal) or (train is not None and box is None):
             raise
-        try:
-            proof = prove(model, box=box, **options)
-        except DataError:
-            raise refusal from None
+        if box is None:
+            raise DataError(
+                f"{refusal}. It is taken from the trials in {documents.TRAINING}, and these are "
+                "not beside the model"
+            ) from refusal
+        proof = prove(model, box=box, **options)
     if proof is None:
         return None
     document = proof.document(model, model_path.name)

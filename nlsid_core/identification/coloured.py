@@ -57,6 +57,8 @@ def fit_in_turn(
         return search(data, alone, noise).candidates[0]
 
     fitted, judged = (train, task.validation) if task.validation else hold_out(train)
+    # a residual shows no more of itself, and a band is no wider than its matrix
+    lags = min(lags, max(max(map(len, fitted)) - 2 * history(white.model) - 1, 0))
     found = white if fitted is train else search(fitted, alone, None).candidates[0]
     steps = [Step("noise taken as white", simulation_percent(found.model, judged))]
     said = "held-back error [%]"

@@ -158,6 +158,11 @@ def _proved(
         raise DataError(f"scales should be {q} of inputs and {p} of outputs, all positive")
     if kind == "passivity" and p != q:
         raise DataError(f"passivity needs as many inputs as outputs; the model has {q} and {p}")
+    if kind == "passivity" and read.limits == "clip":
+        raise DataError(
+            "the model clips its inputs to a range, and so has no index of passivity: its output "
+            "answers to less than it is given. Identify it with on_out_of_range: refuse"
+        )
     if not 0.0 < discount <= 1.0:
         raise DataError(f"the discount should satisfy 0 < discount <= 1, not {discount}")
     tree: Tree = read.box

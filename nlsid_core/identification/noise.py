@@ -52,6 +52,6 @@ class Noise:
 
 
 def _products(residuals: Sequence[FloatArray], k: int) -> FloatArray:
-    """(n_y,): Σ r(t) r(t - k) over all trials."""
-    parts = [np.sum(r[k:] * r[: len(r) - k], axis=0) for r in residuals]
+    """(n_y,): Σ r(t) r(t - k) over all trials; 0 of one that is shorter."""
+    parts = [np.sum(r[k:] * r[: max(len(r) - k, 0)], axis=0) for r in residuals]
     return np.asarray(np.sum(parts, axis=0))

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,17 +12,19 @@ import pytest
 from typer.testing import CliRunner
 
 from bags.chain.gains import Gain
+from bags.chain.training import save_training
 from bags.commands.cli import app
 from bags.commands.show import gain_lines, named_number
 from nlsid_core import files
 from nlsid_core.arrays import Json
+from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, NlsidError
 from nlsid_core.identification import prove_gain
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal
+from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal, StateAffineModel
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check
-from tests.core.kernel.dissipation_claims import feedthrough, integrator, moving
+from tests.core.kernel.dissipation_claims import curved, feedthrough, integrator, moving
 from tests.core.kernel.stability_claims import U, Y, linear
 
 RUN = CliRunner()
@@ -117,6 +120,20 @@ def test_a_model_that_needs_a_box_says_so_where_no_trials_lie_beside_it(tmp_path
     result = RUN.invoke(app, ["gain", str(model)])
     assert isinstance(result.exception, DataError)
     assert "needs a box of its outputs" in str(result.exception)
+    assert "training.npz, and these are not beside the model" in str(result.exception)
+
+
+@pytest.mark.parametrize("model", [curved(), moving()])  # moving: on a box
+def test_a_model_that_clips_its_inputs_is_said_to_have_no_index(
+    tmp_path: Path, model: StateAffineModel
+) -> None:
+    y, u = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 50))
+    trial = Trajectory(t=0.1 * np.arange(50), y=y, u=u, name="run")
+    training = save_training(tmp_path / "training.npz", Dataset((trial,)))
+    path = written(tmp_path, replace(model, training=training))
+    result = RUN.invoke(app, ["gain", str(path), "--passivity"])
+    assert isinstance(result.exception, DataError)
+    assert "clips its inputs to a range, and so has no index" in str(result.exception)
 
 
 def test_the_box_that_runs_have_to_stay_in_is_said_where_the_gain_is(tmp_path: Path) -> None:

@@ -68,6 +68,17 @@ def test_the_correlation_of_a_residual_is_that_of_its_noise_and_gives_a_definite
         Noise.of([np.zeros((50, 1))], 5)
 
 
+def test_more_noise_lags_than_a_trial_has_samples_are_taken_from_the_others_or_are_zero() -> None:
+    long, short = np.random.default_rng(2).standard_normal((2, 300, 1))
+    found = Noise.of([long, short[:6]], 40).correlation[0]
+    products = [(r[k:] * r[: len(r) - k]).sum() for r, k in ((long, 20), (long, 0))]
+    x = 20 / 41
+    wanted = 0.999 * (1 - 6 * x**2 * (1 - x)) * products[0] / (products[1] + (short[:6] ** 2).sum())
+    assert found[20] == pytest.approx(wanted, abs=1e-12)
+    trials = Dataset((recorded(7, pole=0.9, samples=80),))
+    assert np.isfinite(fitted(trials, 200)).all()
+
+
 def test_the_robust_error_with_a_noise_is_least_squares_of_the_whitened_simulation_error() -> None:
     """By a minimiser and a dense factor that know nothing of bands or bounds."""
     trial = recorded(3, pole=0.9, samples=300)
