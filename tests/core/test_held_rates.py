@@ -102,14 +102,10 @@ def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
     assert len(sizes) == len(set(sizes))
 
 
-def test_errors_that_no_hold_is_short_enough_for_are_the_reason(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    periods = noted_periods(monkeypatch)
+def test_errors_that_leave_no_funnel_without_a_hold_are_the_reason() -> None:
     wrong = r"may be wrong by \[0.05, 0.2\], not even without a hold: input 0 is then off by"
     with pytest.raises(Infeasible, match=wrong):
-        design(tracking(hold="largest", error=[0.05, 0.2]))
-    assert min(period for period in periods if period) > 0.008, "no shorter hold is tried"
+        design(tracking(error=[0.05, 0.2]))
 
 
 def noted_periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:

@@ -43,7 +43,6 @@ HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
-ERRORS_BELOW = 0.3  # of the first period of a search: shorter ones are tried if errors are possible
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
 GAIN_SECONDS = 20.0  # of processor time for each
@@ -346,14 +345,10 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
 
 def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
-    """What `held` finds for the longest period, to a factor √2, that it finds anything for.
-
-    Where some periods were too long, the errors alone are tried, without a hold: with none for
-    these, there is none at all, and they are the reason.
-    """
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
     with suppress(Infeasible):
         return held(LONGEST)
-    period, found, wrong = hold.period, None, bool(hold.error.any())
+    period, found = hold.period, None
     while found is None:
         try:
             found = held(period)
@@ -361,9 +356,6 @@ def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
             if period <= hold.shortest:
                 raise
             period /= 2**0.5
-            if wrong and period < ERRORS_BELOW * hold.period:
-                held(0.0)
-                wrong = False
     if period == hold.period:
         with suppress(Infeasible):
             return held(2**0.5 * period)
