@@ -12,6 +12,7 @@ from nlsid_core.design.continuous.held import Changes
 from nlsid_core.design.continuous.lstep import LSteps
 from nlsid_core.design.continuous.rates import curving_states
 from nlsid_core.dynamics import PiecewisePolynomial, VectorField
+from nlsid_core.errors import Infeasible
 from nlsid_core.funnels.continuous import ContinuousFunnel
 from nlsid_core.policies.continuous import ContinuousPolicy
 from tests.falling_pendulum import tracking
@@ -95,6 +96,24 @@ def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
         return of(steps, policy, funnel)
 
     monkeypatch.setattr(Changes, "of", counted)
+    periods = noted_periods(monkeypatch)
+    design(tracking(hold="largest"))
+    assert len(periods) > 1
+    assert len(sizes) == len(set(sizes))
+
+
+def test_errors_that_no_hold_is_short_enough_for_are_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    periods = noted_periods(monkeypatch)
+    wrong = r"may be wrong by \[0.05, 0.2\], not even without a hold: input 0 is then off by"
+    with pytest.raises(Infeasible, match=wrong):
+        design(tracking(hold="largest", error=[0.05, 0.2]))
+    assert min(period for period in periods if period) > 0.008, "no shorter hold is tried"
+
+
+def noted_periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The holds that searches try from now on, in s."""
     periods: list[float] = []
     one = search._held
 
@@ -103,6 +122,4 @@ def test_a_search_for_the_largest_hold_looks_at_a_funnel_once(
         return one(setting, expansion, hold, *rest)
 
     monkeypatch.setattr(search, "_held", noted)
-    design(tracking(hold="largest"))
-    assert len(periods) > 1
-    assert len(sizes) == len(set(sizes))
+    return periods

@@ -43,6 +43,7 @@ HALVINGS = 6  # of intervals where P is far from linear
 PARTS = (1.0, 0.5)  # of a gain step, until the funnel is larger
 SCALES = (1.0, 0.5, 0.25, 0.1)  # of ρ without a hold: where the input's rate is bounded at first
 GROWTH = 4.0  # of the margin, where some piece is not proved
+ERRORS_BELOW = 0.3  # of the first period of a search: shorter ones are tried if errors are possible
 FINER = ("knots", "remainder")  # what is less where knots are closer
 FACTORS = (0.25, 4.0)  # of the default R, which are tried before a refusal
 GAIN_SECONDS = 20.0  # of processor time for each
@@ -345,10 +346,14 @@ def _found(setting: Setting, progress: Progress) -> _Found:
 
 
 def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
-    """What `held` finds for the longest period, to a factor √2, that it finds anything for."""
+    """What `held` finds for the longest period, to a factor √2, that it finds anything for.
+
+    Where some periods were too long, the errors alone are tried, without a hold: with none for
+    these, there is none at all, and they are the reason.
+    """
     with suppress(Infeasible):
         return held(LONGEST)
-    period, found = hold.period, None
+    period, found, wrong = hold.period, None, bool(hold.error.any())
     while found is None:
         try:
             found = held(period)
@@ -356,6 +361,9 @@ def _longest(hold: Hold, held: Callable[[float], _Found]) -> _Found:
             if period <= hold.shortest:
                 raise
             period /= 2**0.5
+            if wrong and period < ERRORS_BELOW * hold.period:
+                held(0.0)
+                wrong = False
     if period == hold.period:
         with suppress(Infeasible):
             return held(2**0.5 * period)
@@ -393,13 +401,15 @@ def _held(
             field, policy, nonlinear=steps.nonlinear, pushed=steps.pushed,
             widths=np.zeros((len(P) - 1, field.m)), tightness=steps.tightness, decay=steps.decay,
         )  # fmt: skip
-        if field is not steps.field:
-            changes = Changes.of(held, policy, outer)
-        elif scale in known:
-            changes = known[scale]
-        else:
-            changes = known[scale] = Changes.of(held, policy, outer)
-        rates, widths = fastest(changes, policy, hold)
+        rates: FloatArray = np.zeros(widths.shape)
+        widths = hold.widths(policy, rates)
+        if hold.period:
+            changes = known.get(scale) if field is steps.field else None
+            if changes is None:
+                changes = Changes.of(held, policy, outer)
+            if field is steps.field:
+                known[scale] = changes
+            rates, widths = fastest(changes, policy, hold)
         held.widths = widths
         setting = replace(setting, steps=held, policy=policy, hold=hold, rates=rates)
         try:
@@ -412,6 +422,12 @@ def _held(
                 break
             reached = refusal.diagnosis.t
     k, i = np.unravel_index(np.argmax(widths), widths.shape)
+    off = f"input {i} is then off by up to {widths[k, i]:.3g} at {policy.t[k]:.3g} s"
+    if not hold.period:
+        raise Infeasible(
+            f"no funnel in which the state may be wrong by {hold.error.tolist()}, not even without "
+            f"a hold: {off}. Take smaller errors, a larger goal, or a larger R ({refusal})"
+        ) from refusal
     plan = (
         hold.period
         * np.abs(np.diff(policy.u.control, axis=1)).sum(axis=1)
@@ -419,10 +435,9 @@ def _held(
     )
     raise Infeasible(
         f"no funnel in which the input may be {hold.period:g} s old and the state wrong by "
-        f"{hold.error.tolist()}: input {i} is then off by up to {widths[k, i]:.3g} at "
-        f"{policy.t[k]:.3g} s, of which {plan[k, i]:.3g} is the plan's own change. Take a shorter "
-        "hold (hold='largest' finds one), a smoother plan, a larger goal, or Q and R that decay "
-        f"faster ({refusal})"
+        f"{hold.error.tolist()}: {off}, of which {plan[k, i]:.3g} is the plan's own change. Take "
+        "a shorter hold (hold='largest' finds one), a smoother plan, a larger goal, or Q and R "
+        f"that decay faster ({refusal})"
     ) from refusal
 
 

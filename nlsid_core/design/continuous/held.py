@@ -215,7 +215,7 @@ def fastest(
     """(intervals, m) R and W for a funnel: each for the other, R with room."""
     rates = np.zeros((len(policy.t) - 1, changes.chosen.shape[1]))
     last = np.zeros_like(rates)
-    for _ in range(MAX_ROUNDS if hold.period else 0):
+    for _ in range(MAX_ROUNDS):
         before = rates
         rates = np.maximum(before, ROOM * changes.rates(hold.widths(policy, before)))
         if (rates <= SETTLED * before).all():
