@@ -15,6 +15,7 @@ Source: Löfberg and Parrilo, "From coefficients to samples", CDC 2004; Toh, Tod
 """
 
 from dataclasses import dataclass, field, replace
+from math import comb
 
 import numpy as np
 import scipy.sparse as sp
@@ -27,7 +28,7 @@ from nlsid_core.errors import DataError, ShapeError, SolverError
 from nlsid_core.polynomial import monomials
 from nlsid_core.polynomial.values import monomial_values
 
-CANDIDATES = 1.5  # random points per equality, of which pivoted QR keeps the best conditioned ones
+CANDIDATES = 1.5  # random points per equality, of which pivoting keeps the best conditioned ones
 ONE = 0.25  # of the weights, of the monomial 1
 RANK_TOLERANCE = 1e-10  # of the QR diagonal: monomials of degree 4 and 6 on a sphere keep 12 digits
 MAX_ITERATIONS = 60  # 8 to 12 are usual
@@ -363,19 +364,30 @@ def multinomials(rows: IntArray) -> FloatArray:
 def unisolvent_points(basis: IntArray, half: int) -> FloatArray:
     """Points on the sphere that determine every function in the span of products of the basis."""
     n = basis.shape[1]
-    products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
-    degree = products.sum(axis=1)
-    if basis.any(axis=1).all() and len(basis) == len(monomials(n, [half - 1, half])):
-        products = products[degree > 2 * half - 2]  # on the sphere they contain those below
     rng = np.random.default_rng(n)  # one fixed set per n: results repeat
-    cloud = rng.normal(size=(int(CANDIDATES * len(products)) + 10, n))
-    cloud /= np.linalg.norm(cloud, axis=1)[:, None]
+    if basis.any(axis=1).all() and len(basis) == len(monomials(n, [half - 1, half])):
+        # On the sphere all products are of the two highest degrees. With the roots of multinomials
+        # as weights their Gram matrix over the points is a sum of two powers.
+        count = sum(comb(n + degree - 1, degree) for degree in (2 * half - 1, 2 * half))
+        cloud = _cloud(rng, count, n)
+        cosine = cloud @ cloud.T
+        gram = cosine * (cosine**2) ** (half - 1) * (1.0 + cosine)
+        order = lapack.dpstrf(gram.T, lower=1, tol=0.0, overwrite_a=1)[1] - 1
+        return np.asarray(cloud[np.sort(order[:count])])
+    products = np.unique((basis[:, None] + basis[None]).reshape(-1, n), axis=0)
+    cloud = _cloud(rng, len(products), n)
     table = monomial_values(products, cloud)
     table /= np.linalg.norm(table, axis=0)
     R, order = qr(table.T, mode="r", pivoting=True, overwrite_a=True, check_finite=False)
     diagonal = np.abs(np.diag(R))
     rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
     return np.asarray(cloud[np.sort(order[:rank])])
+
+
+def _cloud(rng: np.random.Generator, count: int, n: int) -> FloatArray:
+    """Random points on the sphere, more than the `count` of them that are wanted."""
+    points = rng.normal(size=(int(CANDIDATES * count) + 10, n))
+    return np.asarray(points / np.linalg.norm(points, axis=1)[:, None])
 
 
 def _sphere_moment(exponents: IntArray) -> FloatArray:
