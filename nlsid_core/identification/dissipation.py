@@ -25,6 +25,7 @@ ROOMS = (1e-4, 1e-3, 1e-2, 0.1)  # relative, above the least γ², tried until t
 LARGEST = 1e4  # entry of a multiplier in balanced units: where nothing else bounds it
 FREQUENCIES = 512  # from 0 to half the sampling rate, at which the mean's response is looked at
 SOLVER = "clarabel refined"  # alone: where it stalls, slower ones find nothing better
+OUTPUTS = (1.0, 10.0, 1e3)  # of the output's unit, larger where a storage is much more than seen
 BALANCES = 3  # programs, after which units of the state change little
 CORNERS = 16  # vertices that balance a program
 MOST_LEAVES = 16  # of a box whose vertices are too coarse
@@ -168,13 +169,16 @@ def _proved(
     tree: Tree = read.box
     least, storage, form = np.inf, None, None
     while storage is None and len(_leaves(tree)) <= MOST_LEAVES:
-        for _ in range(BALANCES):  # each balanced by the storage of the one before
-            try:
-                form = _balanced(read, tree, kind, u, y, discount, storage)
-                z = conic.solve(_program(form, kind, discount, None), SOLVER).x
-            except (SolverError, LinAlgError):
+        for times in OUTPUTS:
+            for _ in range(BALANCES):  # each balanced by the storage of the one before
+                try:
+                    form = _balanced(read, tree, kind, u, y, discount, storage, times)
+                    z = conic.solve(_program(form, kind, discount, None), SOLVER).x
+                except (SolverError, LinAlgError):
+                    break
+                least, storage = float(z[-2]), _outside(form, _storage(form, z))
+            if storage is not None:
                 break
-            least, storage = float(z[-2]), _outside(form, _storage(form, z))
         if read.whole == len(read.box):
             break
         tree = tree if storage is not None else _halved(read, tree)
@@ -206,8 +210,10 @@ def _balanced(
     y: FloatArray,
     discount: float,
     P: FloatArray | None,
+    times: float,
 ) -> _Form:
-    """Inputs and outputs in their scales, the output then in units of the mean's largest response.
+    """Inputs and outputs in their scales, the output then in units of the largest response, or
+    while there is no P in `times` that.
 
     States in units of P, or of the mean's observability Gramian; ν of what it moves state and
     output by; E with an identity in ν at its mean.
@@ -224,11 +230,12 @@ def _balanced(
     if m:
         some = [E * np.r_[np.ones(m + n), u] for leaf in leaves for E in leaf]
         responses += [_explicit(F, H, E, m) for E in some[:: max(1, len(some) // CORNERS)]]
-    output = max(_peak(AB * np.sqrt(discount), CD) for AB, CD in responses)
+    peaks = [_peak(AB * np.sqrt(discount), CD) for AB, CD in responses]
+    output = (max(peaks) or 1.0) * (times if P is None else 1.0)
     H, unit = H / output, output**2 if kind == "gain" else output
     if P is None:
         seen = [_observed(AB[:, :n] * np.sqrt(discount), CD[:, :n]) for AB, CD in responses]
-        P = np.mean(seen, axis=0) / output**2
+        P = np.mean(seen, axis=0) * (times / output) ** 2
     else:
         P = P / unit
     values, vectors = np.linalg.eigh((P + P.T) / 2.0)
@@ -251,15 +258,15 @@ def _explicit(F: FloatArray, H: FloatArray, E: FloatArray, m: int) -> tuple[Floa
 
 
 def _peak(AB: FloatArray, CD: FloatArray) -> float:
-    """The largest response of the mean over the frequencies of a grid, or 1."""
+    """The largest response over the frequencies of a grid; 0 on one where there is a pole."""
     n = len(AB)
     A, B, C, D = AB[:, :n], AB[:, n:], CD[:, :n], CD[:, n:]
     z = np.exp(1j * np.linspace(0.0, np.pi, FREQUENCIES))
     try:
         G = C @ np.linalg.solve(z[:, None, None] * np.eye(n) - A, B[None]) + D
     except LinAlgError:
-        return 1.0
-    return float(np.linalg.svd(G, compute_uv=False)[:, 0].max()) or 1.0
+        return 0.0
+    return float(np.linalg.svd(G, compute_uv=False)[:, 0].max())
 
 
 def _observed(A: FloatArray, C: FloatArray) -> FloatArray:

@@ -16,12 +16,19 @@ from bags.chain.training import save_training
 from bags.commands.cli import app
 from bags.commands.show import gain_lines, named_number
 from nlsid_core import files
-from nlsid_core.arrays import Json
+from nlsid_core.arrays import FloatArray, Json
 from nlsid_core.data.trajectory import Dataset, Trajectory
 from nlsid_core.errors import CertificateRejected, DataError, Infeasible, NlsidError
 from nlsid_core.identification import prove_gain
 from nlsid_core.kernel import Verdict
-from nlsid_core.models import DifferenceEquation, ImplicitModel, Signal, StateAffineModel
+from nlsid_core.models import (
+    CellNetwork,
+    DifferenceEquation,
+    ImplicitModel,
+    PiecewiseLinear,
+    Signal,
+    StateAffineModel,
+)
 from nlsid_core.models.polynomials import Polynomials
 from nlsid_core.proofs import check
 from tests.core.kernel.dissipation_claims import curved, feedthrough, integrator, moving
@@ -155,6 +162,57 @@ def test_a_gain_of_a_model_without_inputs_is_refused_with_words() -> None:
     )  # fmt: skip
     with pytest.raises(DataError, match="the model has no inputs, so nothing drives two runs"):
         prove_gain(free)
+
+
+def test_a_gain_is_found_where_most_inputs_move_nothing_that_is_seen() -> None:
+    """Two cells, the second behind the first: a storage is much more than what the mean shows."""
+    knots = np.array([-0.47, -0.34, -0.21, -0.09, 0.04, 0.17, 0.29])
+    levels = np.array([-1.03, -0.02, 0.98, 1.99, 3.0, 4.01, 5.01])
+    given = (
+        (knots, [-0.0188, 0.017, 0.0488, 0.0617, 0.0689, 0.0698, 0.0853]),
+        ([-0.729, 0.271, 1.271], [-0.729, 0.271, 0.271]),
+        (knots, [0.0, 0.0418, -0.0811, -0.0475, 0.136, 0.367, 0.538]),
+        (levels, [-0.608, 0.168, 0.98, 1.79, 2.6, 3.4, 4.22]),
+        ([4.37, 5.37, 6.37], [4.37, 5.37, 5.37]),
+        (levels, [0.0, 0.156, 0.318, 0.467, 0.627, 0.785, 0.959]),
+    )
+    maps = tuple((np.array(k, dtype=float), np.array(v, dtype=float)) for k, v in given)
+    into = np.zeros((6, 10))
+    for row, entries in enumerate((
+        {6: 1.0}, {0: 1.0, 8: 0.45, 9: 0.002}, {6: 1.0}, {7: 1.0},
+        {0: -0.575, 1: 0.575, 2: 1.0, 3: 1.0, 8: 0.537, 9: 0.0024}, {7: 1.0},
+    )):  # fmt: skip
+        for column, entry in entries.items():
+            into[row, column] = entry
+    after, seen = np.eye(10)[[1, 4]], 0.17 * np.eye(10)[[7]]
+    model = CellNetwork(
+        maps=tuple(PiecewiseLinear(k, v) for k, v in maps),
+        into=into, next=after, output=seen, start=np.array([-0.04, 2.08]), start_samples=20,
+        period=0.05, y=(Y,), u=(U,),
+    )  # fmt: skip
+    proof = prove_gain(model)
+    assert proof is not None
+
+    def outputs(u: FloatArray) -> FloatArray:
+        x, y = model.start, []
+        for now in u:
+            q = np.r_[np.zeros(6), x, now, 1.0]
+            for j, (at, value) in enumerate(maps):
+                reached = float(into[j] @ q)
+                left, right = (np.diff(value) / np.diff(at))[[0, -1]]
+                beyond = left * min(reached - at[0], 0.0) + right * max(reached - at[-1], 0.0)
+                q[j] = np.interp(reached, at, value) + beyond
+            y.append(float(seen[0] @ q))
+            x = after @ q
+        return np.array(y)
+
+    rng = np.random.default_rng(1)
+    ratios = []
+    for size in np.geomspace(0.01, 10.0, 12):
+        u = size * np.cumsum(rng.standard_normal((2, 300)), axis=1) / 10.0
+        apart = outputs(u[0]) - outputs(u[1])
+        ratios.append(np.linalg.norm(apart) / np.linalg.norm(u[0] - u[1]))
+    assert 0.1 < max(ratios) <= proof.number < 2.0
 
 
 def heard(gain: float) -> DifferenceEquation:
