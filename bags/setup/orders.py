@@ -31,15 +31,13 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     alone = len(held_back) == len(names)
     fitted = train if alone else train.without(held_back)
     errors: dict[int, float] = {}
-    refused: dict[int, str] = {}
     for lags in LAGS:
         try:
             fit = identify(
                 fitted, LinearClass(lags), method=Rse(iterations=TRIED_ITERATIONS),
                 comparators=(), test=train.select(held_back),
             )  # fmt: skip
-        except NlsidError as error:  # too few samples for so many, or no proof
-            refused.setdefault(lags, str(error))
+        except NlsidError:  # too few samples for so many, or no proof
             continue
         errors[lags] = float(fit.errors["test"]["rse"])
     known = {lags: error for lags, error in errors.items() if math.isfinite(error)}
@@ -47,11 +45,12 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
     section = proposal.content["identification"]
     good = min((lags for lags, error in known.items() if error * LAGS_BETTER <= best), default=0)
     others = sorted(set(LAGS) - {good}, key=lambda lags: (known.get(lags, math.inf), -lags))
-    for lags in (good, *others) if known else ():
+    refused: dict[int, str] = {}
+    for lags in (good, *others) if known else (section["lags"],):
         try:
-            identify(train, LinearClass(lags), comparators=())
+            fit = identify(train, LinearClass(lags), comparators=())
         except NlsidError as error:  # more data and iterations may end without a proof: the next
-            refused.setdefault(lags, str(error))
+            refused[lags] = str(error)
         else:
             section["lags"] = lags
             break
@@ -65,7 +64,10 @@ def say_lags(proposal: Proposal, train: Dataset) -> None:
             "told"
         )
         return
-    proposal.error = best
+    if not known:  # a part of the trials is too little for a model, and all of them are not
+        alone, held_back = True, list(names)
+        known = {lags: float(fit.errors["train"][fit.chosen.method.name])}
+    proposal.error = min(known.values())
     proposal.varies = _varies(train.select(held_back))
     said = ", ".join(f"{lags}: {error:.3g} %" for lags, error in known.items())
     proposal.tried_on = "what it was fitted to" if alone else proposal.tried_on

@@ -161,8 +161,9 @@ def _proved(
         raise DataError(f"passivity needs as many inputs as outputs; the model has {q} and {p}")
     if kind == "passivity" and read.limits == "clip":
         raise DataError(
-            "the model clips its inputs to a range, and so has no index of passivity: its output "
-            "answers to less than it is given. Identify it with on_out_of_range: refuse"
+            "the model clips its inputs to a range, and no index of passivity is proved of such: "
+            "what is applied differs by less than what is given, which a gain allows and a "
+            "product does not. Identify it with on_out_of_range: refuse"
         )
     if not 0.0 < discount <= 1.0:
         raise DataError(f"the discount should satisfy 0 < discount <= 1, not {discount}")
@@ -212,8 +213,9 @@ def _balanced(
     P: FloatArray | None,
     times: float,
 ) -> _Form:
-    """Inputs and outputs in their scales, the output then in units of the largest response, or
-    while there is no P in `times` that.
+    """Inputs and outputs in their scales, the output then in units of the largest response seen.
+
+    times: of that unit, while there is no P.
 
     States in units of P, or of the mean's observability Gramian; ν of what it moves state and
     output by; E with an identity in ν at its mean.

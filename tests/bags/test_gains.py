@@ -131,7 +131,7 @@ def test_a_model_that_needs_a_box_says_so_where_no_trials_lie_beside_it(tmp_path
 
 
 @pytest.mark.parametrize("model", [curved(), moving()])  # moving: on a box
-def test_a_model_that_clips_its_inputs_is_said_to_have_no_index(
+def test_a_model_that_clips_its_inputs_is_refused_an_index_with_the_reason(
     tmp_path: Path, model: StateAffineModel
 ) -> None:
     y, u = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 50))
@@ -140,7 +140,9 @@ def test_a_model_that_clips_its_inputs_is_said_to_have_no_index(
     path = written(tmp_path, replace(model, training=training))
     result = RUN.invoke(app, ["gain", str(path), "--passivity"])
     assert isinstance(result.exception, DataError)
-    assert "clips its inputs to a range, and so has no index" in str(result.exception)
+    assert "clips its inputs to a range, and no index of passivity is proved" in str(
+        result.exception
+    )
 
 
 def test_the_box_that_runs_have_to_stay_in_is_said_where_the_gain_is(tmp_path: Path) -> None:

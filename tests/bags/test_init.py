@@ -736,3 +736,19 @@ def test_what_identification_will_refuse_is_said_with_its_reason(tmp_path: Path)
     assert "rank 1" in reason
     refused = nlsid("identify", *f1tenth()[:6], "--config", config, "--out", tmp_path, status=None)
     assert reason in refused
+
+
+def test_lags_are_tried_on_all_trials_where_a_part_of_them_is_too_little(tmp_path: Path) -> None:
+    """The trials that are not held back stand still: only with the moving one is there a model."""
+    rng = np.random.default_rng(0)
+    for run in range(3):
+        given = np.repeat(rng.uniform(0.1, 0.9, 30), 10) if run else np.full(300, 0.4)
+        speeds = np.full(300, 0.4)
+        for k in range(1, 300):
+            speeds[k] = 0.8 * speeds[k - 1] + 0.2 * given[k - 1]
+        speed_bag(tmp_path / f"run_{run}", speeds + 1e-3 * rng.standard_normal(300), given)
+    config = tmp_path / "robot.yaml"
+    said = nlsid("init", tmp_path, "--yes", "--out", config, "-u", CMD, "-y", SPEED)
+    assert "will refuse" not in said
+    assert "of what it was fitted to" in said
+    nlsid("identify", tmp_path, "--config", config, "--out", tmp_path / "out")
