@@ -431,7 +431,7 @@ def _decide_pieces(
         kappa = stated["kappa"].array(len(spans), len(field.box))
         if any(k <= 0 for row in kappa for k in row):
             raise Rejected("kappa should be positive")
-        if len(_pushing(field)) < len(field.box):
+        if len(_pushing(field, field.equations, len(field.box))) < len(field.box):
             raise Rejected("w does more than add constants: kappa does not bound what it does")
     corners = hold.moved + (0 if kappa else len(field.box))
     _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits))
@@ -470,15 +470,19 @@ def _decide_rates(
 ) -> int:  # fmt: skip
     """Prove |dũ_i/dt| < R_i in the funnel, for every input where it is not at a limit.
 
-    What entries of w do that only push is taken off R; the others are at vertices.
+    What entries of (δ, w) do that only push is taken off R; the others are at vertices.
     """
-    pushing = _pushing(field)
-    corners = len(field.box) - len(pushing) + hold.moved
+    equations = [[_moved(e, field, hold.moved) for e in span] for span in field.equations]
+    every = hold.moved + len(field.box)
+    pushing = _pushing(field, equations, every)
+    corners = every - len(pushing)
     _refuse_many(len(spans), 2**corners, 3 ** len(policy.limits), 2 * field.m)
-    values = product(
-        *(((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(field.box))
-    )
-    vertices, limited = list(product(hold.corners, values)), list(policy.limits)
+    sides = [(0,) if j in pushing else (-1, 1) for j in range(hold.moved)]
+    values = [
+        ((a + b) / 2,) if hold.moved + j in pushing else (a, b)
+        for j, (a, b) in enumerate(field.box)
+    ]
+    vertices, limited = list(product(product(*sides), product(*values))), list(policy.limits)
     cases = [
         (i, sign, *mode)
         for i, sign, mode in product(range(field.m), (-1, 1), _modes(policy))
@@ -487,8 +491,7 @@ def _decide_rates(
     needed = list(product(range(len(spans)), range(len(vertices)), cases))
     names = "input sign tau" + " mode" * bool(limited)
     order, pieces = _in_order(stated["rate_pieces"], names, needed, len(limited), work)
-    halves = {j: (field.box[j][1] - field.box[j][0]) / 2 for j in pushing}
-    equations = [[_moved(e, field, hold.moved) for e in span] for span in field.equations]
+    halves = [(b - a) / 2 for a, b in field.box]
     loops: dict[tuple[object, ...], _Loop] = {}  # as above
 
     def decide_piece(ring: Ring, number: int) -> None:
@@ -498,10 +501,10 @@ def _decide_rates(
         if key not in loops:
             loops.clear()
             loops[key] = _Loop(ring, equations[spans[k]], policy, funnel, key[1:4], key[4])
-        loop, room = loops[key], hold.rates[k][i]
-        for j, half in halves.items():
-            column = [_pushed(equation, j, field) for equation in field.equations[spans[k]]]
-            room -= half * max(abs(_product(gain[i], column)) for gain in policy.K[k])
+        loop, room, ranges = loops[key], hold.rates[k][i], [*hold.widths[k][: hold.moved], *halves]
+        for j in pushing:
+            column = [_pushed(equation, j, field) for equation in equations[spans[k]]]
+            room -= ranges[j] * max(abs(_product(gain[i], column)) for gain in policy.K[k])
         off = (*hold.push(k, corner), *w)
         c = loop.rate_condition(room, i, sign, pieces[place], stated, off)
         squares = read_squares(pieces[place] | {"basis": stated["basis"]}, loop.ring)
@@ -522,13 +525,11 @@ def _modes(policy: Policy) -> list[tuple[int, ...]]:
     return list(product((0, -1, 1), repeat=len(policy.limits)))
 
 
-def _pushing(field: Field) -> list[int]:
-    """The entries of w that do nothing but add constants to ẋ, in all time spans."""
+def _pushing(field: Field, equations: list[list[Terms]], count: int) -> list[int]:
+    """Which of the last `count` variables, w or (δ, w), only add constants to ẋ in all spans."""
     first = 1 + field.n + field.m
-    rows = [e for span in field.equations for equation in span for e, _ in equation]
-    return [
-        j for j in range(len(field.box)) if all(sum(row) == 1 for row in rows if row[first + j])
-    ]
+    rows = [e for span in equations for equation in span for e, _ in equation]
+    return [j for j in range(count) if all(sum(row) == 1 for row in rows if row[first + j])]
 
 
 def _moved(equation: Terms, field: Field, moved: int) -> Terms:
@@ -553,7 +554,7 @@ def _moved(equation: Terms, field: Field, moved: int) -> Terms:
 
 
 def _pushed(equation: Terms, j: int, field: Field) -> Fraction:
-    """What w_j adds to one rate, for an entry that only pushes."""
+    """What a unit of entry j adds to one rate, for an entry that only pushes."""
     return sum((c for e, c in equation if e[1 + field.n + field.m + j]), Fraction(0))
 
 

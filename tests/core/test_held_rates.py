@@ -51,12 +51,17 @@ def test_a_proof_of_rates_has_no_products_that_no_cubic_term_needs(held: FunnelD
         assert not any(any(row[2:]) for row in piece["tau"][0]["squares"]["factors"][0])
 
 
-def test_rates_bound_what_samples_show_and_not_by_much() -> None:
-    """For two inputs, one of which enters times the other: every corner of δ, in |z| ≤ 1."""
-
-    def rate(x: Any, u: Any) -> Any:
-        return [x[1] + x[0] ** 2 * x[2], u[0] * u[1] + x[0] * u[0], u[1] - x[2] * x[0]]
-
+@pytest.mark.parametrize(
+    "rate",
+    [
+        lambda x, u: [x[1] + x[0] ** 2 * x[2], u[0] * u[1] + x[0] * u[0], u[1] - x[2] * x[0]],
+        lambda x, u: [x[1] + x[0] ** 2 * x[2], u[0] * x[1] + x[0] * u[0], u[1] - x[2] * x[0]],
+        lambda x, u: [x[1] + x[0] ** 2 * x[2], u[0] + x[0], u[1] - x[2] * x[0] + u[0]],
+    ],
+    ids=["times the other", "one only pushes", "both only push"],
+)
+def test_rates_bound_what_samples_show_and_not_by_much(rate: Any) -> None:
+    """For two inputs: every corner of δ, in |z| ≤ 1."""
     field = VectorField.from_function(rate, 3, 2)
     rng, t = np.random.default_rng(3), np.array([0.0, 2.0])
     x, u, K = (

@@ -6,7 +6,7 @@ searched for W; so R is bounded in a larger one first. Nothing here is trusted.
 Source: docs/theory-funnels.md, "The hold between samples".
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
@@ -122,7 +122,7 @@ class _Rates:
     """Rates of inputs in one time span: pieces of time at vertices, corners and modes.
 
     w: (B, n_w). entry, sign: (B,) of the input. taken: (B,) what entries of w that only push add to
-    the rate, in input units per s.
+    the rate, in input units per s; shoved: (B, m) what a unit of every δ that only pushes adds.
     """
 
     pieces: Pieces
@@ -130,17 +130,23 @@ class _Rates:
     entry: IntArray
     sign: IntArray
     taken: FloatArray
+    shoved: FloatArray
+
+    def room(self, rates: FloatArray, widths: FloatArray) -> FloatArray:
+        """(B,) what R and W (intervals, m) leave to the rest, in input units per s."""
+        k = self.pieces.interval
+        left: FloatArray = rates[k, self.entry] - self.taken - (self.shoved * widths[k]).sum(axis=1)
+        return left
 
     def polynomial(
         self,
         steps: LSteps,
         policy: ContinuousPolicy,
         funnel: ContinuousFunnel,
-        rates: FloatArray,
+        room: FloatArray,
         end: int | None = None,
     ) -> Graded:
-        """What has to be positive for rates (intervals, m); end: only its value at 0 or at 1."""
-        room = rates[self.pieces.interval, self.entry] - self.taken
+        """What has to be positive for this room (B,); end: only its value at 0 or at 1."""
         return rate_polynomial(
             steps.field, policy, funnel, self.pieces, self.w, room=room, entry=self.entry,
             sign=self.sign, end=end,
@@ -151,17 +157,18 @@ class _Rates:
 class Changes:
     """dũ/dt in a funnel at both ends of every interval, whatever the widths of δ.
 
-    It has degree at most 1 in each δ_i, so the corners of |δ_i| ≤ 1 give it for all others. A row
-    is an input in an interval, in a mode at a vertex of w.
+    It has degree at most 1 in each δ_i, so the corners of |δ_i| ≤ 1 give it for all others; those
+    that only push are at 0. A row is an input in an interval, in a mode at a vertex of w.
 
-    interval, entry, taken: (B,), see `_Rates`. products: per end, by degree in z, (B, corners, M_q)
-    coefficients of the products of δ, of -h dũ_i/dt. chosen: (corners, m) 1 where a product has
-    δ_i. signs: (corners, corners) of the products at each corner. h: (intervals,) s.
+    interval, entry, taken, shoved: see `_Rates`. products: per end, by degree in z, (B, corners,
+    M_q) coefficients of the products of δ, of -h dũ_i/dt. chosen: (corners, m) 1 where a product
+    has δ_i. signs: (corners, corners) of the products at each corner. h: (intervals,) s.
     """
 
     interval: IntArray
     entry: IntArray
     taken: FloatArray
+    shoved: FloatArray
     products: tuple[list[FloatArray], list[FloatArray]]
     chosen: IntArray
     signs: FloatArray
@@ -171,9 +178,10 @@ class Changes:
     @classmethod
     def of(cls, steps: LSteps, policy: ContinuousPolicy, funnel: ContinuousFunnel) -> "Changes":
         """Of this funnel; steps: with widths, of any size."""
-        field, count = steps.field, len(steps.corners)
-        chosen, K = (steps.corners > 0).astype(int), len(funnel.t) - 1
-        signs = np.prod(np.where(chosen == 1, steps.corners[:, None], 1.0), axis=2)
+        field, K = steps.field, len(funnel.t) - 1
+        corners = _corners(field)
+        chosen, count = (corners > 0).astype(int), len(corners)
+        signs = np.prod(np.where(chosen == 1, corners[:, None], 1.0), axis=2)
         unit, curving = np.ones((K, field.m)), curving_states(field)
         found: tuple[list[list[FloatArray]], list[list[FloatArray]]] = ([], [])
         rows = []
@@ -183,23 +191,29 @@ class Changes:
             corner, vertex = np.divmod(pieces.vertex, (int(pieces.vertex.max()) + 1) // count)
             order = np.lexsort((corner, batch.entry, vertex, *pieces.mode.T, pieces.interval))
             first = order[::count]
-            rows.append((pieces.interval[first], batch.entry[first], batch.taken[first]))
+            stated = pieces.interval, batch.entry, batch.taken, batch.shoved
+            rows.append(tuple(part[first] for part in stated))
             for end in (0, 1):
                 c, _ = _at_end(steps, policy, funnel, batch, curving, end)
                 at_corners = [part[order].reshape(len(first), count, -1) for part in c]
                 found[end].append([signs.T @ part / count for part in at_corners])
         together = [[np.concatenate(parts) for parts in zip(*of_end, strict=True)]
                     for of_end in found]  # fmt: skip
-        interval, entry, taken = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-        return cls(interval, entry, taken, (together[0], together[1]), chosen, signs,
-                   np.diff(funnel.t), curving)  # fmt: skip
+        interval, entry, taken, shoved = (
+            np.concatenate(parts) for parts in zip(*rows, strict=True)
+        )
+        return cls(
+            interval, entry, taken, shoved, (together[0], together[1]), chosen, signs,
+            np.diff(funnel.t), curving,
+        )  # fmt: skip
 
     def rates(self, widths: FloatArray) -> FloatArray:
         """(intervals, m) the largest at the ends of intervals, for δ in these widths."""
         result = np.zeros(widths.shape)
         weights = np.prod(np.where(self.chosen == 1, widths[:, None], 1.0), axis=2)[self.interval]
         place = np.repeat(np.column_stack([self.interval, self.entry]), len(self.signs), axis=0)
-        h, taken = self.h[place[:, 0]], np.repeat(self.taken, len(self.signs))
+        pushed = self.taken + (self.shoved * widths[self.interval]).sum(axis=1)
+        h, taken = self.h[place[:, 0]], np.repeat(pushed, len(self.signs))
         for products in self.products:
             p = [self.signs @ (weights[..., None] * part) for part in products]
             for sign in (-1, 1):
@@ -243,7 +257,7 @@ def prove_rates(
         written: dict[Part, list[Json | None]] = {}
         for batch in _batches(steps, policy, waiting, basis[used], widths):
             batch = _witnessed(steps, policy, funnel, batch, curving, rates)
-            c = batch.polynomial(steps, policy, funnel, rates)
+            c = batch.polynomial(steps, policy, funnel, batch.room(rates, widths))
             rows = rate_documents(funnel, batch.pieces, c, basis, used)
             places = zip(batch.entry.tolist(), batch.sign.tolist(), rows, strict=True)
             for b, (entry, sign, row) in enumerate(places):
@@ -272,16 +286,16 @@ def _batches(
 ) -> Iterator[_Rates]:  # fmt: skip
     """Every rate on these parts of time, one span of the equations after the other."""
     field, n = steps.field, steps.program.n
-    pushing = _pushing(field)
-    ends = field.uncertain.tolist()
-    boxes = [((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(ends)]
-    corners = list(product(*boxes))
-    values = np.array(corners).reshape(len(corners), -1)
+    own = _pushing(field, 1 + n + field.m, len(field.uncertain))
+    boxes = [((a + b) / 2,) if pushes else (a, b)
+             for pushes, (a, b) in zip(own, field.uncertain.tolist(), strict=True)]  # fmt: skip
+    values = _grid(boxes)
+    corners = _corners(field)
     limited = steps.limits[:, 0].astype(int).tolist()
     cases = [
         (v, entry, sign, mode)
         for mode in range(len(steps.modes))
-        for v in range(len(values) * len(steps.corners))
+        for v in range(len(values) * len(corners))
         for entry in range(field.m)
         for sign in signs
         if entry not in limited or not steps.modes[mode][limited.index(entry)]
@@ -301,32 +315,41 @@ def _batches(
             T=np.tile(np.eye(n), (count, 1, 1)),
             mu=np.zeros((count, 2, 0)), gram=np.zeros((count, 2, len(basis), len(basis))),
             mode=steps.modes[m], tau=np.zeros((count, 2, 1 + limits, n + 1, n + 1)),
-            push=steps.corners[v // len(values)] * widths[place[:, 0]],
+            push=corners[v // len(values)] * widths[place[:, 0]],
             stated=np.empty(count, dtype=object),
         )  # fmt: skip
-        g = _pushes(field, span, pushing)
         gains = policy.K.control[place[:, 0]][np.arange(count), :, i]
-        taken = np.abs(gains @ g).max(axis=1) @ halves
-        yield _Rates(pieces, values[v % len(values)], i, side, taken)
+        shoved, own_shoved = (
+            np.abs(gains @ _pushes(field, span, first, found)).max(axis=1)
+            for first, found in ((1 + n, _pushing(field, 1 + n, field.m)), (1 + n + field.m, own))
+        )
+        yield _Rates(pieces, values[v % len(values)], i, side, own_shoved @ halves, shoved)
 
 
-def _pushing(field: VectorField) -> list[int]:
-    """The entries of w that do nothing but add constants to ẋ, in all time spans."""
-    first = 1 + field.n + field.m
+def _grid(sides: Sequence[tuple[float, ...]]) -> FloatArray:
+    """(points, entries) all of a product, the last entry changing first."""
+    points = list(product(*sides))
+    return np.array(points).reshape(len(points), -1)
+
+
+def _corners(field: VectorField) -> FloatArray:
+    """(corners, m) of |δ_i| ≤ 1 that a rate is proved at: 0 for every δ_i that only pushes."""
+    pushing = _pushing(field, 1 + field.n, field.m)
+    return _grid([(0.0,) if pushes else (-1.0, 1.0) for pushes in pushing])
+
+
+def _pushing(field: VectorField, first: int, count: int) -> list[bool]:
+    """Of each of `count` variables from this column: does it only add constants to ẋ, always?"""
     rows = np.concatenate([p.exponents for equations in field.pieces for p in equations])
-    return [
-        j
-        for j in range(len(field.uncertain))
-        if (rows[rows[:, first + j] > 0].sum(axis=1) == 1).all()
-    ]
+    return [bool((rows[rows[:, first + j] > 0].sum(axis=1) == 1).all()) for j in range(count)]
 
 
-def _pushes(field: VectorField, span: int, pushing: list[int]) -> FloatArray:
-    """(n, n_w) what each entry of w that only pushes adds to ẋ; zero for the others."""
-    g, first = np.zeros((field.n, len(field.uncertain))), 1 + field.n + field.m
+def _pushes(field: VectorField, span: int, first: int, pushing: list[bool]) -> FloatArray:
+    """(n, count) what a unit of each variable that only pushes adds to ẋ; zero for the others."""
+    g = np.zeros((field.n, len(pushing)))
     for i, p in enumerate(field.pieces[span]):
         for exponent, coefficient in p.terms():
-            for j in pushing:
+            for j in np.flatnonzero(pushing).tolist():
                 if exponent[first + j]:
                     g[i, j] += float(coefficient)
     return g
@@ -340,12 +363,8 @@ def _at_end(
     pieces, n = batch.pieces, funnel.n
     k, at = pieces.interval, _ends(pieces)[end]
     frames = Frames.of(funnel, k, at, curving)
-    framed = replace(
-        batch, pieces=replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)),
-        taken=np.zeros_like(batch.taken),
-    )  # fmt: skip
-    nothing = np.zeros((len(policy.t) - 1, steps.field.m))
-    c = framed.polynomial(steps, policy, funnel, nothing, end)
+    framed = replace(batch, pieces=replace(pieces, T=frames.T, tau=np.zeros_like(pieces.tau)))
+    c = framed.polynomial(steps, policy, funnel, np.zeros(len(pieces)), end)
     sizes = [len(monomials_of(n, q)) for q in range(4)]
     none = [np.zeros((len(pieces), size)) for size in sizes]
     return [c[q][:, 0] if q in c else none[q] for q in range(4)], frames
@@ -358,7 +377,8 @@ def _witnessed(
     """The batch with τ as a proof states it, and Gram matrices in x̄ at both ends."""
     pieces, k = batch.pieces, batch.pieces.interval
     tau, gram = pieces.tau.copy(), pieces.gram.copy()
-    room = np.diff(funnel.t)[k] * (rates[k, batch.entry] - batch.taken)
+    assert steps.widths is not None  # as in `prove_rates`
+    room = np.diff(funnel.t)[k] * batch.room(rates, steps.widths)
     one = int(np.flatnonzero(~pieces.basis.any(axis=1))[0])
     for end in (0, 1):
         c, frames = _at_end(steps, policy, funnel, batch, curving, end)

@@ -42,11 +42,11 @@ def claim(low: float) -> Files:
         for k, v, mode in product(range(3), range(2), (-1, 0, 1))
     ]
     rates: list[dict[str, Any]] = []
-    for k, v, sign in product(range(3), range(2), (-1, 1)):
+    for k, sign in product(range(3), (-1, 1)):
         # u₀ climbs faster than R where it is beyond its limit: 3 (ũ² - 1) h R is added there.
         piece = witness(k, 3 if (k, sign) == (1, 1) else 0)
         still = {"columns": [0, 0], "squares": nothing}
-        piece |= {"vertex": v, "mode": [0], "input": 0, "sign": sign, "tau": [still, *piece["tau"]]}
+        piece |= {"vertex": 0, "mode": [0], "input": 0, "sign": sign, "tau": [still, *piece["tau"]]}
         rates.append(piece)
     proof = {
         "margin": 0.5, "basis": free, "multiplier": free, "sides": free, "pieces": pieces,
@@ -55,6 +55,56 @@ def claim(low: float) -> Files:
     about = {role: {"file": f"{role}.json", "digest": ""}
              for role in ("vector_field", "policy", "funnel")}  # fmt: skip
     stated = {"kind": "continuous_funnel", "about": about, "hold": HOLD}
+    files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
+             PROOF: proofs.proof_document(stated, proof)}  # fmt: skip
+    bind(files)
+    return files
+
+
+def integrator(rate: float) -> Files:
+    """dx/dt = u, u = -x held for 0.25 s, |x| <= 1 for 2 s: |du/dt| = |x - δ|, |δ| <= 0.25 rate.
+
+    rate: claimed, in 1/s.
+    """
+    field = {
+        "format": "nlsid/vector_field", "version": 2, "states": 1, "inputs": 1, "uncertain": [],
+        "breaks": [], "valid": [], "expansion": "",
+        "pieces": [[{"exponents": [[0, 0, 1]], "coefficients": [1.0]}]],
+    }  # fmt: skip
+    policy = {
+        "format": "nlsid/policy", "version": 2, "kind": "continuous", "vector_field": "",
+        "t": [0.0, 2.0], "x": [[[0.0]]], "u": [[[0.0]]], "K": [[[[1.0]]]], "limits": [],
+    }  # fmt: skip
+    funnel = {
+        "format": "nlsid/funnel", "version": 2, "kind": "continuous", "vector_field": "",
+        "policy": "", "t": [0.0, 2.0], "x": [[[0.0]]], "P": [[[1.0]]] * 2, "rho": [1.0] * 2,
+    }  # fmt: skip
+    part: dict[str, Any] = {"interval": 0, "level": 0, "index": 0, "columns": [0, 0]}
+
+    def squared(constant: int, unit: int) -> dict[str, Any]:
+        """(x + constant / 2^unit)²."""
+        return {"unit": unit, "factors": [[[constant, 2**unit]]]}
+
+    # -2x 2(-x + δ) - 2 margin + 2.5 (1 - x²), δ nearly ±11/32
+    mu = {"shifts": [-1], "start": [5], "end": [5]}
+    pieces = [
+        {**part, "vertex": v, "mu": mu, "squares": squared(side * 22, 5)}
+        for v, side in ((0, 1), (1, -1))
+    ]
+    # 2 (R - W) - sign 2x - (1 - x²) = (x - sign)² + 2 (R - W - 1)
+    shell = {"columns": [0, 0], "squares": {"unit": 0, "factors": [[[1, 0]]]}}
+    rates = [
+        {**part, "vertex": 0, "input": 0, "sign": sign, "tau": [shell],
+         "squares": squared(-sign, 0)}
+        for sign in (-1, 1)
+    ]  # fmt: skip
+    proof = {
+        "margin": 0.5, "basis": [[0], [1]], "multiplier": [[0]], "sides": [[0], [1]],
+        "pieces": pieces, "rates": [[rate]], "rate_pieces": rates,
+    }  # fmt: skip
+    about = {role: {"file": f"{role}.json", "digest": ""}
+             for role in ("vector_field", "policy", "funnel")}  # fmt: skip
+    stated = {"kind": "continuous_funnel", "about": about, "hold": 0.25}
     files = {FIELD: field, POLICY: policy, FUNNEL: funnel,
              PROOF: proofs.proof_document(stated, proof)}  # fmt: skip
     bind(files)

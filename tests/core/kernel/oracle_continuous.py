@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import lru_cache
-from itertools import pairwise, product
+from itertools import pairwise, product, zip_longest
 from math import comb
 from typing import Any
 
@@ -139,30 +139,34 @@ class Oracle:
         total: Fraction = hold * fastest + shaken
         return total
 
+    def ranges(self, k: int) -> list[list[Fraction]]:
+        """Lows and highs of what the input is off by, if anything, and of w."""
+        off = [self.width(k, i) for i in range(self.m)] if self.sides() != [()] else []
+        return [[-width, width] for width in off] + numbers(self.field["uncertain"])
+
     def pushing(self) -> list[int]:
-        """The entries of w that are alone in every monomial that they are in."""
+        """The entries of `ranges` that are alone in every monomial that they are in."""
         rows = [r for span in self.field["pieces"] for e in span for r in e["exponents"]]
-        first = 1 + self.n + self.m
-        return [j for j in range(len(self.field["uncertain"]))
+        first = 1 + self.n + (self.m if self.sides() == [()] else 0)
+        return [j for j in range(len(self.ranges(0)))
                 if all(sum(row) == 1 for row in rows if row[first + j])]  # fmt: skip
 
-    def rate_corners(self) -> list[tuple[Fraction, ...]]:
-        """w at the vertices of rates: what pushes only is in the middle."""
-        box, pushing = numbers(self.field["uncertain"]), self.pushing()
-        return list(
-            product(*(((a + b) / 2,) if j in pushing else (a, b) for j, (a, b) in enumerate(box)))
-        )
+    def rate_corners(self, k: int) -> list[tuple[Fraction, ...]]:
+        """The vertices of rates in `ranges`: what pushes only is in the middle."""
+        pushing = self.pushing()
+        return list(product(*(((a + b) / 2,) if j in pushing else (a, b)
+                              for j, (a, b) in enumerate(self.ranges(k)))))  # fmt: skip
 
     def rate_vertices(self) -> int:
         """How many vertices a rate is proved at."""
-        return len(self.rate_corners()) * len(self.sides())
+        return len(self.rate_corners(0))
 
     def rate_left(self, piece: Document, sigma: Fraction, e: list[Fraction]) -> Fraction:
-        """h R ∓ dũ_i/ds - τ_0 (ρ - W) - Σ τ_l q_l, with what w pushes taken off R."""
+        """h R ∓ dũ_i/ds - τ_0 (ρ - W) - Σ τ_l q_l, with what only pushes taken off R."""
         k, n, i = piece["interval"], self.n, piece["input"]
         s = (piece["index"] + sigma) / Fraction(2) ** piece["level"]
         t0, t1 = (Fraction(self.funnel["t"][j]) for j in (k, k + 1))
-        h, corners = t1 - t0, self.rate_corners()
+        h, ranges = t1 - t0, self.ranges(k)
         x0, u0, K = (numbers(part[k]) for part in (self.funnel["x"], self.policy["u"],
                                                    self.policy["K"]))  # fmt: skip
         nominal = [bernstein([p[j] for p in x0], s) for j in range(n)]
@@ -178,8 +182,10 @@ class Oracle:
             applied[j] = wanted[j] if mode == 0 else low if mode < 0 else high
             taken.append((high - wanted[j]) * (wanted[j] - low) if mode == 0
                          else low - wanted[j] if mode < 0 else wanted[j] - high)  # fmt: skip
-        applied = add(applied, self.push(k, piece["vertex"], len(corners)))
-        w = list(corners[piece["vertex"] % len(corners)])
+        corner = list(self.rate_corners(k)[piece["vertex"]])
+        off = corner[: len(corner) - len(self.field["uncertain"])]
+        applied = [u + by for u, by in zip_longest(applied, off, fillvalue=Fraction(0))]
+        w = corner[len(off) :]
         f = self.rate(k, (1 - s) * t0 + s * t1, add(nominal, e), applied, w)
         gains = [bernstein([gain[i][a] for gain in K], s) for a in range(n)]
         turning = [slope([gain[i][a] for gain in K], s) for a in range(n)]
@@ -187,11 +193,12 @@ class Oracle:
         change = slope([p[i] for p in u0], s) - dot(turning, e) - dot(gains, away)
         room = Fraction(self.proof["rates"][k][i])
         for j in self.pushing():
-            low, high = numbers(self.field["uncertain"][j])
-            unit = [Fraction(int(a == j)) for a in range(len(w))]
-            nowhere = [Fraction(0)] * self.n, [Fraction(0)] * self.m
-            still = self.rate(k, t0, *nowhere, [Fraction(0)] * len(w))
-            g = [a - b for a, b in zip(self.rate(k, t0, *nowhere, unit), still, strict=True)]
+            low, high = ranges[j]
+            none = [Fraction(0)] * self.n, [Fraction(0)] * self.m, [Fraction(0)] * len(w)
+            unit = [[Fraction(int(a == j)) for a in range(len(off))],
+                    [Fraction(int(a == j - len(off))) for a in range(len(w))]]  # fmt: skip
+            there = self.rate(k, t0, none[0], unit[0] or none[1], unit[1])
+            g = [a - b for a, b in zip(there, self.rate(k, t0, *none), strict=True)]
             room -= (high - low) / 2 * max(abs(dot(gain[i], g)) for gain in K)
         P0, P1 = (numbers(self.funnel["P"][j]) for j in (k, k + 1))
         Pe = [dot([(1 - s) * a + s * b for a, b in zip(*rows, strict=True)], e)

@@ -1,4 +1,4 @@
-"""A held input of a clipped policy may be older than the bounds that it has to keep."""
+"""Held inputs: what bounds they have to keep, and how fast the policy may change them."""
 
 from fractions import Fraction
 
@@ -7,7 +7,7 @@ import pytest
 from nlsid_core import proofs
 from nlsid_core.errors import CertificateRejected
 from nlsid_core.kernel import Verdict
-from tests.core.kernel.held_claims import HOLD, LIMITS, TIMES, WANTED, claim
+from tests.core.kernel.held_claims import HOLD, LIMITS, TIMES, WANTED, claim, integrator
 from tests.core.kernel.oracle_continuous import agrees
 from tests.funnel_files import PROOF, Files
 
@@ -49,3 +49,19 @@ def test_a_bound_that_the_oldest_held_input_keeps_is_proved() -> None:
         "before the solution's start, for the state then, u0 clipped to [-1, 1]",
     )
     assert agrees(files[PROOF], files)
+
+
+@pytest.mark.parametrize("rate", [1.375, 1.34375, 1.328125, 1.3125, 1.25])
+def test_what_an_input_that_only_pushes_is_off_by_is_taken_off_its_rate(rate: float) -> None:
+    """At x = 1, off by δ = -rate/4, u changes by 1 + rate/4 a second: below rate from 4/3 on."""
+    off, fastest = Fraction(rate) / 4, Fraction(0)
+    for x in (-1, 1):
+        for delta in (-off, off):
+            fastest = max(fastest, abs(-(-x + delta)))
+    files = integrator(rate)
+    assert agrees(files[PROOF], files) == (fastest < Fraction(rate))
+    if fastest < Fraction(rate):
+        assert "4 pieces of time" in decided(files).statement
+    else:
+        with pytest.raises(CertificateRejected, match=r"rate piece 0 .* not positive"):
+            decided(files)
