@@ -297,7 +297,7 @@ Proof.
 Qed.
 
 (* The same of what is added to the inputs: they come before w. *)
-Lemma zip_split a : forall pre, (exists b b0 c, forall y post,
+Lemma zip_split a : forall pre, (exists b b0 c, length b = length pre /\ forall y post,
     zip Rplus a (pre ++ y :: post) = b ++ (b0 + y) :: zip Rplus c post) \/
   (exists b, forall y post, zip Rplus a (pre ++ y :: post) = b).
 Proof.
@@ -305,8 +305,8 @@ Proof.
   - right. now exists [].
   - right. now exists [].
   - left. now exists [], a0, a.
-  - destruct (IH pre) as [[b [b0 [c H]]]|[b H]].
-    + left. exists (a0 + p :: b), b0, c. intros y post. now rewrite H.
+  - destruct (IH pre) as [[b [b0 [c [L H]]]]|[b H]].
+    + left. exists (a0 + p :: b), b0, c. split; [cbn; congruence|]. intros y post. now rewrite H.
     + right. exists (a0 + p :: b). intros y post. now rewrite H.
 Qed.
 Lemma growth_affine_inputs n g s x a v : Forall (linear_beyond (1 + n)) (equations g) ->
@@ -316,7 +316,7 @@ Proof.
   { apply (growth_affine (1 + n)); auto. rewrite app_nil_r. cbn. congruence. }
   assert (E : forall u, growth g s x u v = growth g s x [] (u ++ v)) by reflexivity.
   intros pre post p q l. cbn beta. rewrite !E.
-  destruct (zip_split a pre) as [[b [b0 [c H]]]|[b H]].
+  destruct (zip_split a pre) as [[b [b0 [c [_ H]]]]|[b H]].
   - rewrite !H, <- !app_assoc. cbn [app].
     replace (b0 + ((1 - l) * p + l * q)) with ((1 - l) * (b0 + p) + l * (b0 + q)) by ring.
     rewrite (A b (zip Rplus c post ++ v)). reflexivity.

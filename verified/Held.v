@@ -44,7 +44,7 @@ Definition feeds_ok (g : segment) : bool :=
 Section Held.
 Context {K : Ints}.
 
-(* By segment: the rates of the inputs, and what proves them; entries of w that only push. *)
+(* By segment: the rates of the inputs, and what proves them; entries of (delta, w) that only push. *)
 Record rate_witness := Rates {
   rates : list (list num); pushing : list bool; turns : list (list rate_piece) }.
 Definition held_ok (d : problem) (period : num) (errors : list num) (w : witness) (r : rate_witness)
@@ -850,10 +850,10 @@ Proof.
 Qed.
 End Problem.
 
-(* The same of files. Entries of w that only push do so in all time spans. *)
+(* The same of files. Entries of (delta, w) that only push do so in all time spans. *)
 Definition pushing_of (f : field_file) : list bool :=
-  map (fun j => forallb (forallb (alone (1 + states f + inputs f + j))) (spans f))
-    (seq 0 (length (uncertain f))).
+  map (fun j => forallb (forallb (alone (1 + states f + j))) (spans f))
+    (seq 0 (inputs f + length (uncertain f))).
 Definition held_files_ok f p u g e (period : num) (errors : list num) (w : witness)
   (rs : list (list num)) (ts : list (list rate_piece)) : bool :=
   andb (andb (field_ok f) (andb (policy_ok f p) (shape_ok f p u g)))

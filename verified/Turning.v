@@ -85,10 +85,11 @@ Fixpoint mixed (pushing : list bool) (box : list (num * num)) : list (list num) 
   | false :: f, (a, b) :: box' => map (cons a) (mixed f box') ++ map (cons b) (mixed f box')
   | _, _ => [[]]
   end.
-Definition rate_cases (pushing : list bool) (box : list (num * num)) (off : list num)
-  : list (list num * list num) :=
-  flat_map (fun delta => map (pair delta) (mixed pushing box)) (vertices (around off)).
-(* What entries of w that are at their centre add. *)
+(* Vertices of (delta, w): entries that only push are at their centre. *)
+Definition rate_box (d : problem) (off : list num) : list (num * num) := around off ++ box d.
+Definition rate_cases (d : problem) (pushing : list bool) (off : list num) : list (list num) :=
+  mixed pushing (rate_box d off).
+(* What these entries add. *)
 Fixpoint shoved (pushing : list bool) (box : list (num * num)) (g : segment) (i j : nat) : num :=
   match pushing, box with
   | f :: pushing', b :: box' =>
@@ -101,15 +102,16 @@ Definition is_free (m : list Condition.side) (i : nat) : bool :=
 Definition rate_piece_ok (d : problem) (w : witness) (products : choices) (pushing : list bool)
   (g : segment) (off rates : list num) (q : rate_piece) : bool :=
   let p := part q in
-  match nth_error (rate_cases pushing (box d) off) (vertex p), nth_error (modes (limits d)) (mode p),
+  match nth_error (rate_cases d pushing off) (vertex p), nth_error (modes (limits d)) (mode p),
     all_expanded (sides w) (tau p) with
-  | Some (delta, v), Some m, Some taus =>
-      let n := length (nominal g) in
+  | Some v, Some m, Some taus =>
+      let delta := firstn (length off) v in
+      let corner := skipn (length off) v in
       let room := nsub (nth (whose q) rates nzero)
-        (shoved pushing (box d) g (whose q) (1 + n + length (limits d))) in
+        (shoved pushing (rate_box d off) g (whose q) (1 + length (nominal g))) in
       andb (0 <=? depth p)%Z
         (is_positive (basis w) products (columns p) (gram_factors p)
-          (fturning room (upward q) (limits d) m delta v g (depth p) (index p) (whose q) taus))
+          (fturning room (upward q) (limits d) m delta corner g (depth p) (index p) (whose q) taus))
   | _, _, _ => false
   end.
 Definition rates_covered (d : problem) (pushing : list bool) (off : list num) (qs : list rate_piece)
@@ -119,9 +121,9 @@ Definition rates_covered (d : problem) (pushing : list bool) (off : list num) (q
     forallb (fun v => forallb (fun im =>
         if is_free (snd im) i then (2 ^ 16 <=? reached v (fst im) 0 ps)%Z else true)
       (combine (seq 0 (length (modes (limits d)))) (modes (limits d))))
-      (seq 0 (length (rate_cases pushing (box d) off)))) [true; false])
+      (seq 0 (length (rate_cases d pushing off)))) [true; false])
     (seq 0 (length (limits d))).
-(* Which entries of w only push; their equations, and the policy's curves. *)
+(* Which entries of (delta, w) only push; their equations, and the policy's curves. *)
 Fixpoint pushing_ok (pushing : list bool) (es : list equation) (j : nat) : bool :=
   match pushing with
   | [] => true
@@ -129,8 +131,9 @@ Fixpoint pushing_ok (pushing : list bool) (es : list equation) (j : nat) : bool 
   end.
 Definition rates_ok (d : problem) (w : witness) (pushing : list bool) (g : segment)
   (off rates : list num) (qs : list rate_piece) : bool :=
-  andb (andb (andb (Nat.eqb (length off) (length (limits d))) (Nat.eqb (length pushing) (length (box d))))
-      (andb (even_gains g) (pushing_ok pushing (equations g) (1 + length (nominal g) + length (limits d)))))
+  andb (andb (andb (Nat.eqb (length off) (length (limits d)))
+        (Nat.eqb (length pushing) (length (rate_box d off))))
+      (andb (even_gains g) (pushing_ok pushing (equations g) (1 + length (nominal g)))))
     (andb (rates_covered d pushing off qs)
       (forallb (rate_piece_ok d w (products (basis w)) pushing g off rates) qs)).
 
@@ -186,7 +189,7 @@ Proof.
   { apply (turn_affine (1 + n)); auto. rewrite app_nil_r. cbn. congruence. }
   assert (E : forall u, turn g s x u v i = turn g s x [] (u ++ v) i) by reflexivity.
   intros pre post p q l. cbn beta. rewrite !E.
-  destruct (zip_split a pre) as [[b [b0 [c H]]]|[b H]].
+  destruct (zip_split a pre) as [[b [b0 [c [_ H]]]]|[b H]].
   - rewrite !H, <- !app_assoc. cbn [app].
     replace (b0 + ((1 - l) * p + l * q)) with ((1 - l) * (b0 + p) + l * (b0 + q)) by ring.
     exact (A b (zip Rplus c post ++ v) (b0 + p) (b0 + q) l).
@@ -368,6 +371,46 @@ Proof.
   destruct G as [m [Hm G]]. apply In_nth_error in Hm as [im Him]. exists im, m. auto.
 Qed.
 
+(* The same of an input, which is off by entry [length pre] of delta. *)
+Lemma turn_alone_input g s x a v pre y c post up i n : length (equations g) = length (nominal g) ->
+  even_gains g = true -> length (nominal g) = n -> (i < length (gains g))%nat -> 0 <= s <= 1 ->
+  0 <= duration g -> length x = n ->
+  forallb (alone (1 + n + length pre)) (equations g) = true ->
+  signed up (turn g s x (zip Rplus a (pre ++ y :: post)) v i)
+    <= signed up (turn g s x (zip Rplus a (pre ++ c :: post)) v i)
+      + duration g * (Rabs (y - c) * val (shove g i (1 + n + length pre))).
+Proof.
+  intros Hl He Ln Hi Hs Hd Hx Ha.
+  assert (E : forall u, turn g s x u v i = turn g s x [] (u ++ v) i) by reflexivity.
+  rewrite !E. destruct (zip_split a pre) as [[b [b0 [r [Lb H]]]]|[b H]]; rewrite !H.
+  - rewrite <- !app_assoc. cbn [app].
+    replace (y - c) with ((b0 + y) - (b0 + c)) by ring.
+    assert (Ej : (1 + length (x ++ @nil R) + length b)%nat = (1 + n + length pre)%nat).
+    { rewrite app_nil_r. lia. }
+    rewrite <- Ej in Ha |- *.
+    now apply (turn_alone g s x [] b (b0 + y) (b0 + c) (zip Rplus r post ++ v) up i n).
+  - assert (0 <= duration g * (Rabs (y - c) * val (shove g i (1 + n + length pre)))).
+    { apply Rmult_le_pos; auto. apply Rmult_le_pos; [apply Rabs_pos|apply largest_above]. }
+    lra.
+Qed.
+Lemma zip_beyond us : forall e w, length e = length us ->
+  zip Rplus (us ++ map (fun _ => 0) w) (e ++ w) = zip Rplus us e ++ w.
+Proof.
+  induction us as [|u us IH]; intros [|p e] w H; try discriminate; cbn [app zip].
+  - induction w as [|q w IHw]; auto. cbn [map zip]. rewrite IHw. f_equal. ring.
+  - rewrite IH by (now injection H). reflexivity.
+Qed.
+Lemma moved_is us e : length e = length us -> moved e us = zip Rplus us e.
+Proof. intros H. destruct e; auto. now destruct us. Qed.
+Lemma mixed_length box : forall pushing v, length pushing = length box -> In v (mixed pushing box) ->
+  length v = length box.
+Proof.
+  induction box as [|[a b] box IH]; intros [|f pushing] v L H; try discriminate.
+  - destruct H as [<-|[]]. reflexivity.
+  - injection L as L. destruct f; cbn [mixed] in H; [|apply in_app_or in H as [H|H]];
+      apply in_map_iff in H as [v' [<- H]]; cbn; f_equal; now apply (IH pushing).
+Qed.
+
 Section Segment.
 Variables (d : problem) (w : witness) (g : segment) (off rates : list num) (pushing : list bool)
   (qs : list rate_piece) (n : nat).
@@ -377,7 +420,7 @@ Hypothesis Hoff : off_ok n d g off = true.
 Hypothesis Hrates : rates_ok d w pushing g off rates qs = true.
 
 Lemma rate_piece_at i up v im m s : 0 <= s <= 1 -> (i < length (limits d))%nat ->
-  (v < length (rate_cases pushing (box d) off))%nat -> nth_error (modes (limits d)) im = Some m ->
+  (v < length (rate_cases d pushing off))%nat -> nth_error (modes (limits d)) im = Some m ->
   is_free m i = true ->
   exists q, In q qs /\ whose q = i /\ upward q = up /\ vertex (part q) = v /\ mode (part q) = im /\
     holds (part q) s.
@@ -402,7 +445,7 @@ Proof.
   destruct (reached_covers v im (s * 65536) (map part mine) 0) as [p [Hp [E1 [E2 E3]]]].
   - apply Forall_forall. intros p Hp. apply in_map_iff in Hp as [q [<- Hq]].
     apply filter_In in Hq as [Hq _]. rewrite forallb_forall in Hps. specialize (Hps q Hq).
-    unfold rate_piece_ok in Hps. destruct (nth_error _ _) as [[? ?]|]; [|discriminate].
+    unfold rate_piece_ok in Hps. destruct (nth_error _ _); [|discriminate].
     destruct (nth_error _ _); [|discriminate]. destruct (all_expanded _ _); [|discriminate].
     apply andb_prop in Hps as [X _]. now apply Z.leb_le in X.
   - apply IZR_le in Hcov. change (IZR (2 ^ 16)) with 65536 in Hcov. lra.
@@ -435,72 +478,78 @@ Proof.
   assert (Lapp : length (applied (limits d) m us) = length (limits d)).
   { rewrite Happ. rewrite zip_length; congruence. }
   assert (Hdur : 0 < duration g) by (unfold duration; lra).
+  set (a := applied (limits d) m us) in *.
+  (* What it is off by, and w: one point of one box. *)
+  assert (Hoffs : exists delta, in_box delta (around off) /\ u = zip Rplus a delta).
+  { unfold within_off in Hu. destruct off as [|o os]; auto. exists []. split; [constructor|].
+    subst u. destruct a; auto. cbn in *. congruence. }
+  destruct Hoffs as [delta [Hdelta ->]].
+  assert (Ldelta : length delta = length a).
+  { pose proof (Forall2_length _ _ _ Hdelta) as E. unfold around in E. rewrite map_length in E. congruence. }
+  assert (Hlinear : Forall (linear_beyond (1 + n)) (equations g)).
+  { unfold off_ok in Hoff. destruct off as [|o os].
+    - replace (1 + n)%nat with (1 + n + length (limits d))%nat; auto. cbn [length] in Loff. lia.
+    - apply andb_prop in Hoff as [_ Ha]. apply Forall_forall. intros e He.
+      unfold linear_beyond. rewrite forallb_forall in Ha. specialize (Ha e He).
+      apply Forall_forall. intros t Ht. rewrite forallb_forall in Ha. specialize (Ha t Ht).
+      apply Forall_forall. intros k Hk. rewrite forallb_forall in Ha. specialize (Ha k Hk).
+      now apply Nat.leb_le in Ha. }
+  set (still := a ++ map (fun _ => 0) w0).
   set (c := duration g * val (nth i rates nzero)).
-  assert (Way : forall up, signed up (turn g s x u w0 i) < c).
-  { intros up.
-    assert (Corner : forall delta, In delta (vertices (around off)) ->
-      signed up (turn g s x (moved (map val delta) (applied (limits d) m us)) w0 i) < c).
-    { intros delta Hd.
-      assert (Lmov : length (moved (map val delta) (applied (limits d) m us)) = length (limits d)).
-      { destruct delta as [|e l] eqn:Ed; auto. cbn [moved map]. rewrite zip_length; auto.
-        rewrite Lapp, <- Loff.
-        assert (V : forall b v, In v (vertices b) -> length v = length b).
-        { clear. induction b as [|[p q] b IH]; cbn; intros v H; [destruct H as [<-|[]]; auto|].
-          apply in_app_or in H as [H|H]; apply in_map_iff in H as [v' [<- H]]; cbn; auto. }
-        pose proof (V _ _ Hd) as Lv. unfold around in Lv. rewrite map_length in Lv.
-        cbn [length] in *. rewrite map_length. congruence. }
-      set (um := moved (map val delta) (applied (limits d) m us)) in *.
-      apply (below_mixed g i (duration g) ltac:(lra) (box d) pushing (1 + n + length (limits d))
-        (fun w => signed up (turn g s x um w i)) c Lpush); auto.
-      - apply (turn_affine (1 + n + length (limits d))); auto; [|congruence].
-        rewrite app_length. rewrite Lmov. lia.
-      - intros pre y y' post Hflag.
-        assert (Ej : (1 + length (x ++ um) + length pre)%nat = (1 + n + length (limits d) + length pre)%nat).
-        { rewrite app_length. rewrite Lmov. lia. }
-        rewrite <- Ej. apply (turn_alone g s x um pre y y' post up i n); auto; try congruence; try lra.
-        rewrite Ej. rewrite f_nominal in Hpushing. clear - Hpushing Hflag. revert Hpushing Hflag.
-        generalize (1 + n + length (limits d))%nat. revert pushing.
-        induction pre as [|p pre IH]; intros [|f l] j H Hf; cbn [length nth] in *; try discriminate;
-          cbn [pushing_ok] in H; apply andb_prop in H as [A B].
-        + subst f. now rewrite Nat.add_0_r.
-        + rewrite <- Nat.add_succ_comm. exact (IH l (S j) B Hf).
-      - intros v Hv.
-        assert (Case : exists iv, nth_error (rate_cases pushing (box d) off) iv = Some (delta, v)).
-        { apply In_nth_error. unfold rate_cases. apply in_flat_map. exists delta.
-          split; auto. now apply in_map. }
-        destruct Case as [iv Hiv].
-        destruct (rate_piece_at i up iv im m s Hs Hi) as [q [Hq [E1 [E2 [E3 [E4 Hh]]]]]]; auto.
-        { apply nth_error_Some. congruence. }
-        rewrite forallb_forall in Hps. specialize (Hps q Hq). unfold rate_piece_ok in Hps.
-        rewrite E3, E4, Hiv, Him in Hps.
-        destruct (all_expanded (sides w) (tau (part q))) as [taus|] eqn:Etau; [|discriminate].
-        rewrite f_nominal, E1, E2 in Hps. apply andb_prop in Hps as [A1 B].
-        apply Z.leb_le in A1. set (p := part q) in *.
-        set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
-        assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
-        destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
-        pose proof (means_turning s r0 (depth p) (index p)
-          (nsub (nth i rates nzero) (shoved pushing (box d) g i (1 + n + length (limits d)))) up
-          (limits d) m delta v g x i taus ts A1 ltac:(unfold r0; ring) ltac:(congruence) Hts) as Hc.
-        fold z in Hc.
-        pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hc) as Hpos.
-        unfold turning in Hpos. fold z in Hpos. fold us in Hpos. fold um in Hpos.
-        assert (Hdot : 0 <= dot ts ((rho g s - form (P g s) z z) :: held (limits d) m us)).
-        { apply dot_nonneg; auto. constructor; auto. lra. }
-        rewrite val_sub in Hpos. unfold c. lra. }
-    unfold within_off in Hu. destruct off as [|o os] eqn:Eo.
-    - subst u. exact (Corner [] (or_introl eq_refl)).
-    - destruct Hu as [delta [Hd ->]]. unfold off_ok in Hoff. apply andb_prop in Hoff as [_ Ha].
-      apply (below_on_box (around (o :: os))
-        (fun delta => signed up (turn g s x (zip Rplus (applied (limits d) m us) delta) w0 i))); auto.
-      + apply (turn_affine_inputs n); auto; [|congruence]. apply Forall_forall. intros e He.
-        unfold linear_beyond. rewrite forallb_forall in Ha. specialize (Ha e He).
-        apply Forall_forall. intros t Ht. rewrite forallb_forall in Ha. specialize (Ha t Ht).
-        apply Forall_forall. intros k Hk. rewrite forallb_forall in Ha. specialize (Ha k Hk).
-        now apply Nat.leb_le in Ha.
-      + intros v Hv. specialize (Corner v Hv). destruct v as [|e l]; [|exact Corner].
-        exfalso. cbn [around map vertices] in Hv. apply in_app_or in Hv as [H|H];
-          apply in_map_iff in H as [? [? _]]; discriminate. }
+  assert (Way : forall up, signed up (turn g s x (zip Rplus a delta) w0 i) < c).
+  { intros up. set (G := fun v => signed up (turn g s x (zip Rplus still v) [] i)).
+    assert (HG : forall e v, length e = length a -> length v = length w0 ->
+      G (e ++ v) = signed up (turn g s x (zip Rplus a e) v i)).
+    { intros e v Le Lv. unfold G, still.
+      assert (Ez : map (fun _ : R => 0) w0 = map (fun _ => 0) v).
+      { clear - Lv. revert v Lv. induction w0 as [|q l IH]; intros [|r v] L; try discriminate; auto.
+        cbn. f_equal. apply IH. now injection L. }
+      rewrite Ez, zip_beyond by auto. unfold turn, relative, field. now rewrite app_nil_r. }
+    rewrite <- HG by auto.
+    apply (below_mixed g i (duration g) ltac:(lra) (rate_box d off) pushing (1 + n) G c Lpush).
+    - apply (turn_affine_inputs n); auto; congruence.
+    - intros pre y y' post Hflag. unfold G.
+      apply (turn_alone_input g s x still [] pre y y' post up i n); auto; try congruence; try lra.
+      rewrite f_nominal in Hpushing. clear - Hpushing Hflag. revert Hpushing Hflag.
+      generalize (1 + n)%nat. revert pushing.
+      induction pre as [|p pre IH]; intros [|f l] j H Hf; cbn [length nth] in *; try discriminate;
+        cbn [pushing_ok] in H; apply andb_prop in H as [A B].
+      + subst f. now rewrite Nat.add_0_r.
+      + rewrite <- Nat.add_succ_comm. exact (IH l (S j) B Hf).
+    - intros v Hv.
+      assert (Case : exists iv, nth_error (rate_cases d pushing off) iv = Some v)
+        by now apply In_nth_error.
+      destruct Case as [iv Hiv].
+      destruct (rate_piece_at i up iv im m s Hs Hi) as [q [Hq [E1 [E2 [E3 [E4 Hh]]]]]]; auto.
+      { apply nth_error_Some. congruence. }
+      rewrite forallb_forall in Hps. specialize (Hps q Hq). unfold rate_piece_ok in Hps.
+      rewrite E3, E4, Hiv, Him in Hps.
+      destruct (all_expanded (sides w) (tau (part q))) as [taus|] eqn:Etau; [|discriminate].
+      rewrite f_nominal, E1, E2 in Hps. cbn zeta in Hps. apply andb_prop in Hps as [A1 B].
+      apply Z.leb_le in A1. set (p := part q) in *.
+      set (e := firstn (length off) v) in *. set (v' := skipn (length off) v) in *.
+      pose proof (mixed_length _ _ _ Lpush Hv) as Lv. unfold rate_box, around in Lv.
+      rewrite app_length, map_length in Lv.
+      assert (Lw : length w0 = length (box d)) by exact (Forall2_length _ _ _ Hw).
+      assert (Le : length (map val e) = length a).
+      { unfold e. rewrite map_length, firstn_length_le by lia. congruence. }
+      assert (Lv' : length (map val v') = length w0).
+      { unfold v'. rewrite map_length, skipn_length. lia. }
+      set (r0 := s * IZR (2 ^ depth p) - IZR (index p)).
+      assert (Hr : 0 <= r0 <= 1) by (unfold r0; destruct Hh; lra).
+      destruct (all_expanded_val r0 z _ _ Hr _ Etau) as [ts [Hts Hns]].
+      pose proof (means_turning s r0 (depth p) (index p)
+        (nsub (nth i rates nzero) (shoved pushing (rate_box d off) g i (1 + n))) up
+        (limits d) m e v' g x i taus ts A1 ltac:(unfold r0; ring) ltac:(congruence) Hts) as Hc.
+      fold z in Hc.
+      pose proof (is_positive_sound r0 (env z) _ _ _ _ _ Hr B Hc) as Hpos.
+      unfold turning in Hpos. fold z in Hpos. fold us in Hpos. fold a in Hpos.
+      rewrite (moved_is a) in Hpos by auto.
+      assert (Hdot : 0 <= dot ts ((rho g s - form (P g s) z z) :: held (limits d) m us)).
+      { apply dot_nonneg; auto. constructor; auto. lra. }
+      rewrite <- (firstn_skipn (length off) v), map_app. fold e v'. rewrite HG by auto.
+      rewrite val_sub in Hpos. unfold c. lra.
+    - apply Forall2_app; auto. }
   pose proof (Way true) as U. pose proof (Way false) as D. unfold signed in U, D.
   apply Rabs_def1; lra.
 Qed.
