@@ -338,7 +338,13 @@ def test_a_design_without_a_motion_says_what_is_missing() -> None:
     ],
 )
 def test_a_motion_that_cannot_be_asked_for_says_so(changed: Any, said: str) -> None:
-    asked = {"dynamics": pendulum, "start": [0.3, 0], "end": [0, 0], "seconds": 1, "m": 1}
+    asked: dict[str, Any] = {
+        "dynamics": pendulum,
+        "start": [0.3, 0],
+        "end": [0, 0],
+        "seconds": 1,
+        "m": 1,
+    }
     asked |= changed
     with pytest.raises(DataError, match=said):
         plan_motion(asked.pop("dynamics"), **asked)
