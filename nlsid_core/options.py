@@ -2,7 +2,10 @@
 
 from numbers import Real
 
-from nlsid_core.errors import OptionError
+import numpy as np
+
+from nlsid_core.arrays import FloatArray
+from nlsid_core.errors import DataError, OptionError
 
 
 def require_whole(owner: object, key: str, low: int, high: int) -> None:
@@ -52,6 +55,14 @@ def require_at_least(owner: object, key: str, least: float) -> None:
     value = getattr(owner, key)
     if not is_number(value) or not least <= value < float("inf"):
         raise OptionError(key, value, f"a finite number, at least {least:g}")
+
+
+def numbers(value: object, name: str) -> FloatArray:
+    """The value as an array of float64; DataError unless it is made of real numbers."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"{name} should be numbers, of one shape, is {value!r}") from None
 
 
 def is_number(value: object) -> bool:

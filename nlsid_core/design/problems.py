@@ -140,6 +140,8 @@ class ContinuousTracking:
     decay: float | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.nominal, Nominal):
+            raise OptionError("nominal", self.nominal, "a Nominal, such as plan_motion returns")
         if self.decay is not None:
             require_positive(self, "decay")
         require_one_of(self, "shape", get_args(Shape))

@@ -14,8 +14,9 @@ import numpy as np
 
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray
 from nlsid_core.dynamics.taylor_model import DEGREE, TaylorModel, variables_of
-from nlsid_core.dynamics.vector_field import VectorField, arguments, variable_names
+from nlsid_core.dynamics.vector_field import VectorField, arguments, no_entry, variable_names
 from nlsid_core.errors import DataError, NlsidError, NotPolynomial, ShapeError
+from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.polynomial.algebra import as_polynomial, variables
 
@@ -58,8 +59,7 @@ class Rates:
         affine: bool = False,
     ) -> "Rates":  # fmt: skip
         """Look at the function once, with symbols."""
-        box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
-        _refuse_box(box)
+        box = box_of(uncertain)
         given = arguments(function)
         if len(box) and "w" not in given:
             raise DataError("uncertain has rows, but the dynamics have no argument w")
@@ -80,8 +80,7 @@ class Rates:
         cls, function: Callable[..., Any], n: int, m: int, uncertain: ArrayLike | None = None
     ) -> "Rates":
         """Only for values at points: nothing is asked of the function but numbers."""
-        box = np.zeros((0, 2)) if uncertain is None else np.array(uncertain, dtype=np.float64)
-        _refuse_box(box)
+        box = box_of(uncertain)
         if "w" in arguments(function) and not len(box):
             raise DataError("the dynamics have an argument w: give its bounds as `uncertain`")
         return cls(function, n, m, box, (), ())
@@ -115,6 +114,8 @@ class Rates:
                 rows, np.ndarray) else list(rows)  # fmt: skip
         except NlsidError:
             raise
+        except IndexError as error:
+            raise no_entry(error, n, m, len(self.uncertain)) from error
         except ZeroDivisionError as error:
             raise DataError(f"the dynamics divide by zero ({error})") from error
         except Exception as error:
@@ -139,7 +140,17 @@ class Rates:
             parts = {"t": t, "x": x, "u": u, "w": w}
             return self.function(**{name: parts[name] for name in names})
 
-        first = np.asarray(called(X[0], U[0], W[0]), dtype=np.float64).reshape(-1)
+        try:
+            first = np.asarray(called(X[0], U[0], W[0]), dtype=np.float64).reshape(-1)
+        except NlsidError:
+            raise
+        except IndexError as error:
+            raise no_entry(error, self.n, self.m, len(self.uncertain)) from error
+        except (ArithmeticError, TypeError, ValueError) as error:
+            raise DataError(
+                f"the dynamics have no value at t = {t:.6g}, x = {X[0].tolist()}, u = "
+                f"{U[0].tolist()} ({type(error).__name__}: {error})"
+            ) from error
         if first.shape != (self.n,):
             raise ShapeError(f"the dynamics return {len(first)} rates for {self.n} states")
         if len(X) == 1:
@@ -380,11 +391,14 @@ def field_of(cubics: Sequence[Cubic], t: FloatArray) -> VectorField:
     )
 
 
-def _refuse_box(box: FloatArray) -> None:
+def box_of(uncertain: ArrayLike | None) -> FloatArray:
+    """(n_w, 2) bounds of w; DataError unless they are rows (low, high)."""
+    box = np.zeros((0, 2)) if uncertain is None else numbers(uncertain, "uncertain")
     if box.ndim != 2 or box.shape[1] != 2 or not (box[:, 0] <= box[:, 1]).all():
         raise DataError(f"uncertain should be rows (low, high) of w, is {box.tolist()}")
     if not np.isfinite(box).all():
         raise DataError(f"uncertain should be finite bounds of w, is {box.tolist()}")
+    return box
 
 
 def _once(
@@ -474,7 +488,10 @@ class _Symbol:
         return self._power(2)
 
     def __float__(self) -> float:
-        raise TypeError("functions of `math` take numbers only: take NumPy's, such as np.sin")
+        raise TypeError(
+            "functions of `math` take numbers only: take NumPy's, such as np.sin; "
+            "an array of floats holds numbers only: return a list"
+        )
 
     def __neg__(self) -> "_Symbol":
         return _Symbol(None if self.p is None else -self.p, self.uses)

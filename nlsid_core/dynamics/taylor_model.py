@@ -326,6 +326,7 @@ def _digits(keys: IntArray) -> IntArray:
     return np.stack([keys // BASE**2, keys // BASE % BASE, keys % BASE], axis=-1)
 
 
+@lru_cache(maxsize=65536)
 def variables_of(key: int) -> tuple[int, ...]:
     """The variables, counted from 0, of one monomial; twice where squared."""
     return tuple(int(d) - 1 for d in _digits(np.array(key)) if d)

@@ -13,6 +13,7 @@ import numpy as np
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray, IntArray, Json, keep
 from nlsid_core.errors import DataError, DocumentError, NotPolynomial, ShapeError
+from nlsid_core.options import numbers
 from nlsid_core.polynomial import Polynomial, trace, variables
 from nlsid_core.polynomial.maps import coefficient_table
 
@@ -109,7 +110,9 @@ class VectorField:
 
         Raises NotPolynomial naming the operation; `taylor.taylor_field` is then the way.
         """
-        bounds = np.zeros((0, 2)) if uncertain is None else np.asarray(uncertain, dtype=np.float64)
+        bounds = np.zeros((0, 2)) if uncertain is None else numbers(uncertain, "uncertain")
+        if bounds.ndim != 2 or bounds.shape[1] != 2:
+            raise DataError(f"uncertain should be rows (low, high) of w, is {bounds.tolist()}")
         given = arguments(function)
         if len(bounds) and "w" not in given:
             raise DataError("uncertain has rows, but the dynamics have no argument w")
@@ -122,6 +125,8 @@ class VectorField:
         called.__name__ = getattr(function, "__name__", "dynamics")
         try:
             traced = trace(called, {name: sizes[name] for name in given})
+        except IndexError as error:
+            raise no_entry(error, n, m, len(bounds)) from error
         except NotPolynomial as error:
             raise NotPolynomial(
                 f"{error}. taylor_field makes cubics along a motion, with a bound of what they "
@@ -363,6 +368,8 @@ def arguments(function: Callable[..., Any]) -> tuple[str, ...]:
 
     What else it takes keeps its default. DataError of what has none, and if it takes none of them.
     """
+    if not callable(function):
+        raise DataError(f"dynamics should be a function or a VectorField, is {function!r:.80}")
     given = inspect.signature(function).parameters.values()
     names = tuple(p.name for p in given if p.name in ARGUMENTS)
     unknown = [p for p in given if p.name not in ARGUMENTS and p.default is p.empty]
@@ -373,6 +380,14 @@ def arguments(function: Callable[..., Any]) -> tuple[str, ...]:
             f"else without a default value; it is of ({said})"
         )
     return names
+
+
+def no_entry(error: IndexError, n: int, m: int, uncertain: int) -> DataError:
+    """What is said of dynamics that ask for an entry beyond the last."""
+    return DataError(
+        f"the dynamics use an entry that is not there ({error}): x has {n} entries, u has {m}, w "
+        f"has {uncertain}"
+    )
 
 
 def variable_names(n: int, m: int, uncertain: int) -> tuple[str, ...]:

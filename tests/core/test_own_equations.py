@@ -170,6 +170,8 @@ def test_half_widths_a_matrix_and_a_goal_are_the_same_goal() -> None:
         ({"goal": [0.2, 0.5], "limits": [-1, 1]}, "limits should be rows"),
         ({"goal": [0.2, 0.5], "uncertain": [[-1, 1]]}, "no argument w|function of some of"),
         ({"goal": [0.2, 0.5], "hold": 50.0}, "the hold of 50 s is longer than the motion"),
+        ({"goal": "small"}, "the goal should be numbers, of one shape, is 'small'"),
+        ({"goal": [0.2, 0.5], "uncertain": 0.1}, "uncertain should be rows|function of some of"),
     ],
 )
 def test_what_cannot_be_right_says_so(options: Any, said: str) -> None:
@@ -298,6 +300,68 @@ def test_bounds_of_a_w_that_a_polynomial_does_not_have_are_refused() -> None:
 
     with pytest.raises(DataError, match="no argument w"):
         design_funnel(falls, upright(), goal=[0.2, 0.5], uncertain=[[-1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("rate", "options", "said"),
+    [
+        (lambda x, u: [x[1], x[2] + u[0]], {}, r"an entry that is not there.*x has 2 entries"),
+        (lambda x, u: [x[1], np.sin(x[0]) + u[1]], {}, r"that is not there.*u has 1"),
+        (blown, {"uncertain": 0.1}, r"rows \(low, high\) of w, is 0\.1"),
+        (np.eye(2), {}, "dynamics should be a function or a VectorField"),
+        (lambda x, u: [x[1], (x[0] + 2) ** 1.5 - 2**1.5 + u[0]], {}, "whatever the state"),
+    ],
+)
+def test_equations_that_cannot_be_called_say_so(rate: Any, options: Any, said: str) -> None:
+    with pytest.raises(NlsidError, match=said):
+        design_funnel(rate, upright(), goal=[0.2, 0.5], **options)
+
+
+def test_a_design_without_a_motion_says_what_is_missing() -> None:
+    with pytest.raises(DataError, match="nominal is None; it should be a Nominal"):
+        ContinuousTracking(pendulum, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"start": [np.nan, 0]}, "start and end should be finite"),
+        ({"start": ["a", 0]}, "start should be numbers"),
+        ({"seconds": "2"}, "seconds should be above 0, is '2'"),
+        ({"m": -1}, "m should be a whole number from 0 on, is -1"),
+        ({"m": "1"}, "m should be a whole number from 0 on, is '1'"),
+        ({"knots": 1}, "knots should be a whole number from 2 on, is 1"),
+        ({"through": [0.5]}, r"through should be two or more states \(2,\)"),
+        ({"start": [0.3], "end": [0.0]}, "an entry that is not there"),
+        ({"dynamics": lambda x, u: [x[1], 1j * u[0]]}, "have no value at t = 0, x = "),
+        ({"dynamics": lambda x, u: [x[1], u[0] + math.sqrt(x[0] - 1)]}, "have no value at t"),
+    ],
+)
+def test_a_motion_that_cannot_be_asked_for_says_so(changed: Any, said: str) -> None:
+    asked: dict[str, Any] = {
+        "dynamics": pendulum,
+        "start": [0.3, 0],
+        "end": [0, 0],
+        "seconds": 1,
+        "m": 1,
+    }
+    asked |= changed
+    with pytest.raises(DataError, match=said):
+        plan_motion(asked.pop("dynamics"), **asked)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_guess_where_the_equations_have_no_value_is_named() -> None:
+    with pytest.raises(Infeasible, match="not finite on the path that is guessed: dx0/dt between"):
+        plan_motion(lambda x, u: [u[0] - np.sqrt(x[0] - 2)], start=[0], end=[1], seconds=1, m=1)
+
+
+def test_a_state_to_integrate_from_that_is_no_state_is_named() -> None:
+    t = np.linspace(0, 1, 5)
+    with pytest.raises(DataError, match="the state should be n finite numbers"):
+        integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[np.nan, 0])
+    with pytest.raises(DataError, match="an entry that is not there"):
+        integrate_nominal(pendulum, lambda _: [0.0], t=t, start=[0.1])
 
 
 def test_functions_of_math_are_refused_with_what_to_take() -> None:

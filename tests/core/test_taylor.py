@@ -12,6 +12,7 @@ from benchmarks.thesis.soundness import TrueDynamics, simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import FunnelDesign, design_funnel, nominal_through
 from nlsid_core.dynamics import Rates, VectorField, solve, taylor_field
+from nlsid_core.dynamics.taylor_model import BASE, variables_of
 from nlsid_core.errors import CertificateRejected, DataError, NlsidError, ShapeError
 from nlsid_core.polynomial import Polynomial
 from nlsid_core.proofs import check
@@ -308,3 +309,8 @@ def test_known_problems_are_proved_and_no_start_of_the_true_dynamics_leaves(name
     assert figures["remainder_covered"]
     assert figures["violations"] == 0
     assert 0.9 < figures["max_v"] <= 1
+
+
+def test_the_variables_of_a_monomial_are_read_once() -> None:
+    assert variables_of(BASE * 3 + 2) == (2, 1)
+    assert variables_of(BASE * 3 + 2) is variables_of(BASE * 3 + 2)

@@ -16,6 +16,14 @@ from nlsid_core.design.continuous.counterexample import try_to_miss
 from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.expansion import Expansion, sweep_expanded
+from nlsid_core.design.continuous.finer import (
+    NEARBY,
+    Unproved,
+    coarse,
+    halved,
+    most_knots,
+    refusal_time,
+)
 from nlsid_core.design.continuous.gain import faster_gain
 from nlsid_core.design.continuous.held import LONGEST, Changes, Hold, fastest
 from nlsid_core.design.continuous.lstep import LSteps, sections
@@ -111,6 +119,8 @@ def design_funnel(
         limits=limits, uncertain=uncertain, hold=hold, error=error, decay=decay,
     )  # fmt: skip
     setting = prepared(nominal)
+    if policy is None:
+        setting = _with_knots(setting, prepared)
     if decay is not None:
         refuse_decay(setting.steps)
     if shape == "P":
@@ -269,28 +279,47 @@ def _limited(progress: Progress) -> Progress:
     return told
 
 
+def _with_knots(setting: Setting, again: Callable[[Nominal], Setting]) -> Setting:
+    """The setting with more knots where P(t) is far from linear, such as near the goal."""
+    most = most_knots(len(setting.policy.t))
+    for _ in range(HALVINGS):
+        chosen = coarse(setting, most)
+        if not chosen.any():
+            break
+        setting = again(Nominal(setting.policy.x, setting.policy.u).halved(chosen))
+    return setting
+
+
 def _tried(
     setting: Setting, again: Callable[[Nominal], Setting] | None, progress: Progress
 ) -> _Found:
     """ρ for the cost-to-go; where w stops that, for what the pushed linear loop reaches.
 
-    Where one of `FINER` stops it, it is tried with twice as many knots.
+    Where one of `FINER` stops it, it is tried with more knots, see `halved`.
     """
-    try:
-        return _found(setting, progress)
-    except Infeasible as refusal:
-        term = refusal.diagnosis.dominant if isinstance(refusal, NoFunnel) else "knots"
+    before, nearby = np.inf, NEARBY
+    refusal = Infeasible("")
+    for attempt in range(1 + HALVINGS):
+        try:
+            return _found(setting, progress)
+        except Infeasible as error:
+            found = error
+        at = refusal_time(found)
+        t = -np.inf if at is None else at  # the sweep goes back in time; the rest comes after it
+        if t <= before:  # this one came at least as far
+            refusal = found
+        nearby = 2 * nearby if t >= before else NEARBY
+        before = min(t, before)
+        term = found.diagnosis.dominant if isinstance(found, NoFunnel) else "knots"
         pushed = _pushed(setting, again) if term == "disturbance" else None
         if pushed is not None:
             with suppress(Infeasible):
                 return _found(pushed, progress)
-        K = len(setting.policy.t)
-        if term not in FINER or again is None or 2 * K - 1 > MOST_KNOTS:
-            raise
-        nominal = Nominal(setting.policy.x, setting.policy.u)
-        with suppress(Infeasible):
-            return _tried(again(nominal.halved(np.ones(K - 1))), again, progress)
-        raise
+        chosen = halved(setting, found, nearby) if term in FINER else None
+        if again is None or chosen is None or attempt == HALVINGS:
+            break
+        setting = again(Nominal(setting.policy.x, setting.policy.u).halved(chosen))
+    raise refusal
 
 
 def _pushed(setting: Setting, again: Callable[[Nominal], Setting] | None) -> Setting | None:
@@ -521,7 +550,8 @@ def proved_for(
             return setting, funnel, proved, margin
         margin *= GROWTH
     assert proved is not None
-    raise Infeasible(
+    raise Unproved(
         f"no proof from {unsolved(policy, proved.unproved)} although the L-steps at its "
-        "knots hold: try more knots there"
+        "knots hold: try more knots there",
+        float(policy.t[proved.unproved[-1].interval]),
     )

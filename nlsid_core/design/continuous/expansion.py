@@ -147,7 +147,9 @@ class NoExpansion(Infeasible):
             for j in rates.expanded
             if self._narrower(j)
         ]
-        if not wide:
+        if isinstance(self.cause.__cause__, TypeError):  # whatever the box is
+            why = "whatever the state and the input are"
+        elif not wide:
             why = "and no single state or input is the cause: the equations are not smooth there"
         else:
             why = f"because of {' or '.join(wide)}"

@@ -20,6 +20,7 @@ from nlsid_core.conic import Cone, ConeProgram
 from nlsid_core.design.continuous.setting import DEFECT, limits_of
 from nlsid_core.dynamics import Nominal, Rates, VectorField, cubic_through, linear_through
 from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.options import is_number, numbers
 
 FIRST_KNOTS = 25
 MORE_KNOTS = 3  # for one interval, at a time, where its cubic misses the dynamics
@@ -65,17 +66,22 @@ def plan_motion(
 
     Raises DataError on input that makes no sense, Infeasible if no motion was found.
     """
-    ends = [np.asarray(part, dtype=np.float64) for part in (start, end)]
+    ends = [numbers(part, name) for part, name in ((start, "start"), (end, "end"))]
     if ends[0].ndim != 1 or ends[0].shape != ends[1].shape:
         raise DataError(
             f"start and end should be states (n,), are {ends[0].shape}, {ends[1].shape}"
         )
-    if not seconds > 0:
-        raise DataError(f"seconds should be above 0, is {seconds}")
+    if not np.isfinite(ends).all():
+        raise DataError(f"start and end should be finite, are {[e.tolist() for e in ends]}")
+    if not is_number(seconds) or not 0 < seconds < np.inf:
+        raise DataError(f"seconds should be above 0, is {seconds!r}")
+    for name, count, least in (("m", m, 0), ("knots", knots, 2)):
+        if count is not None and (not isinstance(count, int) or count < least):
+            raise DataError(f"{name} should be a whole number from {least} on, is {count!r}")
     if u is None and m is None and not isinstance(dynamics, VectorField):
         raise DataError("give u, the input that costs nothing, or m, how many inputs there are")
     count = dynamics.m if isinstance(dynamics, VectorField) else m
-    rest = np.zeros(count or 0) if u is None else np.asarray(u, dtype=np.float64).reshape(-1)
+    rest = np.zeros(count or 0) if u is None else numbers(u, "u").reshape(-1)
     n, m = len(ends[0]), len(rest)
     if isinstance(dynamics, VectorField):
         rates: VectorField | Rates = dynamics
@@ -91,7 +97,9 @@ def plan_motion(
         much = np.asarray(scale, dtype=np.float64)
         if much.shape != (m,) or not (much > 0).all():
             raise DataError(f"scale should be {m} positive numbers, is {much.tolist()}")
-    path = np.stack(ends) if through is None else np.asarray(through, dtype=np.float64)
+    path = np.stack(ends) if through is None else numbers(through, "through")
+    if path.ndim != 2 or len(path) < 2 or path.shape[1] != n or not np.isfinite(path).all():
+        raise DataError(f"through should be two or more states ({n},), is {path.tolist()}")
     t = np.linspace(0.0, seconds, FIRST_KNOTS if knots is None else knots)
     share = np.linspace(0, seconds, len(path))
     x = np.stack([np.interp(t, share, column) for column in path.T], axis=1)
@@ -241,6 +249,15 @@ class _Mesh:
         """A motion by convex programs and Newton's steps from a guess; Infeasible if none."""
         z = z.copy()
         z[:, self.n :] = np.clip(z[:, self.n :], *self.box.T)
+        with np.errstate(all="ignore"):
+            gaps = self.defects(z)
+        if not np.isfinite(gaps).all():
+            k, i = np.argwhere(~np.isfinite(gaps))[0].tolist()
+            raise Infeasible(
+                f"the dynamics are not finite on the path that is guessed: dx{i}/dt between "
+                f"x = {z[k, : self.n].tolist()} and x = {z[k + 1, : self.n].tolist()}. Give "
+                "`through`, states of a path on which they are"
+            )
         for _ in range(ROUNDS):
             z = self._descended(z, self.sizes(z))
             try:

@@ -29,6 +29,7 @@ from nlsid_core.dynamics.taylor_model import DEGREE
 from nlsid_core.dynamics.vector_field import FEW_STATES
 from nlsid_core.errors import DataError, Infeasible, NotPolynomial
 from nlsid_core.funnels.continuous import ContinuousFunnel, ellipsoid_inside
+from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 MOST_KNOTS = 130  # of a motion that is given more: each takes programs of its own
@@ -180,7 +181,7 @@ def default_weights(
 
 def limits_of(limits: ArrayLike, m: int) -> FloatArray:
     """(L, 3) rows (input, low, high); of pairs (low, high), one per input, too."""
-    rows = np.asarray(limits, dtype=np.float64)
+    rows = numbers(limits, "limits")
     if rows.shape == (m, 2):
         return np.column_stack([np.arange(m), rows])
     if rows.ndim != 2 or rows.shape[1] != 3:
@@ -256,7 +257,7 @@ def _wanted_goal(goal: Goal | ArrayLike | None, nominal: Nominal, n: int) -> Goa
     if goal is None or isinstance(goal, Goal):
         wanted = goal
     else:
-        P = np.asarray(goal, dtype=np.float64)
+        P = numbers(goal, "the goal")
         if P.shape == (n,):
             if not (np.isfinite(P).all() and (P > 0).all()):
                 raise DataError(f"the goal's half-widths should be positive numbers, are {P}")

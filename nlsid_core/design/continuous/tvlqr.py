@@ -23,6 +23,7 @@ from nlsid_core.dynamics import (
     linear_through,
 )
 from nlsid_core.errors import DataError, Infeasible, SolverError
+from nlsid_core.options import numbers
 from nlsid_core.policies.continuous import ContinuousPolicy
 
 RTOL, ATOL = 1e-9, 1e-10  # of the integrations; P's interpolation error is far larger
@@ -123,7 +124,9 @@ def integrate_nominal(
         raise DataError("t should be two or more times that increase")
     if (start is None) == (final is None):
         raise DataError("give the state at the start or at the end, not both")
-    given = np.asarray(start if final is None else final, dtype=np.float64)
+    given = numbers(start if final is None else final, "the state")
+    if given.ndim != 1 or not np.isfinite(given).all():
+        raise DataError(f"the state should be n finite numbers, is {given.tolist()}")
     m = u.control.shape[2] if isinstance(u, PiecewisePolynomial) else np.size(u(float(t[0])))
     rates = field if isinstance(field, VectorField) else Rates.numeric(field, len(given), m)
     inputs = u if isinstance(u, PiecewisePolynomial) else _cubic_input(u, t)
@@ -228,7 +231,7 @@ def _backward(
 
 def definite(M: ArrayLike, n: int, name: str, *, strict: bool) -> FloatArray:
     """M as a symmetric (n, n) array; DataError unless it is one, ⪰ 0 or, if strict, ≻ 0."""
-    M = np.asarray(M, dtype=np.float64)
+    M = numbers(M, name)
     if (
         M.shape != (n, n)
         or not np.isfinite(M).all()

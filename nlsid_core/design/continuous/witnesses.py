@@ -79,7 +79,10 @@ def piece_margins(
     """Each piece's margin in 1/s; nan where its Gram matrices are not positive definite."""
     c = closed_loop_polynomial(field, policy, funnel, pieces)
     curves = _Curves.of(funnel, pieces, c)
-    lowest = np.linalg.eigvalsh(curves.scaled()).min(axis=(1, 2))
+    with np.errstate(all="ignore"):  # of a funnel so small that its numbers overflow
+        scaled = curves.scaled()
+    finite = np.asarray(np.isfinite(scaled).all(axis=(1, 2, 3), keepdims=True))
+    lowest = np.linalg.eigvalsh(np.where(finite, scaled, 0.0)).min(axis=(1, 2))
     margins = np.full(len(pieces), np.nan)
     sound = np.isfinite(lowest) & (lowest > 0)
     if sound.any():
@@ -145,7 +148,10 @@ def rate_documents(
     basis: (k, n) of the proof, of which `used` are those of the pieces.
     """
     curves = _Curves.of(funnel, pieces, c)
-    lowest = np.linalg.eigvalsh(curves.scaled()).min(axis=(1, 2))
+    with np.errstate(all="ignore"):  # of a funnel so small that its numbers overflow
+        scaled = curves.scaled()
+    finite = np.asarray(np.isfinite(scaled).all(axis=(1, 2, 3), keepdims=True))
+    lowest = np.linalg.eigvalsh(np.where(finite, scaled, 0.0)).min(axis=(1, 2))
     found: list[Json | None] = []
     for b in range(len(pieces)):
         try:

@@ -1,0 +1,96 @@
+"""Where more knots are needed: where P(t), linear between knots, loses what it gains at them."""
+
+import numpy as np
+
+from nlsid_core.arrays import BoolArray, FloatArray
+from nlsid_core.design.continuous.diagnosis import NoFunnel
+from nlsid_core.design.continuous.setting import MOST_KNOTS, Setting
+from nlsid_core.errors import Infeasible
+
+NEARBY = 1 / 32  # of the motion: what is halved on either side of a refusal, doubled at each try
+LOST = 0.2  # of log ρ on one interval, by the linear closed loop: more asks for a knot
+MORE = 1 / 3  # of the knots, and that many more: what they are at most before anything is tried
+FEW = 8
+ENDS = 1e-9  # of an interval, where its own closed loop holds
+
+
+class Unproved(Infeasible):
+    """Nothing was found wrong at the knots around this time, but nothing proves it between them."""
+
+    def __init__(self, said: str, t: float) -> None:
+        super().__init__(said)
+        self.t = t
+
+
+def lost(setting: Setting) -> FloatArray:
+    """(K-1,) by how much log ρ has to grow in time where P is linear between knots and V is not.
+
+    Of the linear closed loop alone: for P(t) between the knots as at them there would be no loss.
+    """
+    policy, field, P = setting.policy, setting.steps.field, setting.P
+    t, h = policy.t, np.diff(policy.t)
+    found = np.zeros(len(h))
+    for k in range(len(h)):
+        root = np.linalg.inv(np.linalg.cholesky((P[k] + P[k + 1]) / 2))
+        for s in (0.0, 0.5, 1.0):
+            when = float(t[k] + np.clip(s, ENDS, 1 - ENDS) * h[k])
+            A, B = field.jacobians(when, policy.x(when), policy.u(when))
+            here = (1 - s) * P[k] + s * P[k + 1]
+            along = here @ (A - B @ policy.K(when))
+            falls = -(h[k] * (along + along.T) + P[k + 1] - P[k])
+            if s != 0.5:
+                root = np.linalg.inv(np.linalg.cholesky(here))
+            found[k] = max(found[k], -float(np.linalg.eigvalsh(root @ falls @ root.T)[0]))
+    return found
+
+
+def coarse(setting: Setting, most: int) -> BoolArray:
+    """(K-1,) the intervals that lose more than LOST, those that lose most if more than `most`."""
+    losses = lost(setting)
+    return _first(losses > LOST, -losses, most - len(setting.policy.t))
+
+
+def most_knots(count: int) -> int:
+    """How many knots a motion of so many gets at most before anything is tried."""
+    return min(MOST_KNOTS, int((1 + MORE) * count) + FEW)
+
+
+def halved(setting: Setting, refusal: Infeasible, nearby: float) -> BoolArray | None:
+    """(K-1,) the intervals to halve after a refusal; None if there are enough knots already.
+
+    nearby: of the motion. All of them while that is possible, but near its time if V falls at its
+    instant; else also, of those before it, the ones on which the motion moves farthest in what was
+    tried there.
+    """
+    t, x = setting.policy.t, setting.policy.x.control
+    K = len(t)
+    diagnosis = refusal.diagnosis if isinstance(refusal, NoFunnel) else None
+    alone = isinstance(refusal, Unproved) or (
+        diagnosis is not None and diagnosis.dominant == "knots"
+    )
+    if 2 * K - 1 <= MOST_KNOTS and not alone:
+        return np.ones(K - 1, dtype=bool)
+    when = refusal_time(refusal)
+    if when is None or K >= MOST_KNOTS:
+        return None
+    around = nearby * float(t[-1] - t[0])
+    chosen = (t[1:] >= when - around) & (t[:-1] <= when + around)
+    if diagnosis is not None and not alone:
+        moved = (np.ptp(x, axis=1) / np.asarray(diagnosis.widths)).max(axis=1)
+        chosen |= (t[:-1] <= when) & (moved > 1)
+    return _first(chosen, np.abs((t[1:] + t[:-1]) / 2 - when), MOST_KNOTS - K)
+
+
+def refusal_time(refusal: Infeasible) -> float | None:
+    """When in the motion something was refused; None if it says nothing about that."""
+    if isinstance(refusal, Unproved):
+        return refusal.t
+    return refusal.diagnosis.t if isinstance(refusal, NoFunnel) else None
+
+
+def _first(chosen: BoolArray, order: FloatArray, count: int) -> BoolArray:
+    """Of the chosen ones at most `count`, the first in this order."""
+    sequence = np.argsort(np.where(chosen, order, np.inf), kind="stable")
+    kept = np.zeros(len(chosen), dtype=bool)
+    kept[sequence[: max(count, 0)]] = True
+    return np.asarray(kept & chosen)
