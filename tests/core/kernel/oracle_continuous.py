@@ -142,7 +142,8 @@ class Oracle:
     def ranges(self, k: int) -> list[list[Fraction]]:
         """Lows and highs of what the input is off by, if anything, and of w."""
         off = [self.width(k, i) for i in range(self.m)] if self.sides() != [()] else []
-        return [[-width, width] for width in off] + numbers(self.field["uncertain"])
+        box: list[list[Fraction]] = numbers(self.field["uncertain"])
+        return [[-width, width] for width in off] + box
 
     def pushing(self) -> list[int]:
         """The entries of `ranges` that are alone in every monomial that they are in."""
