@@ -246,20 +246,34 @@ class LSteps:
         return np.array(rows).reshape(len(self.limits), len(x_bar))
 
     def solve(
-        self, section: Section, rho: float, start: list[SphereSolution] | None = None
+        self,
+        section: Section,
+        rho: float,
+        start: list[SphereSolution] | None = None,
+        *,
+        least: float = -np.inf,
     ) -> list[SphereSolution]:
-        """φ for every case."""
-        found = []
-        for case, g in enumerate(self.values(section, rho, range(self.cases))):
-            warm = None if start is None else start[case]
+        """φ for every case; or, once one is below `least`, `start` for those not solved yet.
+
+        Then the cases that `start` bounds lowest are solved first.
+        """
+        cases = np.arange(self.cases)
+        if start is not None and len(cases) > 1 and least > -np.inf:
+            cases = np.argsort(self.bounds(section, rho, start, cases.tolist()), kind="stable")
+        found = {} if start is None else dict(enumerate(start))
+        for case in cases.tolist():
+            (g,) = self.values(section, rho, [case])
             tau: FloatArray = np.zeros((0, 0, 0))
             if len(self.limits):
                 tau, products = multipliers(self.program, g, self.in_mode(section, rho, case))
                 g = g - products
+            warm = None if start is None else start[case]
             solved = self.program.solve(g, tolerance=self.tolerance, start=warm)
-            found.append(replace(solved, tau=tau))
+            found[case] = replace(solved, tau=tau)
             self.solved += 1
-        return found
+            if solved.m < least:
+                break
+        return [found[case] for case in range(len(cases))]
 
     def predicted(
         self,
@@ -276,14 +290,20 @@ class LSteps:
         """
         free = not saturated and len(self.limits) > 0
         cases = [c for c in range(len(duals)) if not (free and self.split(c)[-1].any())]
-        bounds = []
+        return min(self.bounds(section, rho, duals, cases))
+
+    def bounds(
+        self, section: Section, rho: float, duals: list[SphereSolution], cases: Sequence[int]
+    ) -> list[float]:
+        """The upper bound of φ for each of these cases."""
+        found = []
         for case, g in zip(cases, self.values(section, rho, cases), strict=True):
             if len(self.limits):
                 y = np.hstack([np.ones((len(self.program.points), 1)), self.program.points])
                 q = self.in_mode(section, rho, case)
                 g = g - np.einsum("ln,na,lab,nb->n", q, y, duals[case].tau, y)
-            bounds.append(float(g @ duals[case].y))
-        return min(bounds)
+            found.append(float(g @ duals[case].y))
+        return found
 
 
 def sphere_program(

@@ -95,7 +95,7 @@ def _largest(
     feasible, infeasible = 0.0, np.inf
     best: list[SphereSolution] | None = None
     estimated = len(steps.limits) > 0  # then `predicted` may be too low, and more be possible
-    for _ in range(MAX_TRIES):
+    for _ in range(MAX_TRIES + steps.cases):  # one that fails is solved for one case
         if cap <= LOWEST * after:
             break
         known = duals
@@ -103,7 +103,8 @@ def _largest(
                     LOWEST * after, min(cap, infeasible))  # fmt: skip
         if best is not None and rho <= feasible:
             break
-        found = steps.solve(section, here(rho), duals)
+        least = -ACCEPT * margin - slack(rho, 0.0)
+        found = steps.solve(section, here(rho), duals, least=least)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
             if not estimated or rho >= cap:
