@@ -86,3 +86,14 @@ def test_a_funnel_whose_numbers_overflow_is_not_proved() -> None:
     rho = np.geomspace(1e-180, 1e-3, 41)
     funnel = ContinuousFunnel(setting.policy.x, setting.P, rho, setting.policy.vector_field, "")
     assert prove_pieces(setting.steps, setting.policy, funnel).unproved
+
+
+def test_a_shape_that_is_wider_before_the_end_than_equations_reach_is_no_refusal() -> None:
+    def valve(x: Any, u: Any) -> Any:
+        flow = x[3] * np.sqrt(1 - 0.5 * np.tanh(x[3] / 0.05) * x[2])
+        return [x[1], 20 * x[2] - 2 * x[1], 50 * (flow - 0.5 * x[1]) - x[2], 50 * (u[0] - x[3])]
+
+    still = integrate_nominal(valve, lambda _: [0.0], t=np.linspace(0, 0.5, 41), start=np.zeros(4))
+    goal = [0.05, 0.3, 0.3, 0.1]
+    setting = prepare(valve, still, goal=goal, policy=None, Q=None, R=None, gain="constant")
+    assert setting.margin(setting.rho_final) > 0

@@ -5,6 +5,7 @@ Everything that can be wrong with what a user gives is found here, before anythi
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from nlsid_core.design.continuous.lstep import (
     section_at,
 )
 from nlsid_core.design.continuous.pieces import affine
+from nlsid_core.design.continuous.sweep import LOWEST
 from nlsid_core.design.continuous.tvlqr import Tracking, definite, lyapunov, tvlqr
 from nlsid_core.dynamics import Nominal, Rates, VectorField
 from nlsid_core.dynamics.taylor_model import DEGREE
@@ -105,8 +107,11 @@ class Setting:
         last = len(self.policy.t) - 2
         end = section_at(self.steps, self.policy, self.P, last, 1.0)
         if self.expansion is not None:
-            cubic = self.expansion.around(self.policy, self.P, last, (rho, rho))
-            self.steps.local[last] = cubic
+            around = partial(self.expansion.around, self.policy, self.P, last)
+            try:
+                self.steps.local[last] = around((rho, rho))
+            except NoExpansion:  # the end alone has one, or there would be no such ρ
+                self.steps.local[last] = around((LOWEST * rho, rho))
         self.steps.bound_pushes(end, rho)
         own = MARGIN * float(np.abs(self.steps.values(end, rho, [0])).mean())
         return max(own, self.needed)
