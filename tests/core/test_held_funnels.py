@@ -48,13 +48,13 @@ def test_a_design_says_what_the_hold_and_the_errors_cost(held: FunnelDesign) -> 
     free = design(tracking(gain="linear"))  # as a held policy's is
     widths, unheld = (found.funnel.widths(found.funnel.t0) for found in (held, free))
     said = str(held)
-    named = "the hold of 0.01 s and the errors of the measured state"
-    part = re.search(rf"{named} leave ([\d.]+) of", said)
+    named = "with a hold of 0.01 s and the errors of the measured state"
+    part = re.search(rf"{named}, ([\d.]+) of the half-widths are left", said)
     assert part, said
     proved = widths[0] / unheld[0]  # what was found without is a little more than is proved
     assert 0.97 * proved < float(part[1]) <= proved
     assert f"at 0 s: x0 {widths[0]:.3g}, x1 {widths[1]:.3g}; without, x0 " in said
-    assert "leave" not in str(free)
+    assert "left" not in str(free)
 
 
 def test_runs_that_are_held_and_measured_wrong_stay_inside(held: FunnelDesign) -> None:

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from bags.commands.cli import app
 from benchmarks.first_try import Truth, dubins, flexible_arm, lines_of, rocket, van_der_pol
 from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
@@ -52,6 +54,19 @@ def test_the_page_about_own_equations_says_what_its_code_does(tmp_path: Path) ->
     run = simulate_boundary(truth, found.policy, found.funnel, starts=1000, rng=rng, substeps=10)
     assert run.violations == 0
     assert run.max_v > 0.9
+
+
+def test_the_page_writes_a_problem_for_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+    (code,) = (block for block in blocks if "spring.json" in block)
+    exec(code, {})
+    ended = CliRunner().invoke(app, ["funnel", "--problem", "spring.json", "--out", "spring"])
+    assert ended.exit_code == 0, ended.output
+    assert "is applied every 0.032 s or more often" in ended.output
+    assert "with a hold of 0.032 s, 0.165 of the half-widths are left" in ended.output
 
 
 @pytest.mark.slow

@@ -199,11 +199,11 @@ def _cost(setting: Setting, funnel: ContinuousFunnel) -> str:
         ", ".join(f"x{i} {width:.3g}" for i, width in enumerate(f.widths(funnel.t0).tolist()))
         for f in (funnel, free)
     )
-    causes = [f"the hold of {setting.hold.period:g} s"] if setting.hold.period else []
+    causes = [f"a hold of {setting.hold.period:g} s"] if setting.hold.period else []
     causes += ["the errors of the measured state"] if setting.hold.error.any() else []
     return (
-        f"{' and '.join(causes)} leave {part:.3g} of the half-widths at {funnel.t0:g} s: {held}; "
-        f"without, {unheld} were found for this policy, not proved"
+        f"with {' and '.join(causes)}, {part:.3g} of the half-widths are left at {funnel.t0:g} s: "
+        f"{held}; without, {unheld} were found for this policy, not proved"
     )
 
 
