@@ -106,7 +106,7 @@ class SphereProgram:
         one = np.zeros((int(self.constant), self.n), dtype=np.int64)
         basis = np.vstack([one, low, high[high[:, list(chosen)].any(axis=1)]])
         points = unisolvent_points(basis, self.half)
-        weight = _weights(basis, np.isin(np.arange(self.n), chosen))
+        weight = weights_of(basis, np.isin(np.arange(self.n), chosen))
         moments = _sphere_moments(basis) * np.outer(weight, weight)
         values, vectors = np.linalg.eigh(moments)
         # v = root⁻¹·weight·monomials is orthonormal on the sphere, and v'(moments)v = 1 there.
@@ -338,7 +338,7 @@ def _step(dA: FloatArray, L: FloatArray) -> float:
     return min(1.0, STEP_TO_BOUNDARY / -lowest) if lowest < 0 else 1.0
 
 
-def _weights(basis: IntArray, chosen: BoolArray) -> FloatArray:
+def weights_of(basis: IntArray, chosen: BoolArray) -> FloatArray:
     """(k,) with Σ (weight·monomial)² = 1 on the sphere.
 
     All chosen: ½|z|^2d for both degrees d; else |z_l|² + ½|z_nl|² + ½|z_nl|²|z|². With 1 in the

@@ -12,6 +12,7 @@ import numpy as np
 
 from nlsid_core import files
 from nlsid_core.arrays import ArrayLike, FloatArray
+from nlsid_core.design.continuous.cliques import CliqueSteps
 from nlsid_core.design.continuous.counterexample import try_to_miss
 from nlsid_core.design.continuous.decay import prove_decay, refuse_decay
 from nlsid_core.design.continuous.diagnosis import NoFunnel
@@ -479,6 +480,11 @@ def _unheld(setting: Setting, progress: Progress) -> _Found:
     if setting.expansion is not None:
         return proved_for(setting, setting.rho_final, partial(_expanded, setting, progress))
     caps = validity_caps(setting.steps.field, setting.policy, setting.P)
+    cliques = CliqueSteps.of(setting.steps)
+    if cliques is not None:
+        with suppress(Infeasible, SolverError):  # then with every product
+            _, funnel, proved, margin = _swept(replace(setting, steps=cliques), caps, progress)
+            return setting, funnel, proved, margin
     return _swept(setting, caps, progress)
 
 

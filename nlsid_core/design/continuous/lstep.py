@@ -6,6 +6,7 @@ depend on ρ̇. Source: thesis (6.4), in the sphere form.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -108,8 +109,11 @@ class LSteps:
     w does is bounded, not taken at its corners; only where it adds constants to ẋ (None: the
     field's `is_pushed`). decay: 1/s, the rate of V̇ that every margin is above. kappa: (intervals,
     n_w), if it is bounded; tightness: the same over 1/max|x̄'Pg| (None: 1). local: what the dynamics
-    are on an interval, where a search expands them anew; else they are the field.
+    are on an interval, where a search expands them anew; else they are the field. carries: whether
+    a dual of one section bounds φ at others.
     """
+
+    carries = True
 
     def __init__(
         self,
@@ -138,9 +142,7 @@ class LSteps:
         self.tightness = tightness
         corners = list(product((-1.0, 1.0), repeat=0 if widths is None else field.m))
         self.corners: FloatArray = np.array(corners).reshape(len(corners), -1)
-        self.program = sphere_program(  # what the input is off is a term of degree 1 in Ẇ
-            field, self.nonlinear, reduced=not limited, constant=widths is not None
-        )
+        self._reduced = not limited
         self.kappa: FloatArray | None = None
         self.solved = 0
         if self.pushed and policy is not None:
@@ -148,6 +150,13 @@ class LSteps:
             self.vertices = field.uncertain.mean(axis=1)[None]
         else:
             self.vertices = field.vertices()
+
+    @cached_property
+    def program(self) -> SphereProgram | LineProgram:
+        """Made when it is asked for: of many states it takes seconds."""
+        return sphere_program(  # what the input is off is a term of degree 1 in Ẇ
+            self.field, self.nonlinear, reduced=self._reduced, constant=self.widths is not None
+        )
 
     def pushes(self, section: Section) -> FloatArray:
         """(n, n_w) what each w adds to ẋ there; only where w does nothing else."""
@@ -183,6 +192,10 @@ class LSteps:
     def cases(self) -> int:
         """Vertices times corners times modes."""
         return len(self.vertices) * len(self.corners) * len(self.modes)
+
+    def weights(self, solution: SphereSolution) -> FloatArray:
+        """(N,) of the program's points in the dual bound."""
+        return np.asarray(solution.y)
 
     def split(self, case: int) -> tuple[int, int, IntArray]:
         """The vertex, the corner and the mode of a case."""

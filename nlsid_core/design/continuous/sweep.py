@@ -94,7 +94,7 @@ def _largest(
 
     feasible, infeasible = 0.0, np.inf
     best: list[SphereSolution] | None = None
-    estimated = len(steps.limits) > 0  # then `predicted` may be too low, and more be possible
+    limited, exact = len(steps.limits) > 0, steps.carries
     for _ in range(MAX_TRIES + steps.cases):  # one that fails is solved for one case
         if cap <= LOWEST * after:
             break
@@ -107,7 +107,7 @@ def _largest(
         found = steps.solve(section, here(rho), duals, least=least)
         left = slack(rho, min(s.m for s in found))
         if left >= -ACCEPT * margin:
-            if not estimated or rho >= cap:
+            if (exact and not limited) or rho >= cap:  # else `predicted` may be too low
                 return rho, found
             done = rho <= NEAR * feasible
             feasible, best = rho, found
@@ -115,7 +115,7 @@ def _largest(
                 break
         else:
             infeasible = min(infeasible, rho)
-        duals = found
+        duals, exact = found, True
     if best is None:
         levels = (after * np.geomspace(1e-3, 1.0, 12)).tolist()
         rho = max(levels, key=lambda r: slack(r, steps.predicted(section, here(r), duals)))

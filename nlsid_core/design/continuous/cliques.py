@@ -1,0 +1,178 @@
+"""L-steps of many states by small Gram matrices, where few states are nonlinear together.
+
+A clique is what occurs in the nonlinear terms of one rate. Ẇ's terms of degree 3 and 4 then have
+two factors of a clique each, which is what `sos.cliques` is for. φ is a little smaller than that
+of the sphere program, whose Gram matrix has every product.
+Source: docs/theory-funnels.md, "Many states".
+"""
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from nlsid_core.arrays import FloatArray, IntArray
+from nlsid_core.design.continuous.lstep import LSteps, Section
+from nlsid_core.design.continuous.pieces import substitution
+from nlsid_core.dynamics import VectorField
+from nlsid_core.polynomial.maps import monomials
+from nlsid_core.sos.cliques import CliqueProgram
+from nlsid_core.sos.sphere import SphereSolution, weights_of
+
+LARGE = 12  # states: below, a sphere program takes about as little time
+PART = 0.25  # of the states: larger cliques save little
+MAX_DEGREE = 3  # of f
+FINER = 0.1  # of the tolerance of sphere programs: their unit is the spread of g
+
+
+def cliques_of(field: VectorField) -> tuple[tuple[int, ...], ...]:
+    """States in the nonlinear terms of each rate; () if these have inputs, or many states."""
+    n, last = field.n, 1 + field.n + field.m
+    found: set[tuple[int, ...]] = set()
+    for equations in field.pieces:
+        for p in equations:
+            high = p.exponents[p.exponents[:, 1:last].sum(axis=1) > 1]
+            if high[:, 1 + n : last].any():
+                return ()
+            states = tuple(np.flatnonzero(high[:, 1 : 1 + n].any(axis=0)).tolist())
+            if states:
+                found.add(states)
+    kept = [S for S in found if not any(set(S) < set(other) for other in found)]
+    return tuple(sorted(kept)) if all(len(S) <= PART * n for S in kept) else ()
+
+
+class Cliques:
+    """What `SphereProgram` is to pieces of a proof; its Gram matrix is a sum of small ones.
+
+    order: of the states in z and in the small program; nonlinear ones come last. exponents:
+    (M, n) of the monomials of a rate.
+    """
+
+    half, constant = 2, True
+
+    def __init__(
+        self, n: int, nonlinear: tuple[int, ...], cliques: tuple[tuple[int, ...], ...]
+    ) -> None:
+        self.n, self.chosen = n, tuple(range(n - len(nonlinear), n))
+        self.order = [j for j in range(n) if j not in nonlinear] + list(nonlinear)
+        self.place = 1 + np.argsort(self.order)  # of each state in y = (1, x)
+        linear, products = monomials(n, [0, 1]), monomials(n, [2])
+        curved = products[:, list(self.chosen)].any(axis=1)
+        self.basis: IntArray = np.vstack([linear, products[curved]])
+        self.weight = weights_of(self.basis, np.isin(np.arange(n), self.chosen))
+        points = np.random.default_rng(n).normal(size=(4 * n, n))
+        self.points: FloatArray = points / np.linalg.norm(points, axis=1)[:, None]
+        self.small = CliqueProgram(n, [tuple(int(self.place[j]) - 1 for j in S) for S in cliques])
+        rows = {tuple(row) for row in linear.tolist()}
+        for S in cliques:
+            inside = monomials(len(S), [2, 3])
+            wide = np.zeros((len(inside), n), dtype=np.int64)
+            wide[:, list(S)] = inside
+            rows |= {tuple(row) for row in wide.tolist()}
+        self.exponents: IntArray = np.array(sorted(rows))
+        # A polynomial with these exponents is known by its values at the same points.
+        values = np.prod(self.exponents[:, None].astype(np.float64) ** self.exponents, axis=2)
+        self._inverse = np.linalg.inv(values)
+
+    def fitted(self, rates: FloatArray, forms: FloatArray) -> dict[Any, float]:
+        """-2 Σ_i rate_i (forms x)_i in products of four entries of y; rates (M, n) at exponents."""
+        coefficients = -2 * (self._inverse @ rates) @ forms
+        found: dict[Any, float] = {}
+        for row, exponent in zip(coefficients, self.exponents, strict=True):
+            factors = self.place[np.repeat(np.arange(self.n), exponent)].tolist()
+            for j in np.flatnonzero(row).tolist():
+                used = sorted([*factors, int(self.place[j])])
+                key = (*[0] * (4 - len(used)), *used)
+                found[key] = found.get(key, 0.0) + float(row[j])
+        return found
+
+    def gram(self, solution: SphereSolution) -> FloatArray:
+        """Gram matrix of the solution in the monomials `basis` of z."""
+        return solution.X
+
+
+class CliqueSteps(LSteps):
+    """L-steps whose programs are `Cliques`; there are no limits, no w, no hold and no decay."""
+
+    carries = False
+
+    @classmethod
+    def of(cls, steps: LSteps) -> "CliqueSteps | None":
+        """The same L-steps by cliques, where that is possible and takes less time."""
+        field = steps.field
+        plain = not (len(steps.limits) or len(field.uncertain) or steps.decay or steps.pushed)
+        if not plain or steps.widths is not None or field.n < LARGE or field.degree > MAX_DEGREE:
+            return None
+        cliques = cliques_of(field)
+        return cls(steps, cliques) if cliques else None
+
+    def __init__(self, steps: LSteps, cliques: tuple[tuple[int, ...], ...]) -> None:
+        super().__init__(steps.field, nonlinear=steps.nonlinear, tolerance=steps.tolerance)
+        self.cliques = Cliques(self.field.n, self.nonlinear, cliques)
+
+    @cached_property
+    def program(self) -> Any:
+        """The cliques."""
+        return self.cliques
+
+    def solve(
+        self,
+        section: Section,
+        rho: float,
+        start: list[SphereSolution] | None = None,
+        *,
+        least: float = -np.inf,
+    ) -> list[SphereSolution]:
+        """φ, the only case; `start` and `least` change nothing."""
+        del start, least
+        P, g = self._posed(section, rho)
+        found = self.cliques.small.solve(P, g, tolerance=FINER * self.tolerance)
+        basis, small = self.cliques.basis, self.cliques.small
+        rows = {tuple(row): place for place, row in enumerate(basis.tolist())}
+        Q = np.zeros((len(basis), len(basis)))
+        unit = np.vstack([np.zeros((1, self.field.n), dtype=np.int64), np.eye(self.field.n)])
+        for block, gram in zip(small.blocks, found.grams, strict=True):
+            exponents = unit[block.products].sum(axis=1).astype(int).tolist()
+            at = [rows[tuple(row)] for row in exponents]
+            Q[np.ix_(at, at)] += gram
+        order = self.cliques.order
+        size = np.sqrt(np.diag(section.P))[order]
+        M = substitution(basis, size[:, None] * section.base[order])
+        X = M.T @ Q @ M
+        gap = (found.upper - found.m) / float(np.abs(g).max())
+        self.solved += 1
+        return [
+            SphereSolution(
+                found.m, found.upper, X, found.moments, gap, found.iterations,
+                (X, found.moments, found.m),
+            )
+        ]  # fmt: skip
+
+    def bounds(
+        self, section: Section, rho: float, duals: list[SphereSolution], cases: Any
+    ) -> list[float]:
+        """φ's upper bound in the only case; an estimate where the dual is of another P."""
+        del cases
+        return [float(self._posed(section, rho)[1] @ duals[0].y)]
+
+    def weights(self, solution: SphereSolution) -> FloatArray:
+        """(N,) all points alike: moments have no weights at points."""
+        del solution
+        return np.full(len(self.program.points), 1 / len(self.program.points))
+
+    def _posed(self, section: Section, rho: float) -> tuple[FloatArray, FloatArray]:
+        """P of unit diagonal, and g = -Ẇ/ρ in the small program's monomials of x̄/√ρ, scaled."""
+        cliques, order = self.cliques, self.cliques.order
+        size = np.sqrt(np.diag(section.P))
+        x_bar = np.sqrt(rho) * cliques.exponents / size
+        u = section.u - x_bar @ section.K.T
+        none = np.zeros((len(x_bar), 0))
+        rates = self.rate(section, section.x + x_bar, u, none) - section.x_rate
+        g = cliques.fitted(rates, section.P / size / np.sqrt(rho))
+        turning = section.P_rate / size / size[:, None]
+        for i in range(self.field.n):
+            for j in range(i, self.field.n):
+                a, b = sorted((int(cliques.place[i]), int(cliques.place[j])))
+                g[0, 0, a, b] = g.get((0, 0, a, b), 0.0) - turning[i, j] * (1 + (i != j))
+        P = section.P / size / size[:, None]
+        return P[np.ix_(order, order)], cliques.small.vector(g)
