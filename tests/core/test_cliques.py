@@ -29,7 +29,7 @@ def posed(rng: np.random.Generator) -> tuple[FloatArray, dict[tuple[int, ...], f
     root = rng.normal(size=(5, 5))
     P = root @ root.T + 3 * np.eye(5)
     size = np.sqrt(np.diag(P))
-    g = {(0, 0, 0, 0): 0.3}
+    g: dict[tuple[int, ...], float] = {(0, 0, 0, 0): 0.3}
     for i, j in combinations_with_replacement(range(6), 2):
         g[0, 0, i, j] = g.get((0, 0, i, j), 0.0) + float(rng.normal())
     for S in GROUPS:
