@@ -65,7 +65,7 @@ BENCHMARKS: Mapping[str, Benchmark] = MappingProxyType(
         "faults": Benchmark("faults"),
         "first_order_bias": Benchmark("first_order_bias"),
         "fleet": Benchmark("fleet"),
-        "funnel_scaling": Benchmark("funnel_scaling"),
+        "funnel_scaling": Benchmark("funnel_scaling", ("--most", "16")),
         "heat_exchanger": Benchmark("heat_exchanger", data="exchanger"),
         "known_problems": Benchmark("known_problems"),
         "first_try": Benchmark("first_try"),
