@@ -1,6 +1,7 @@
 """Programs and designs whose Gram matrices are sums of small ones."""
 
 from itertools import combinations_with_replacement
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from benchmarks.thesis.soundness import simulate_boundary
 from nlsid_core.arrays import FloatArray
 from nlsid_core.design import design_funnel, integrate_nominal
 from nlsid_core.design.continuous import cliques
-from nlsid_core.design.continuous.cliques import CliqueSteps, cliques_of
+from nlsid_core.design.continuous.cliques import CliqueSteps, cliques_of, share_of_work
 from nlsid_core.design.continuous.diagnosis import NoFunnel
 from nlsid_core.design.continuous.lstep import LSteps, section_at
 from nlsid_core.design.continuous.sweep import sweep_rho
@@ -70,7 +71,7 @@ def test_small_gram_matrices_show_their_bound(seed: int) -> None:
         (lambda x, u: [x[1] ** 2, x[0] * x[1] ** 2 + u[0], *(-x[2:])], ((0, 1),)),
         (lambda x, u: [x[7] ** 3, u[0] + x[2] * x[0], *(-x[2:])], ((0, 2), (7,))),
         (lambda x, u: [x[1] * u[0], x[0], *(-x[2:])], ()),  # an input times a state
-        (lambda x, u: [x[0] * x[1] * x[2], u[0], *(-x[2:])], ()),  # three of eight states
+        (lambda x, u: [x[0] * x[1] * x[2], u[0], *(-x[2:])], ((0, 1, 2),)),
         (lambda x, u: [u[0], *(-x[1:])], ()),
     ],
 )
@@ -123,6 +124,29 @@ def designed() -> Any:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cliques from eight states on."""
     monkeypatch.setattr(cliques, "LARGE", 8)
+    monkeypatch.setattr(cliques, "CHEAPER", np.inf)
+
+
+def test_cliques_are_taken_where_they_take_less_time() -> None:
+    """The work of a chain's programs is known; springs that harden have no products of rates."""
+    steps = LSteps(VectorField.from_function(chain(6), 12, 6))
+    pairs = 6 * (25 * 26 // 2) ** 3
+    assert share_of_work(12, 12, cliques_of(steps.field)) == pytest.approx(
+        pairs / (comb(16, 4) - comb(14, 2)) ** 3
+    )
+    assert CliqueSteps.of(steps) is not None
+
+    def masses(x: Any, u: Any) -> Any:
+        d = np.concatenate([x[:1], x[1:6] - x[:5], -x[5:6]])
+        pull = d + d**3 / 2
+        return [*x[6:], *(pull[1:] - pull[:-1] + u)]
+
+    steps = LSteps(VectorField.from_function(masses, 12, 6))
+    assert CliqueSteps.of(steps) is None
+    program, count = steps.program, len(steps.nonlinear)
+    some = ((0, 1),)  # two states of 12: 25 products
+    monomials = len(program.points)
+    assert share_of_work(12, count, some) == pytest.approx((25 * 26 // 2) ** 3 / monomials**3)
 
 
 @pytest.mark.usefixtures("small")

@@ -7,6 +7,7 @@ Source: docs/theory-funnels.md, "Many states".
 """
 
 from functools import cached_property
+from math import comb
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,14 @@ from nlsid_core.polynomial.maps import monomials
 from nlsid_core.sos.cliques import CliqueProgram
 from nlsid_core.sos.sphere import SphereSolution, weights_of
 
-LARGE = 12  # states: below, a sphere program takes about as little time
-PART = 0.25  # of the states: larger cliques save little
+LARGE = 12  # states: below, a sphere program takes a second or so
+CHEAPER = 1 / 16  # of a sphere program's work: with more, small matrices take as long
 MAX_DEGREE = 3  # of f
 FINER = 0.1  # of the tolerance of sphere programs: their unit is the spread of g
 
 
 def cliques_of(field: VectorField) -> tuple[tuple[int, ...], ...]:
-    """States in the nonlinear terms of each rate; () if these have inputs, or many states."""
+    """States in the nonlinear terms of each rate; () if these have inputs."""
     n, last = field.n, 1 + field.n + field.m
     found: set[tuple[int, ...]] = set()
     for equations in field.pieces:
@@ -37,8 +38,21 @@ def cliques_of(field: VectorField) -> tuple[tuple[int, ...], ...]:
             states = tuple(np.flatnonzero(high[:, 1 : 1 + n].any(axis=0)).tolist())
             if states:
                 found.add(states)
-    kept = [S for S in found if not any(set(S) < set(other) for other in found)]
-    return tuple(sorted(kept)) if all(len(S) <= PART * n for S in kept) else ()
+    return tuple(sorted(S for S in found if not any(set(S) < set(other) for other in found)))
+
+
+def share_of_work(n: int, nonlinear: int, cliques: tuple[tuple[int, ...], ...]) -> float:
+    """Σ (pairs of a clique's products)³ over (monomials of the sphere program)³.
+
+    nonlinear: how many states are. A monomial of degree 4 has two of them, of degree 3 one; products
+    of two others are those that the sphere does not give by these.
+    """
+    linear = n - nonlinear
+    squares = comb(linear + 1, 2)
+    cubics = comb(n + 2, 3) - comb(linear + 2, 3)
+    quartics = comb(n + 3, 4) - comb(linear + 3, 4) - nonlinear * comb(linear + 2, 3)
+    rows = [len(S) * (n + 1) - comb(len(S), 2) for S in cliques]
+    return sum(comb(k + 1, 2) ** 3 for k in rows) / (squares + cubics + quartics) ** 3
 
 
 class Cliques:
@@ -104,7 +118,9 @@ class CliqueSteps(LSteps):
         if not plain or steps.widths is not None or field.n < LARGE or field.degree > MAX_DEGREE:
             return None
         cliques = cliques_of(field)
-        return cls(steps, cliques) if cliques else None
+        if not cliques or share_of_work(field.n, len(steps.nonlinear), cliques) > CHEAPER:
+            return None
+        return cls(steps, cliques)
 
     def __init__(self, steps: LSteps, cliques: tuple[tuple[int, ...], ...]) -> None:
         super().__init__(steps.field, nonlinear=steps.nonlinear, tolerance=steps.tolerance)
