@@ -44,11 +44,11 @@ def cliques_of(field: VectorField) -> tuple[tuple[int, ...], ...]:
 def share_of_work(n: int, nonlinear: int, cliques: tuple[tuple[int, ...], ...]) -> float:
     """Σ (pairs of a clique's products)³ over (monomials of the sphere program)³.
 
-    nonlinear: how many states are. A monomial of degree 4 has two of them, of degree 3 one; products
-    of two others are those that the sphere does not give by these.
+    nonlinear: how many states are. A monomial of degree 4 has two of them, of degree 3 one, and of
+    degree 2 not two: the sphere gives those by others.
     """
     linear = n - nonlinear
-    squares = comb(linear + 1, 2)
+    squares = comb(linear + 1, 2) + linear * nonlinear
     cubics = comb(n + 2, 3) - comb(linear + 2, 3)
     quartics = comb(n + 3, 4) - comb(linear + 3, 4) - nonlinear * comb(linear + 2, 3)
     rows = [len(S) * (n + 1) - comb(len(S), 2) for S in cliques]
