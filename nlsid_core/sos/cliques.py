@@ -47,6 +47,7 @@ class _Block:
         self.k = len(products)
         self.i, self.j = np.triu_indices(self.k)
         self.keys = np.sort(np.hstack([self.products[self.i], self.products[self.j]]), axis=1)
+        self._work: FloatArray | None = None  # new memory costs more than what is computed in it
         self.place: dict[Key, int] = {}  # the first pair of every monomial
         self.moved: list[tuple[int, int]] = []  # and pairs that have the same one
         for pair, key in enumerate(map(tuple, self.keys.tolist())):
@@ -65,14 +66,20 @@ class _Block:
         return np.asarray(A[self.i, self.j])
 
     def kronecker(self, X: FloatArray, W: FloatArray) -> FloatArray:
-        """(pairs, pairs) tr(E_p X E_q W), symmetric."""
+        """(pairs, pairs) tr(E_p X E_q W), symmetric; valid until the next call."""
         i, j = self.i, self.j
-        Xi, Xj, Wi, Wj = X[:, i], X[:, j], W[:, i], W[:, j]
-        total = Xi[j] * Wj[i]
-        total += Xj[j] * Wi[i]
-        total += Xi[i] * Wj[j]
-        total += Xj[i] * Wi[j]
-        return np.asarray(total / 4)
+        if self._work is None:
+            self._work = np.empty((3, len(i), len(i)))
+        total, left, right = self._work
+        total[:] = 0.0
+        for a, b in ((i, j), (j, i)):
+            for c, d in ((i, j), (j, i)):
+                np.take(X[:, a], c, axis=0, out=left)
+                np.take(W[:, b], d, axis=0, out=right)
+                left *= right
+                total += left
+        total /= 4
+        return np.asarray(total)
 
 
 @dataclass(frozen=True, eq=False)
